@@ -1,0 +1,117 @@
+// State of a frame: its blocks while it is parsed, and what later frames may refer to.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "av1/cdf.h"
+#include "av1/headers.h"
+
+namespace colmap_av1::av1 {
+
+// A motion vector in units of 1/8 luma sample.
+struct Mv {
+  std::int16_t row = 0;
+  std::int16_t col = 0;
+  friend bool operator==(const Mv&, const Mv&) = default;
+};
+
+constexpr std::uint8_t kAbsent = 255;  // a syntax element that a block does not have
+
+// One block (decode_block) under the specification's names.
+struct BlockInfo {
+  std::uint16_t mi_row = 0;
+  std::uint16_t mi_col = 0;
+  std::array<Mv, 2> mv{};
+  std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
+  std::uint8_t mi_size = 0;
+  std::uint8_t y_mode = DC_PRED;
+  std::uint8_t uv_mode = kAbsent;
+  std::uint8_t partition = 0;
+  bool is_inter = false;
+  bool skip = false;
+  bool skip_mode = false;
+  bool use_intrabc = false;
+  bool interintra = false;
+  bool use_filter_intra = false;
+  bool has_chroma = false;
+  std::uint8_t segment_id = 0;
+  std::uint8_t motion_mode = SIMPLE;
+  std::uint8_t compound_type = kAbsent;
+  std::array<std::uint8_t, 2> interp_filter{kAbsent, kAbsent};
+  std::array<std::uint8_t, 2> palette_size{};  // PaletteSizeY, PaletteSizeUV
+  std::uint8_t comp_group_idx = 0;
+  std::uint8_t compound_idx = 0;
+  std::uint8_t tx_size = TX_4X4;
+  std::int8_t angle_delta_y = 0;
+  std::int8_t angle_delta_uv = 0;
+  std::uint8_t filter_intra_mode = 0;
+  std::uint8_t cfl_alpha_idx = 0;
+  std::uint8_t cfl_alpha_signs = 0;
+  std::uint8_t interintra_mode = kAbsent;
+  std::uint8_t wedge_interintra = 0;
+  std::uint8_t wedge_index = kAbsent;
+  std::uint8_t wedge_sign = 0;
+  std::uint8_t mask_type = 0;
+  std::uint8_t num_samples = 0;
+  std::int16_t current_q_index = 0;
+  std::array<std::int8_t, FRAME_LF_COUNT> delta_lf{};
+  std::int32_t local_warp = -1;      // index of the tile's LocalWarp, -1 without
+  std::int32_t num_coefficients = 0; // coded positions (eob) of all transform blocks
+};
+
+// LocalWarpParams and LocalValid of one block (7.11.3.8)
+struct LocalWarp {
+  bool valid = false;
+  std::array<std::int32_t, 6> params{};
+};
+
+// Motion saved for the motion field estimation of later frames, one entry per 8x8 luma
+// samples (only odd rows and columns of MfRefFrames and MfMvs are ever read, 7.19).
+struct SavedMotion {
+  Mv mv;
+  std::int8_t ref_frame = NONE;
+};
+
+// What stays of a decoded frame (7.20).
+struct FrameState {
+  FrameHeader header;
+  int decode_index = -1;
+  int bit_depth = 8;
+  int subsampling_x = 1;
+  int subsampling_y = 1;
+  CdfContext cdfs;
+  std::vector<SavedMotion> saved_motion;   // [mi_rows / 2][mi_cols / 2]
+  std::vector<std::uint8_t> segment_ids;   // [mi_rows][mi_cols]; empty: all 0
+};
+
+// An entry of the projected motion field (7.9): the saved vector and the distance it covers;
+// ref_offset 0 marks a hole. Projection to a reference happens on use.
+struct MotionFieldEntry {
+  Mv mv;
+  std::int8_t ref_offset = 0;
+};
+
+// Everything the tiles of one frame share.
+struct FrameContext {
+  const SequenceHeader* seq = nullptr;
+  const FrameHeader* header = nullptr;
+  CdfContext cdfs;                                 // at the start of each tile
+  std::vector<BlockInfo*> grid;                    // [mi_rows][mi_cols], null: not decoded yet
+  std::unique_ptr<BlockInfo[]> blocks;             // as many as units
+  std::size_t blocks_capacity = 0;
+  std::vector<MotionFieldEntry> motion_field;      // [mi_rows / 2][mi_cols / 2]
+  const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0
+  std::array<bool, TOTAL_REFS_PER_FRAME> ref_present{};
+  std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};  // is_scaled( )
+
+  BlockInfo*& at(int row, int col) {
+    return grid[static_cast<std::size_t>(row) * static_cast<std::size_t>(header->mi_cols) +
+                static_cast<std::size_t>(col)];
+  }
+};
+
+}  // namespace colmap_av1::av1

@@ -1,0 +1,125 @@
+#include "av1/motion_field.h"
+
+#include <algorithm>
+#include <cstdlib>
+
+#include "av1/spec_tables.h"
+
+namespace colmap_av1::av1 {
+namespace {
+
+// 7.9.4 Get block position process, one coordinate; false when offset too far
+bool project_position(int v8, int delta, int dst_sign, int max8, int max_off8, int& position) {
+  const int base8 = (v8 >> 3) << 3;
+  constexpr int kShift = 3 + 1 + MI_SIZE_LOG2;
+  const int offset8 = delta >= 0 ? delta >> kShift : -((-delta) >> kShift);
+  position = v8 + dst_sign * offset8;
+  return position >= 0 && position < max8 && position >= base8 - max_off8 &&
+         position < base8 + 8 + max_off8;
+}
+
+// 7.9.2 Projection process
+bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameState* source,
+             int src, int dst_sign, std::vector<MotionFieldEntry>& motion_field) {
+  if (source == nullptr || source->header.mi_rows != header.mi_rows ||
+      source->header.mi_cols != header.mi_cols || source->header.frame_is_intra ||
+      source->saved_motion.empty()) {
+    return false;
+  }
+  const int h8 = header.mi_rows >> 1;
+  const int w8 = header.mi_cols >> 1;
+  const int src_hint = header.order_hints[src];
+  const int ref_to_cur = seq.relative_dist(src_hint, header.order_hint);
+  if (std::abs(ref_to_cur) > MAX_FRAME_DISTANCE) return true;
+  std::array<int, TOTAL_REFS_PER_FRAME> ref_offsets{};
+  for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
+    const int offset = seq.relative_dist(src_hint, source->header.order_hints[ref]);
+    ref_offsets[ref] = offset > 0 && offset <= MAX_FRAME_DISTANCE ? offset : 0;
+  }
+  const SavedMotion* saved = source->saved_motion.data();
+  for (int y8 = 0; y8 < h8; ++y8) {
+    for (int x8 = 0; x8 < w8; ++x8, ++saved) {
+      if (saved->ref_frame <= INTRA_FRAME) continue;
+      const int ref_offset = ref_offsets[saved->ref_frame];
+      if (ref_offset == 0) continue;
+      const Mv projected = project_mv(saved->mv, ref_to_cur * dst_sign, ref_offset);
+      int pos_y8, pos_x8;
+      if (!project_position(y8, projected.row, dst_sign, h8, MAX_OFFSET_HEIGHT, pos_y8) ||
+          !project_position(x8, projected.col, dst_sign, w8, MAX_OFFSET_WIDTH, pos_x8)) {
+        continue;
+      }
+      motion_field[static_cast<std::size_t>(pos_y8) * static_cast<std::size_t>(w8) +
+                   static_cast<std::size_t>(pos_x8)] = {saved->mv,
+                                                        static_cast<std::int8_t>(ref_offset)};
+    }
+  }
+  return true;
+}
+
+}  // namespace
+
+Mv project_mv(Mv mv, int numerator, int denominator) {
+  const int clipped_denominator = std::min(MAX_FRAME_DISTANCE, denominator);
+  const int clipped_numerator = std::clamp(numerator, -MAX_FRAME_DISTANCE, MAX_FRAME_DISTANCE);
+  const int factor = clipped_numerator * kDivMult[clipped_denominator];
+  const auto scale = [factor](int v) {
+    const int product = v * factor;
+    const int scaled =
+        product >= 0 ? (product + (1 << 13)) >> 14 : -((-product + (1 << 13)) >> 14);
+    return static_cast<std::int16_t>(std::clamp(scaled, -(1 << 14) + 1, (1 << 14) - 1));
+  };
+  return {scale(mv.row), scale(mv.col)};
+}
+
+void estimate_motion_field(const SequenceHeader& seq, const FrameHeader& header,
+                           const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references,
+                           std::vector<MotionFieldEntry>& motion_field) {
+  motion_field.assign(
+      static_cast<std::size_t>(header.mi_rows >> 1) * static_cast<std::size_t>(header.mi_cols >> 1),
+      MotionFieldEntry{});
+  const auto project_from = [&](int src, int dst_sign) {
+    return project(seq, header, references[src], src, dst_sign, motion_field);
+  };
+  const FrameState* last = references[LAST_FRAME];
+  if (last != nullptr &&
+      last->header.order_hints[ALTREF_FRAME] != header.order_hints[GOLDEN_FRAME]) {
+    project_from(LAST_FRAME, -1);
+  }
+  int ref_stamp = MFMV_STACK_SIZE - 2;
+  const auto is_backward = [&](int ref) {
+    return seq.relative_dist(header.order_hints[ref], header.order_hint) > 0;
+  };
+  if (is_backward(BWDREF_FRAME) && project_from(BWDREF_FRAME, 1)) --ref_stamp;
+  if (is_backward(ALTREF2_FRAME) && project_from(ALTREF2_FRAME, 1)) --ref_stamp;
+  if (is_backward(ALTREF_FRAME) && ref_stamp >= 0 && project_from(ALTREF_FRAME, 1)) --ref_stamp;
+  if (ref_stamp >= 0) project_from(LAST2_FRAME, -1);
+}
+
+void save_motion(const SequenceHeader& seq, FrameContext& frame,
+                 std::vector<SavedMotion>& saved_motion) {
+  const FrameHeader& header = *frame.header;
+  const int h8 = header.mi_rows >> 1;
+  const int w8 = header.mi_cols >> 1;
+  saved_motion.resize(static_cast<std::size_t>(h8) * static_cast<std::size_t>(w8));
+  std::array<bool, TOTAL_REFS_PER_FRAME> is_forward{};
+  for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
+    is_forward[ref] = seq.relative_dist(header.order_hints[ref], header.order_hint) < 0;
+  }
+  SavedMotion* saved = saved_motion.data();
+  for (int y8 = 0; y8 < h8; ++y8) {
+    for (int x8 = 0; x8 < w8; ++x8, ++saved) {
+      *saved = {};
+      const BlockInfo& block = *frame.at(2 * y8 + 1, 2 * x8 + 1);
+      for (int list = 0; list < 2; ++list) {
+        const int ref = block.ref_frame[list];
+        if (ref <= INTRA_FRAME || !is_forward[ref]) continue;
+        const Mv mv = block.mv[list];
+        if (std::abs(mv.row) <= REFMVS_LIMIT && std::abs(mv.col) <= REFMVS_LIMIT) {
+          *saved = {mv, static_cast<std::int8_t>(ref)};
+        }
+      }
+    }
+  }
+}
+
+}  // namespace colmap_av1::av1

@@ -1,0 +1,378 @@
+// OBU syntax (specification sections 5.3 to 5.11.1), decode frame wrapup (7.4) and reference
+// frame update (7.20, 7.21).
+#include "av1/parser.h"
+
+#include <algorithm>
+#include <string>
+
+#include "av1/error.h"
+#include "av1/motion_field.h"
+
+namespace colmap_av1::av1 {
+namespace {
+
+// 4.10.5 leb128( )
+std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t& position) {
+  std::uint64_t value = 0;
+  for (int i = 0; i < 8; ++i) {
+    if (position >= size) throw BitstreamError("OBU size ends early");
+    const std::uint8_t byte = data[position++];
+    value |= static_cast<std::uint64_t>(byte & 0x7F) << (i * 7);
+    if (!(byte & 0x80)) {
+      if (value > 0xFFFFFFFFU) break;
+      return static_cast<std::size_t>(value);
+    }
+  }
+  throw BitstreamError("OBU size is longer than the specification allows");
+}
+
+}  // namespace
+
+void Parser::parse(const std::uint8_t* data, std::size_t size) {
+  parse_obus(data, size);
+}
+
+void Parser::finish() const {
+  if (seen_frame_header_) throw BitstreamError("stream ends inside a frame");
+}
+
+// 5.3 OBU syntax
+void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
+  std::size_t position = 0;
+  while (position < size) {
+    const std::size_t start = position;
+    const std::uint8_t header = data[position++];
+    if (header & 0x80) throw BitstreamError("obu_forbidden_bit is set");
+    const int obu_type = (header >> 3) & 15;
+    const bool has_extension = header & 4;
+    const bool has_size_field = header & 2;
+    int temporal_id = 0;
+    int spatial_id = 0;
+    if (has_extension) {
+      if (position >= size) throw BitstreamError("OBU header ends early");
+      temporal_id = data[position] >> 5;
+      spatial_id = (data[position] >> 3) & 3;
+      ++position;
+    }
+    const std::size_t obu_size =
+        has_size_field ? read_leb128(data, size, position) : size - position;
+    if (obu_size > size - position) throw BitstreamError("OBU reaches beyond the end of the data");
+    const std::uint8_t* payload = data + position;
+    position += obu_size;
+    obu_offset_ = start;
+    if (obu_type != OBU_SEQUENCE_HEADER && obu_type != OBU_TEMPORAL_DELIMITER &&
+        operating_point_idc_ != 0 && has_extension) {
+      const bool in_temporal_layer = (operating_point_idc_ >> temporal_id) & 1;
+      const bool in_spatial_layer = (operating_point_idc_ >> (spatial_id + 8)) & 1;
+      if (!in_temporal_layer || !in_spatial_layer) continue;
+    }
+    switch (obu_type) {
+      case OBU_SEQUENCE_HEADER:
+        sequence_header_obu(payload, obu_size);
+        break;
+      case OBU_TEMPORAL_DELIMITER:
+        finish();
+        start_temporal_unit();
+        break;
+      case OBU_FRAME_HEADER:
+      case OBU_REDUNDANT_FRAME_HEADER:
+        frame_header_obu(payload, obu_size, temporal_id, spatial_id);
+        break;
+      case OBU_FRAME: {
+        if (seen_frame_header_) throw BitstreamError("frame starts inside another frame");
+        const std::size_t bytes = frame_header_obu(payload, obu_size, temporal_id, spatial_id);
+        if (!seen_frame_header_) throw BitstreamError("OBU_FRAME holds show_existing_frame");
+        tile_group_obu(payload + bytes, obu_size - bytes);
+        break;
+      }
+      case OBU_TILE_GROUP:
+        tile_group_obu(payload, obu_size);
+        break;
+      default:  // metadata, tile lists, padding and reserved types do not affect motion
+        break;
+    }
+  }
+}
+
+void Parser::sequence_header_obu(const std::uint8_t* data, std::size_t size) {
+  if (seen_frame_header_) throw BitstreamError("sequence header inside a frame");
+  BitReader reader(data, size);
+  seq_ = std::make_unique<SequenceHeader>(read_sequence_header(reader));
+  const int op = options_.operating_point <= seq_->operating_points_cnt_minus_1
+                     ? options_.operating_point
+                     : 0;  // 7.20 note: a choice that the stream does not have means the first
+  operating_point_idc_ = seq_->operating_point_idc[op];
+}
+
+std::size_t Parser::frame_header_obu(const std::uint8_t* data, std::size_t size, int temporal_id,
+                                     int spatial_id) {
+  if (seen_frame_header_) return size;  // frame_header_copy( )
+  if (!seq_) throw BitstreamError("frame comes before the first sequence header");
+  References infos;
+  for (int i = 0; i < NUM_REF_FRAMES; ++i) {
+    const Slot& slot = slots_[i];
+    infos[i].valid = slot.valid;
+    infos[i].order_hint = slot.order_hint;
+    if (slot.frame) {
+      infos[i].header = &slot.frame->header;
+      infos[i].frame_id = slot.frame->header.current_frame_id;
+      infos[i].bit_depth = slot.frame->bit_depth;
+      infos[i].subsampling_x = slot.frame->subsampling_x;
+      infos[i].subsampling_y = slot.frame->subsampling_y;
+    }
+  }
+  BitReader reader(data, size);
+  header_ = read_frame_header(reader, *seq_, infos, temporal_id, spatial_id,
+                              options_.max_frame_size);
+  for (int i = 0; i < NUM_REF_FRAMES; ++i) {
+    slots_[i].valid = infos[i].valid;
+    slots_[i].order_hint = infos[i].order_hint;
+    if (infos[i].header == nullptr) slots_[i].frame.reset();
+  }
+  // Containers may leave temporal delimiters out. A temporal unit has one shown frame for each
+  // spatial layer, in ascending order (7.5).
+  if (temporal_unit_ < 0 || spatial_id <= shown_spatial_id_) start_temporal_unit();
+  if (header_.show_frame || header_.show_existing_frame) shown_spatial_id_ = spatial_id;
+  event_ = std::make_unique<Event>();
+  event_->header = header_;
+  event_->decode_index = num_events_;
+  event_->temporal_unit = temporal_unit_;
+  event_->obu_offset = static_cast<int>(obu_offset_);
+  event_->ref_decode_index.fill(-1);
+  if (header_.show_existing_frame) {
+    show_existing_frame();
+    return size;
+  }
+  seen_frame_header_ = true;
+  tile_num_ = 0;
+  start_frame();
+  reader.byte_alignment();
+  return reader.position() / 8;
+}
+
+std::array<const FrameState*, TOTAL_REFS_PER_FRAME> Parser::references() const {
+  std::array<const FrameState*, TOTAL_REFS_PER_FRAME> refs{};
+  if (header_.frame_is_intra) return refs;
+  for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
+    refs[ref] = slots_[header_.ref_frame_idx[ref - LAST_FRAME]].frame.get();
+  }
+  return refs;
+}
+
+// What uncompressed_header( ) sets up besides its values: CDFs, segment ids, motion field
+void Parser::start_frame() {
+  state_ = std::make_shared<FrameState>();
+  state_->decode_index = num_events_;
+  state_->bit_depth = seq_->bit_depth;
+  state_->subsampling_x = seq_->subsampling_x;
+  state_->subsampling_y = seq_->subsampling_y;
+  state_->header = header_;
+
+  const auto refs = references();
+  context_.seq = seq_.get();
+  context_.header = &header_;
+  context_.prev_segment_ids = nullptr;
+  context_.ref_present.fill(false);
+  context_.ref_scaled.fill(false);
+  for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
+    if (refs[ref] == nullptr) continue;
+    const FrameHeader& reference = refs[ref]->header;
+    // is_scaled( ) of 5.11.27, and the limits on scaling of 7.11.3.3
+    const int x_scale =
+        ((reference.upscaled_width << REF_SCALE_SHIFT) + header_.frame_width / 2) /
+        header_.frame_width;
+    const int y_scale =
+        ((reference.frame_height << REF_SCALE_SHIFT) + header_.frame_height / 2) /
+        header_.frame_height;
+    constexpr int kNoScale = 1 << REF_SCALE_SHIFT;
+    context_.ref_scaled[ref] = x_scale != kNoScale || y_scale != kNoScale;
+    context_.ref_present[ref] = 2 * header_.frame_width >= reference.upscaled_width &&
+                                2 * header_.frame_height >= reference.frame_height &&
+                                header_.frame_width <= 16 * reference.upscaled_width &&
+                                header_.frame_height <= 16 * reference.frame_height;
+    event_->ref_decode_index[ref] = refs[ref]->decode_index;
+    event_->ref_size[ref] = {reference.upscaled_width, reference.frame_height};
+  }
+  event_->ref_order_hint = header_.order_hints;
+  if (options_.headers_only) return;
+
+  const std::size_t units =
+      static_cast<std::size_t>(header_.mi_rows) * static_cast<std::size_t>(header_.mi_cols);
+  if (header_.primary_ref_frame == PRIMARY_REF_NONE) {
+    context_.cdfs.init_non_coeff_cdfs();
+    context_.cdfs.init_coeff_cdfs(header_.base_q_idx);
+  } else {
+    // load_cdfs( ) and load_previous_segment_ids( ); the header checked that the frame is there
+    const FrameState& previous =
+        *slots_[header_.ref_frame_idx[header_.primary_ref_frame]].frame;
+    context_.cdfs = previous.cdfs;
+    if (header_.segmentation_enabled && previous.header.mi_rows == header_.mi_rows &&
+        previous.header.mi_cols == header_.mi_cols && !previous.segment_ids.empty()) {
+      context_.prev_segment_ids = previous.segment_ids.data();
+    }
+  }
+  context_.grid.assign(units, nullptr);
+  if (context_.blocks_capacity < units) {
+    context_.blocks = std::make_unique_for_overwrite<BlockInfo[]>(units);
+    context_.blocks_capacity = units;
+  }
+  if (header_.use_ref_frame_mvs) {
+    estimate_motion_field(*seq_, header_, refs, context_.motion_field);
+  }
+  const std::size_t num_tiles = static_cast<std::size_t>(header_.tile_cols * header_.tile_rows);
+  tile_first_block_.assign(num_tiles, 0);
+  tile_num_blocks_.assign(num_tiles, 0);
+  std::size_t first = 0;
+  for (int row = 0; row < header_.tile_rows; ++row) {
+    for (int col = 0; col < header_.tile_cols; ++col) {
+      tile_first_block_[static_cast<std::size_t>(row * header_.tile_cols + col)] = first;
+      first += static_cast<std::size_t>(header_.mi_row_starts[row + 1] - header_.mi_row_starts[row]) *
+               static_cast<std::size_t>(header_.mi_col_starts[col + 1] - header_.mi_col_starts[col]);
+    }
+  }
+}
+
+// 5.11.1 General tile group OBU syntax
+void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
+  if (!seen_frame_header_) throw BitstreamError("tile group without a frame header");
+  const int num_tiles = header_.tile_cols * header_.tile_rows;
+  BitReader reader(data, size);
+  int tg_start = 0;
+  int tg_end = num_tiles - 1;
+  if (num_tiles > 1 && reader.flag()) {  // tile_start_and_end_present_flag
+    const int tile_bits = header_.tile_cols_log2 + header_.tile_rows_log2;
+    tg_start = reader.literal(tile_bits);
+    tg_end = reader.literal(tile_bits);
+  }
+  if (tg_start != tile_num_ || tg_end < tg_start || tg_end >= num_tiles) {
+    throw BitstreamError("tile group does not continue the frame");
+  }
+  reader.byte_alignment();
+  ++event_->num_tile_groups;
+  std::size_t position = reader.position() / 8;
+  for (; tile_num_ <= tg_end; ++tile_num_) {
+    std::size_t tile_size = size - position;
+    if (tile_num_ != tg_end) {
+      const std::size_t bytes = static_cast<std::size_t>(header_.tile_size_bytes);
+      if (tile_size < bytes) throw BitstreamError("tile group ends inside a tile size");
+      std::size_t minus_1 = 0;
+      for (std::size_t i = 0; i < bytes; ++i) {
+        minus_1 |= static_cast<std::size_t>(data[position + i]) << (8 * i);
+      }
+      position += bytes;
+      tile_size = minus_1 + 1;
+    }
+    if (tile_size > size - position) throw BitstreamError("tile reaches beyond its tile group");
+    if (tile_size == 0) throw BitstreamError("tile is empty");
+    if (!options_.headers_only) {
+      const std::size_t tile = static_cast<std::size_t>(tile_num_);
+      tile_parser_.parse(context_, tile_num_ / header_.tile_cols, tile_num_ % header_.tile_cols,
+                         data + position, tile_size,
+                         context_.blocks.get() + tile_first_block_[tile]);
+      tile_num_blocks_[tile] = tile_parser_.num_blocks();
+      const auto base = static_cast<std::int32_t>(event_->local_warps.size());
+      if (base > 0) {
+        BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
+        for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i) {
+          if (block[i].local_warp >= 0) block[i].local_warp += base;
+        }
+      }
+      event_->local_warps.insert(event_->local_warps.end(), tile_parser_.local_warps().begin(),
+                                 tile_parser_.local_warps().end());
+      if (!header_.disable_frame_end_update_cdf && tile_num_ == header_.context_update_tile_id) {
+        state_->cdfs = tile_parser_.cdfs();
+        state_->cdfs.clear_counters();
+      }
+      if (options_.keep_blocks) event_->tile_sizes.push_back(static_cast<int>(tile_size));
+    }
+    position += tile_size;
+  }
+  if (tile_num_ == num_tiles) finish_frame();
+}
+
+// 7.4 Decode frame wrapup process
+void Parser::finish_frame() {
+  seen_frame_header_ = false;
+  if (!options_.headers_only) {
+    if (header_.disable_frame_end_update_cdf) state_->cdfs = context_.cdfs;
+    save_motion(*seq_, context_, state_->saved_motion);
+    const std::size_t units = context_.grid.size();
+    if (header_.segmentation_enabled) {
+      state_->segment_ids.resize(units);
+      if (header_.segmentation_update_map) {
+        for (std::size_t i = 0; i < units; ++i) {
+          state_->segment_ids[i] = context_.grid[i]->segment_id;
+        }
+      } else if (context_.prev_segment_ids != nullptr) {
+        std::copy_n(context_.prev_segment_ids, units, state_->segment_ids.begin());
+      }
+    }
+    export_units(*event_);
+  }
+  update_references(state_, header_.refresh_frame_flags);
+  state_.reset();
+  ++num_events_;
+  events_.push_back(std::move(event_));
+}
+
+void Parser::show_existing_frame() {
+  const std::shared_ptr<const FrameState> shown = slots_[header_.frame_to_show_map_idx].frame;
+  event_->shown_decode_index = shown->decode_index;
+  event_->header.order_hint = shown->header.order_hint;
+  if (header_.frame_type == KEY_FRAME) {
+    // 7.21 Reference frame loading process: the loaded frame goes into every slot
+    update_references(shown, header_.refresh_frame_flags);
+  } else {
+    update_references(nullptr, 0);
+  }
+  ++num_events_;
+  events_.push_back(std::move(event_));
+}
+
+// 7.20 Reference frame update process
+void Parser::update_references(const std::shared_ptr<const FrameState>& state,
+                               int refresh_frame_flags) {
+  for (int i = 0; i < NUM_REF_FRAMES; ++i) {
+    if ((refresh_frame_flags >> i) & 1) slots_[i] = {true, state->header.order_hint, state};
+    event_->slot_decode_index[i] = slots_[i].frame ? slots_[i].frame->decode_index : -1;
+  }
+}
+
+void Parser::export_units(Event& event) {
+  const std::size_t n = context_.grid.size();
+  Units& u = event.units;
+  u.mv.resize(2 * n);
+  u.ref_frame.resize(2 * n);
+  for (auto* field : {&u.mi_size, &u.y_mode, &u.is_inter, &u.skip, &u.skip_mode, &u.segment_id,
+                      &u.motion_mode, &u.compound_type, &u.interintra, &u.use_intrabc}) {
+    field->resize(n);
+  }
+  u.warp_index.resize(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    const BlockInfo& b = *context_.grid[i];
+    u.mv[2 * i] = b.mv[0];
+    u.mv[2 * i + 1] = b.mv[1];
+    u.ref_frame[2 * i] = b.ref_frame[0];
+    u.ref_frame[2 * i + 1] = b.ref_frame[1];
+    u.mi_size[i] = b.mi_size;
+    u.y_mode[i] = b.y_mode;
+    u.is_inter[i] = b.is_inter;
+    u.skip[i] = b.skip;
+    u.skip_mode[i] = b.skip_mode;
+    u.segment_id[i] = b.segment_id;
+    u.motion_mode[i] = b.motion_mode;
+    u.compound_type[i] = b.compound_type;
+    u.interintra[i] = b.interintra;
+    u.use_intrabc[i] = b.use_intrabc;
+    const bool warped =
+        b.local_warp >= 0 && event.local_warps[static_cast<std::size_t>(b.local_warp)].valid;
+    u.warp_index[i] = warped ? b.local_warp : -1;
+  }
+  if (!options_.keep_blocks) return;
+  for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {
+    const BlockInfo* first = context_.blocks.get() + tile_first_block_[tile];
+    event.blocks.insert(event.blocks.end(), first, first + tile_num_blocks_[tile]);
+  }
+}
+
+}  // namespace colmap_av1::av1

@@ -1,0 +1,116 @@
+// The parser: temporal units in, one event per decoded or repeated frame out.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "av1/frame_state.h"
+#include "av1/tile_parser.h"
+
+namespace colmap_av1::av1 {
+
+struct ParserOptions {
+  int operating_point = 0;
+  // Reads the headers alone; events then hold no units.
+  bool headers_only = false;
+  // Keeps BlockInfo, LocalWarp and tile sizes of every frame in its event.
+  bool keep_blocks = false;
+  // Largest accepted frame in luma samples.
+  std::int64_t max_frame_size = std::int64_t{1} << 28;
+};
+
+// Block data of a frame per 4x4 luma unit, row after row.
+struct Units {
+  std::vector<Mv> mv;                 // two per unit
+  std::vector<std::int8_t> ref_frame; // two per unit
+  std::vector<std::uint8_t> mi_size, y_mode, is_inter, skip, skip_mode, segment_id, motion_mode,
+      compound_type, interintra, use_intrabc;
+  std::vector<std::int32_t> warp_index;  // into Event::local_warps, -1 without a valid warp
+};
+
+// A decoded frame or a show_existing_frame header, in bitstream order.
+struct Event {
+  FrameHeader header;
+  int decode_index = 0;  // number of this event
+  int temporal_unit = 0;
+  int obu_offset = 0;    // of the frame's first OBU in its temporal unit, in bytes
+  int num_tile_groups = 0;
+  int shown_decode_index = -1;  // show_existing_frame: the event that decoded the frame
+  // By RefFrame; -1 and 0 where there is none.
+  std::array<int, TOTAL_REFS_PER_FRAME> ref_decode_index{};
+  std::array<std::array<int, 2>, TOTAL_REFS_PER_FRAME> ref_size{};  // UpscaledWidth, FrameHeight
+  std::array<int, TOTAL_REFS_PER_FRAME> ref_order_hint{};
+  // Reference slots after the reference frame update process
+  std::array<int, NUM_REF_FRAMES> slot_decode_index{};
+  Units units;
+  std::vector<LocalWarp> local_warps;
+  std::vector<BlockInfo> blocks;  // in decoding order
+  std::vector<int> tile_sizes;    // in bytes, in tile order
+};
+
+class Parser {
+ public:
+  explicit Parser(const ParserOptions& options) : options_(options) {}
+
+  // Parses a temporal unit, or a part of one, of the low-overhead format (section 5.2). An OBU
+  // without a size field reaches to the end of the data. Completed frames are appended to
+  // events() also when a later one throws BitstreamError or LimitError.
+  void parse(const std::uint8_t* data, std::size_t size);
+
+  // Throws BitstreamError when the stream ends inside a frame.
+  void finish() const;
+
+  std::vector<std::unique_ptr<Event>>& events() { return events_; }
+  // The sequence header in force; null before the first.
+  const SequenceHeader* sequence_header() const { return seq_.get(); }
+  int operating_point_idc() const { return operating_point_idc_; }
+
+ private:
+  struct Slot {
+    bool valid = false;
+    int order_hint = 0;
+    std::shared_ptr<const FrameState> frame;
+  };
+
+  void start_temporal_unit() {
+    ++temporal_unit_;
+    shown_spatial_id_ = -1;
+  }
+  void parse_obus(const std::uint8_t* data, std::size_t size);
+  void sequence_header_obu(const std::uint8_t* data, std::size_t size);
+  // Returns the bytes of the header.
+  std::size_t frame_header_obu(const std::uint8_t* data, std::size_t size, int temporal_id,
+                               int spatial_id);
+  void start_frame();
+  void tile_group_obu(const std::uint8_t* data, std::size_t size);
+  void finish_frame();
+  void show_existing_frame();
+  void update_references(const std::shared_ptr<const FrameState>& state, int refresh_frame_flags);
+  void export_units(Event& event);
+  std::array<const FrameState*, TOTAL_REFS_PER_FRAME> references() const;
+
+  ParserOptions options_;
+  std::vector<std::unique_ptr<Event>> events_;
+  std::unique_ptr<SequenceHeader> seq_;
+  int operating_point_idc_ = 0;
+  std::array<Slot, NUM_REF_FRAMES> slots_;
+  int num_events_ = 0;
+  int temporal_unit_ = -1;
+  int shown_spatial_id_ = -1;  // of the last shown frame of the temporal unit
+  std::size_t obu_offset_ = 0;
+
+  bool seen_frame_header_ = false;
+  int tile_num_ = 0;
+  FrameHeader header_;
+  std::unique_ptr<Event> event_;
+  std::shared_ptr<FrameState> state_;
+  FrameContext context_;
+  std::vector<std::size_t> tile_first_block_;
+  std::vector<std::size_t> tile_num_blocks_;
+  TileParser tile_parser_;
+};
+
+}  // namespace colmap_av1::av1

@@ -1,0 +1,509 @@
+// Transform sizes and types, and coefficients, which are read to keep the decoder in step and
+// then dropped (specification sections 5.11.15 to 5.11.17, 5.11.34, 5.11.37 to 5.11.41, 5.11.47,
+// 5.11.48; contexts as in 8.3.2).
+#include <algorithm>
+#include <cstring>
+
+#include "av1/error.h"
+#include "av1/spec_tables.h"
+#include "av1/tile_parser.h"
+
+namespace colmap_av1::av1 {
+namespace {
+
+constexpr int kMargin = 4;  // of TileParser::levels_
+
+// find_tx_size( )
+int find_tx_size(int w, int h) {
+  for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) {
+    if (kTxWidth[tx_size] == w && kTxHeight[tx_size] == h) return tx_size;
+  }
+  throw BitstreamError("transform tree gives no transform size");
+}
+
+int tx_class(int tx_type) {
+  switch (tx_type) {
+    case V_DCT:
+    case V_ADST:
+    case V_FLIPADST:
+      return TX_CLASS_VERT;
+    case H_DCT:
+    case H_ADST:
+    case H_FLIPADST:
+      return TX_CLASS_HORIZ;
+    default:
+      return TX_CLASS_2D;
+  }
+}
+
+// 5.11.41 Get scan function. Scans of 512 positions and more have 16-bit entries.
+struct Scan {
+  const void* positions;
+  bool wide;
+};
+
+Scan get_scan(int tx_size, int tx_type) {
+  if (tx_size == TX_16X64) return {kDefaultScan16x32, true};
+  if (tx_size == TX_64X16) return {kDefaultScan32x16, true};
+  if (kTxSizeSqrUp[tx_size] == TX_64X64) return {kDefaultScan32x32, true};
+  const int c = tx_class(tx_type);  // preferRow: TX_CLASS_VERT, preferCol: TX_CLASS_HORIZ
+  const auto choose = [c](const void* def, const void* mrow, const void* mcol) {
+    return Scan{c == TX_CLASS_2D ? def : c == TX_CLASS_VERT ? mrow : mcol, false};
+  };
+  switch (tx_size) {
+    case TX_4X4: return choose(kDefaultScan4x4, kMrowScan4x4, kMcolScan4x4);
+    case TX_4X8: return choose(kDefaultScan4x8, kMrowScan4x8, kMcolScan4x8);
+    case TX_8X4: return choose(kDefaultScan8x4, kMrowScan8x4, kMcolScan8x4);
+    case TX_8X8: return choose(kDefaultScan8x8, kMrowScan8x8, kMcolScan8x8);
+    case TX_8X16: return choose(kDefaultScan8x16, kMrowScan8x16, kMcolScan8x16);
+    case TX_16X8: return choose(kDefaultScan16x8, kMrowScan16x8, kMcolScan16x8);
+    case TX_16X16: return choose(kDefaultScan16x16, kMrowScan16x16, kMcolScan16x16);
+    case TX_4X16: return choose(kDefaultScan4x16, kMrowScan4x16, kMcolScan4x16);
+    case TX_16X4: return choose(kDefaultScan16x4, kMrowScan16x4, kMcolScan16x4);
+    case TX_8X32: return {kDefaultScan8x32, false};
+    case TX_32X8: return {kDefaultScan32x8, false};
+    case TX_16X32: return {kDefaultScan16x32, true};
+    case TX_32X16: return {kDefaultScan32x16, true};
+    default: return {kDefaultScan32x32, true};
+  }
+}
+
+}  // namespace
+
+// 5.11.16 Block TX size syntax
+void TileParser::read_block_tx_size() {
+  const int row0 = b_->mi_row;
+  const int col0 = b_->mi_col;
+  if (header_->tx_mode == TX_MODE_SELECT && b_->mi_size > BLOCK_4X4 && b_->is_inter && !b_->skip &&
+      !lossless_) {
+    const int max_tx_size = kMaxTxSizeRect[b_->mi_size];
+    const int tx_w4 = kTxWidth[max_tx_size] / MI_SIZE;
+    const int tx_h4 = kTxHeight[max_tx_size] / MI_SIZE;
+    for (int row = row0; row < row0 + bh4_; row += tx_h4) {
+      for (int col = col0; col < col0 + bw4_; col += tx_w4) {
+        read_var_tx_size(row, col, max_tx_size, 0);
+      }
+    }
+    return;
+  }
+  read_tx_size(!b_->skip || !b_->is_inter);
+  if (b_->is_inter && !b_->skip) {
+    for (int y = 0; y < bh4_; ++y) {
+      std::fill_n(inter_tx_sizes_.begin() + ((row0 + y) & kSbMask) * kMaxSb4 + (col0 & kSbMask),
+                  bw4_, b_->tx_size);
+    }
+  }
+  // The contexts see the block's size where nothing is coded (get_above_tx_width( )).
+  const bool whole = b_->skip && b_->is_inter;
+  set_tx_context(row0, col0, bw4_, bh4_, whole ? kBlockWidth[b_->mi_size] : kTxWidth[b_->tx_size],
+                 whole ? kBlockHeight[b_->mi_size] : kTxHeight[b_->tx_size]);
+}
+
+void TileParser::set_tx_context(int row, int col, int w4, int h4, int width, int height) {
+  std::fill_n(above_tx_width_.begin() + col, w4, static_cast<std::uint8_t>(width));
+  std::fill_n(left_tx_height_.begin() + (row & kSbMask), h4, static_cast<std::uint8_t>(height));
+}
+
+int TileParser::above_tx_width(int row, int col) const {
+  return row == b_->mi_row && !above_ ? 64 : above_tx_width_[col];
+}
+
+int TileParser::left_tx_height(int row, int col) const {
+  return col == b_->mi_col && !left_ ? 64 : left_tx_height_[row & kSbMask];
+}
+
+// 5.11.15 TX size syntax
+void TileParser::read_tx_size(bool allow_select) {
+  if (lossless_) {
+    b_->tx_size = TX_4X4;
+    return;
+  }
+  const int max_rect_tx_size = kMaxTxSizeRect[b_->mi_size];
+  int tx_size = max_rect_tx_size;
+  if (b_->mi_size > BLOCK_4X4 && allow_select && header_->tx_mode == TX_MODE_SELECT) {
+    int above_w = 0;
+    int left_h = 0;
+    if (above_) {
+      above_w = above_->is_inter ? kBlockWidth[above_->mi_size]
+                                 : above_tx_width(b_->mi_row, b_->mi_col);
+    }
+    if (left_) {
+      left_h = left_->is_inter ? kBlockHeight[left_->mi_size]
+                               : left_tx_height(b_->mi_row, b_->mi_col);
+    }
+    const int ctx =
+        (above_w >= kTxWidth[max_rect_tx_size]) + (left_h >= kTxHeight[max_rect_tx_size]);
+    int tx_depth;
+    switch (kMaxTxDepth[b_->mi_size]) {
+      case 4: tx_depth = read(cdf_.tx_64x64[ctx]); break;
+      case 3: tx_depth = read(cdf_.tx_32x32[ctx]); break;
+      case 2: tx_depth = read(cdf_.tx_16x16[ctx]); break;
+      default: tx_depth = read(cdf_.tx_8x8[ctx]); break;
+    }
+    for (int i = 0; i < tx_depth; ++i) tx_size = kSplitTxSize[tx_size];
+  }
+  b_->tx_size = static_cast<std::uint8_t>(tx_size);
+}
+
+// 5.11.17 Var TX size syntax
+void TileParser::read_var_tx_size(int row, int col, int tx_size, int depth) {
+  if (row >= header_->mi_rows || col >= header_->mi_cols) return;
+  bool txfm_split = false;
+  if (tx_size != TX_4X4 && depth != MAX_VARTX_DEPTH) {
+    const bool above = above_tx_width(row, col) < kTxWidth[tx_size];
+    const bool left = left_tx_height(row, col) < kTxHeight[tx_size];
+    const int size =
+        std::min<int>(64, std::max(kBlockWidth[b_->mi_size], kBlockHeight[b_->mi_size]));
+    const int max_tx_size = find_tx_size(size, size);
+    const int ctx = (kTxSizeSqrUp[tx_size] != max_tx_size) * 3 + (TX_SIZES - 1 - max_tx_size) * 6 +
+                    above + left;
+    txfm_split = read_flag(cdf_.txfm_split[ctx]);
+  }
+  const int w4 = kTxWidth[tx_size] / MI_SIZE;
+  const int h4 = kTxHeight[tx_size] / MI_SIZE;
+  if (txfm_split) {
+    const int sub_tx_size = kSplitTxSize[tx_size];
+    const int step_w = kTxWidth[sub_tx_size] / MI_SIZE;
+    const int step_h = kTxHeight[sub_tx_size] / MI_SIZE;
+    for (int i = 0; i < h4; i += step_h) {
+      for (int j = 0; j < w4; j += step_w) {
+        read_var_tx_size(row + i, col + j, sub_tx_size, depth + 1);
+      }
+    }
+    return;
+  }
+  for (int i = 0; i < h4; ++i) {
+    std::fill_n(inter_tx_sizes_.begin() + ((row + i) & kSbMask) * kMaxSb4 + (col & kSbMask), w4,
+                static_cast<std::uint8_t>(tx_size));
+  }
+  set_tx_context(row, col, w4, h4, kTxWidth[tx_size], kTxHeight[tx_size]);
+  b_->tx_size = static_cast<std::uint8_t>(tx_size);
+}
+
+// reset_block_context( ) of 5.11.5
+void TileParser::reset_block_context() {
+  for (int plane = 0; plane < (b_->has_chroma ? 3 : 1); ++plane) {
+    const int sub_x = plane > 0 ? seq_->subsampling_x : 0;
+    const int sub_y = plane > 0 ? seq_->subsampling_y : 0;
+    const int x = b_->mi_col >> sub_x;
+    const int y = b_->mi_row >> sub_y;
+    const int w = ((b_->mi_col + bw4_ - 1) >> sub_x) - x + 1;
+    const int h = ((b_->mi_row + bh4_ - 1) >> sub_y) - y + 1;
+    std::fill_n(above_coef_context_[plane].begin() + x, w, std::uint8_t{0});
+    std::fill_n(left_coef_context_[plane].begin() + (y & kSbMask), h, std::uint8_t{0});
+  }
+}
+
+// 5.11.34 Residual syntax
+void TileParser::residual() {
+  const int width_chunks = std::max(1, kBlockWidth[b_->mi_size] >> 6);
+  const int height_chunks = std::max(1, kBlockHeight[b_->mi_size] >> 6);
+  const int mi_size_chunk = width_chunks > 1 || height_chunks > 1 ? BLOCK_64X64 : b_->mi_size;
+  const int num_planes = b_->has_chroma ? 3 : 1;
+  for (int chunk_y = 0; chunk_y < height_chunks; ++chunk_y) {
+    for (int chunk_x = 0; chunk_x < width_chunks; ++chunk_x) {
+      const int row = b_->mi_row + (chunk_y << 4);
+      const int col = b_->mi_col + (chunk_x << 4);
+      for (int plane = 0; plane < num_planes; ++plane) {
+        const int sub_x = plane > 0 ? seq_->subsampling_x : 0;
+        const int sub_y = plane > 0 ? seq_->subsampling_y : 0;
+        const int plane_size = kSubsampledSize[mi_size_chunk][sub_x][sub_y];
+        const int width = kBlockWidth[plane_size];
+        const int height = kBlockHeight[plane_size];
+        const int base_x = (col >> sub_x) * MI_SIZE;
+        const int base_y = (row >> sub_y) * MI_SIZE;
+        if (b_->is_inter && !lossless_ && plane == 0) {
+          transform_tree(base_x, base_y, width, height);
+          continue;
+        }
+        const int tx_size = lossless_ ? TX_4X4 : plane == 0 ? b_->tx_size : uv_tx_size();
+        for (int y = 0; y < height; y += kTxHeight[tx_size]) {
+          for (int x = 0; x < width; x += kTxWidth[tx_size]) {
+            transform_block(plane, base_x + x, base_y + y, tx_size);
+          }
+        }
+      }
+    }
+  }
+}
+
+// 5.11.37 Get TX size function, for chroma
+int TileParser::uv_tx_size() const {
+  const int plane_size = kSubsampledSize[b_->mi_size][seq_->subsampling_x][seq_->subsampling_y];
+  const int uv_tx = kMaxTxSizeRect[plane_size];
+  if (kTxWidth[uv_tx] == 64 || kTxHeight[uv_tx] == 64) {
+    if (kTxWidth[uv_tx] == 16) return TX_16X32;
+    if (kTxHeight[uv_tx] == 16) return TX_32X16;
+    return TX_32X32;
+  }
+  return uv_tx;
+}
+
+// 5.11.36 Transform tree syntax
+void TileParser::transform_tree(int start_x, int start_y, int w, int h) {
+  if (start_x >= header_->mi_cols * MI_SIZE || start_y >= header_->mi_rows * MI_SIZE) return;
+  const int row = (start_y >> MI_SIZE_LOG2) & kSbMask;
+  const int col = (start_x >> MI_SIZE_LOG2) & kSbMask;
+  const int luma_tx_size = inter_tx_sizes_[row * kMaxSb4 + col];
+  if (w <= kTxWidth[luma_tx_size] && h <= kTxHeight[luma_tx_size]) {
+    transform_block(0, start_x, start_y, find_tx_size(w, h));
+    return;
+  }
+  const int step_w = w >= h ? w / 2 : w;
+  const int step_h = h >= w ? h / 2 : h;
+  for (int y = 0; y < h; y += step_h) {
+    for (int x = 0; x < w; x += step_w) transform_tree(start_x + x, start_y + y, step_w, step_h);
+  }
+}
+
+// 5.11.35 Transform block syntax
+void TileParser::transform_block(int plane, int start_x, int start_y, int tx_size) {
+  const int max_x = (header_->mi_cols * MI_SIZE) >> (plane > 0 ? seq_->subsampling_x : 0);
+  const int max_y = (header_->mi_rows * MI_SIZE) >> (plane > 0 ? seq_->subsampling_y : 0);
+  if (start_x >= max_x || start_y >= max_y) return;
+  coeffs(plane, start_x >> 2, start_y >> 2, tx_size);
+}
+
+// 5.11.48 Get transform set function
+int TileParser::tx_set(int tx_size) const {
+  const int sqr = kTxSizeSqr[tx_size];
+  const int sqr_up = kTxSizeSqrUp[tx_size];
+  if (sqr_up > TX_32X32) return TX_SET_DCTONLY;
+  if (b_->is_inter) {
+    if (header_->reduced_tx_set || sqr_up == TX_32X32) return TX_SET_INTER_3;
+    return sqr == TX_16X16 ? TX_SET_INTER_2 : TX_SET_INTER_1;
+  }
+  if (sqr_up == TX_32X32) return TX_SET_DCTONLY;
+  return header_->reduced_tx_set || sqr == TX_16X16 ? TX_SET_INTRA_2 : TX_SET_INTRA_1;
+}
+
+// 5.11.47 Transform type syntax
+int TileParser::read_transform_type(int tx_size) {
+  const int set = tx_set(tx_size);
+  if (set == TX_SET_DCTONLY || header_->qindex(b_->segment_id) == 0) return DCT_DCT;
+  const int sqr = kTxSizeSqr[tx_size];
+  if (b_->is_inter) {
+    if (set == TX_SET_INTER_1) return kTxTypeInterInvSet1[read(cdf_.inter_tx_type_set1[sqr])];
+    if (set == TX_SET_INTER_2) return kTxTypeInterInvSet2[read(cdf_.inter_tx_type_set2)];
+    return kTxTypeInterInvSet3[read(cdf_.inter_tx_type_set3[sqr])];
+  }
+  const int intra_dir =
+      b_->use_filter_intra ? kFilterIntraModeToIntraDir[b_->filter_intra_mode] : b_->y_mode;
+  if (set == TX_SET_INTRA_1) {
+    return kTxTypeIntraInvSet1[read(cdf_.intra_tx_type_set1[sqr][intra_dir])];
+  }
+  return kTxTypeIntraInvSet2[read(cdf_.intra_tx_type_set2[sqr][intra_dir])];
+}
+
+// 5.11.40 Compute transform type function, for chroma
+int TileParser::plane_tx_type(int plane, int tx_size, int x4, int y4) const {
+  if (lossless_ || kTxSizeSqrUp[tx_size] > TX_32X32 || plane == 0) return DCT_DCT;
+  const int set = tx_set(tx_size);
+  if (b_->is_inter) {
+    const int col = std::max<int>(b_->mi_col, x4 << seq_->subsampling_x) & kSbMask;
+    const int row = std::max<int>(b_->mi_row, y4 << seq_->subsampling_y) & kSbMask;
+    const int tx_type = tx_types_[row * kMaxSb4 + col];
+    return kTxTypeInSetInter[set][tx_type] ? tx_type : DCT_DCT;
+  }
+  const int tx_type = kModeToTxfm[b_->uv_mode];
+  return kTxTypeInSetIntra[set][tx_type] ? tx_type : DCT_DCT;
+}
+
+// 5.11.39 Coefficients syntax
+void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
+  const int w4 = kTxWidth[tx_size] >> 2;
+  const int h4 = kTxHeight[tx_size] >> 2;
+  const int tx_size_ctx = (kTxSizeSqr[tx_size] + kTxSizeSqrUp[tx_size] + 1) >> 1;
+  const int ptype = plane > 0;
+  const int sub_x = plane > 0 ? seq_->subsampling_x : 0;
+  const int sub_y = plane > 0 ? seq_->subsampling_y : 0;
+  std::uint8_t* above = above_coef_context_[plane].data() + x4;
+  std::uint8_t* left = left_coef_context_[plane].data() + (y4 & kSbMask);
+
+  // Contexts of all_zero and dc_sign. Entries behind the frame's edge are kept at 0.
+  int top_level = 0, left_level = 0, any_above = 0, any_left = 0, dc_sum = 0;
+  const auto dc_value = [](int context) { return (context >> 7) - ((context >> 6) & 1); };
+  for (int k = 0; k < w4; ++k) {
+    top_level = std::max(top_level, above[k] & 63);
+    any_above |= above[k];
+    dc_sum += dc_value(above[k]);
+  }
+  for (int k = 0; k < h4; ++k) {
+    left_level = std::max(left_level, left[k] & 63);
+    any_left |= left[k];
+    dc_sum += dc_value(left[k]);
+  }
+  const int plane_size = kSubsampledSize[b_->mi_size][sub_x][sub_y];
+  const int bw = kBlockWidth[plane_size];
+  const int bh = kBlockHeight[plane_size];
+  int ctx;
+  if (plane == 0) {
+    const int max_level = std::max(top_level, left_level);
+    const int min_level = std::min(top_level, left_level);
+    if (bw == kTxWidth[tx_size] && bh == kTxHeight[tx_size]) {
+      ctx = 0;
+    } else if (max_level == 0) {
+      ctx = 1;
+    } else if (min_level == 0) {
+      ctx = 2 + (max_level > 3);
+    } else if (max_level <= 3) {
+      ctx = 4;
+    } else {
+      ctx = min_level <= 3 ? 5 : 6;
+    }
+  } else {
+    ctx = 7 + (any_above != 0) + (any_left != 0);
+    if (bw * bh > kTxWidth[tx_size] * kTxHeight[tx_size]) ctx += 3;
+  }
+  const bool all_zero = read_flag(cdf_.txb_skip[tx_size_ctx][ctx]);
+
+  int tx_type = DCT_DCT;
+  int cul_level = 0;
+  int dc_category = 0;
+  if (!all_zero) {
+    tx_type = plane == 0 ? read_transform_type(tx_size) : plane_tx_type(plane, tx_size, x4, y4);
+    // TxTypes keeps what was read; a lossless or 64 wide block is DCT_DCT either way.
+    const int c = tx_class(tx_type);
+    const int eob = read_eob(tx_size, tx_size_ctx, ptype, c);
+    b_->num_coefficients += eob;
+    const Scan scan = get_scan(tx_size, tx_type);
+    if (c == TX_CLASS_2D) {
+      read_levels<TX_CLASS_2D>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
+    } else if (c == TX_CLASS_HORIZ) {
+      read_levels<TX_CLASS_HORIZ>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
+    } else {
+      read_levels<TX_CLASS_VERT>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
+    }
+    const int bwl = kTxWidthLog2[kAdjustedTxSize[tx_size]];
+    const auto* scan8 = static_cast<const std::uint8_t*>(scan.positions);
+    const auto* scan16 = static_cast<const std::uint16_t*>(scan.positions);
+    for (int i = 0; i < eob; ++i) {
+      const int pos = scan.wide ? scan16[i] : scan8[i];
+      int level = levels_[pos + (pos >> bwl) * kMargin];
+      if (level == 0) continue;
+      bool sign;
+      if (i == 0) {
+        const int sign_ctx = dc_sum < 0 ? 1 : dc_sum > 0 ? 2 : 0;
+        sign = read_flag(cdf_.dc_sign[ptype][sign_ctx]);
+      } else {
+        sign = symbols_.bit();
+      }
+      if (level > NUM_BASE_LEVELS + COEFF_BASE_RANGE) {
+        int length = 1;
+        while (!symbols_.bit()) {
+          if (++length > 20) throw BitstreamError("coefficient is too large");
+        }
+        int x = 1;
+        for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols_.bit();
+        level = (x + COEFF_BASE_RANGE + NUM_BASE_LEVELS) & 0xFFFFF;
+      }
+      if (pos == 0 && level > 0) dc_category = sign ? 1 : 2;
+      cul_level = std::min(63, cul_level + level);
+    }
+  }
+  if (plane == 0 && b_->is_inter) {
+    for (int i = 0; i < h4; ++i) {
+      std::fill_n(tx_types_.begin() + ((y4 + i) & kSbMask) * kMaxSb4 + (x4 & kSbMask), w4,
+                  static_cast<std::uint8_t>(tx_type));
+    }
+  }
+  const auto value = static_cast<std::uint8_t>(cul_level | (dc_category << 6));
+  const int visible_w = std::min(w4, (header_->mi_cols >> sub_x) - x4);
+  const int visible_h = std::min(h4, (header_->mi_rows >> sub_y) - y4);
+  std::fill_n(above, visible_w, value);
+  std::fill_n(above + visible_w, w4 - visible_w, std::uint8_t{0});
+  std::fill_n(left, visible_h, value);
+  std::fill_n(left + visible_h, h4 - visible_h, std::uint8_t{0});
+}
+
+int TileParser::read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class) {
+  const int ctx = tx_class == TX_CLASS_2D ? 0 : 1;
+  const int eob_multisize = std::min<int>(kTxWidthLog2[tx_size], 5) +
+                            std::min<int>(kTxHeightLog2[tx_size], 5) - 4;
+  int eob_pt;
+  switch (eob_multisize) {
+    case 0: eob_pt = read(cdf_.eob_pt_16[ptype][ctx]) + 1; break;
+    case 1: eob_pt = read(cdf_.eob_pt_32[ptype][ctx]) + 1; break;
+    case 2: eob_pt = read(cdf_.eob_pt_64[ptype][ctx]) + 1; break;
+    case 3: eob_pt = read(cdf_.eob_pt_128[ptype][ctx]) + 1; break;
+    case 4: eob_pt = read(cdf_.eob_pt_256[ptype][ctx]) + 1; break;
+    case 5: eob_pt = read(cdf_.eob_pt_512[ptype]) + 1; break;
+    default: eob_pt = read(cdf_.eob_pt_1024[ptype]) + 1; break;
+  }
+  int eob = eob_pt < 2 ? eob_pt : (1 << (eob_pt - 2)) + 1;
+  if (eob_pt >= 3) {
+    if (read_flag(cdf_.eob_extra[tx_size_ctx][ptype][eob_pt - 3])) eob += 1 << (eob_pt - 3);
+    for (int shift = eob_pt - 4; shift >= 0; --shift) {
+      if (symbols_.bit()) eob += 1 << shift;
+    }
+  }
+  return eob;
+}
+
+// The levels of coeffs( ) up to the Golomb codes, from the last position to the first, into
+// levels_ (row after row with a margin, so that neighbours need no checks)
+template <int kTxClass>
+void TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, const void* scan, bool wide,
+                             int eob) {
+  const int adjusted = kAdjustedTxSize[tx_size];
+  const int bwl = kTxWidthLog2[adjusted];
+  const int stride = (1 << bwl) + kMargin;
+  const int height = kTxHeight[adjusted];
+  std::memset(levels_.data(), 0, static_cast<std::size_t>(stride * (height + kMargin)));
+  const auto* scan8 = static_cast<const std::uint8_t*>(scan);
+  const auto* scan16 = static_cast<const std::uint16_t*>(scan);
+  auto& base_cdfs = cdf_.coeff_base[tx_size_ctx][ptype];
+  auto& br_cdfs = cdf_.coeff_br[std::min(tx_size_ctx, TX_32X32)][ptype];
+  const auto clip3 = [](int level) { return std::min(level, 3); };
+  for (int c = eob - 1; c >= 0; --c) {
+    const int pos = wide ? scan16[c] : scan8[c];
+    const int row = pos >> bwl;
+    const int col = pos - (row << bwl);
+    std::uint8_t* at = &levels_[row * stride + col];
+    int level;
+    if (c == eob - 1) {
+      const int size = height << bwl;
+      const int ctx = c == 0 ? 0 : c <= size / 8 ? 1 : c <= size / 4 ? 2 : 3;
+      level = read(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
+    } else {
+      int mag = clip3(at[1]) + clip3(at[stride]);
+      if constexpr (kTxClass == TX_CLASS_2D) {
+        mag += clip3(at[stride + 1]) + clip3(at[2]) + clip3(at[2 * stride]);
+      } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
+        mag += clip3(at[2]) + clip3(at[3]) + clip3(at[4]);
+      } else {
+        mag += clip3(at[2 * stride]) + clip3(at[3 * stride]) + clip3(at[4 * stride]);
+      }
+      int ctx = std::min((mag + 1) >> 1, 4);
+      if constexpr (kTxClass == TX_CLASS_2D) {
+        ctx = pos == 0 ? 0 : ctx + kCoeffBaseCtxOffset[tx_size][std::min(row, 4)][std::min(col, 4)];
+      } else {
+        ctx += kCoeffBasePosCtxOffset[std::min(kTxClass == TX_CLASS_VERT ? row : col, 2)];
+      }
+      level = read(base_cdfs[ctx]);
+    }
+    if (level > NUM_BASE_LEVELS) {
+      int mag = at[1] + at[stride];
+      bool near;
+      if constexpr (kTxClass == TX_CLASS_2D) {
+        mag += at[stride + 1];
+        near = row < 2 && col < 2;
+      } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
+        mag += at[2];
+        near = col == 0;
+      } else {
+        mag += at[2 * stride];
+        near = row == 0;
+      }
+      const int ctx = std::min((mag + 1) >> 1, 6) + (pos == 0 ? 0 : near ? 7 : 14);
+      for (int idx = 0; idx < COEFF_BASE_RANGE / (BR_CDF_SIZE - 1); ++idx) {
+        const int coeff_br = read(br_cdfs[ctx]);
+        level += coeff_br;
+        if (coeff_br < BR_CDF_SIZE - 1) break;
+      }
+    }
+    *at = static_cast<std::uint8_t>(level);
+  }
+}
+
+}  // namespace colmap_av1::av1
