@@ -1,0 +1,70 @@
+"""Types of the C++ core (csrc/bindings.cc)."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+class BitstreamError(Exception): ...
+class LimitError(Exception): ...
+
+class Event:
+    decode_index: int
+    shown_decode_index: int
+    def header(self) -> dict[str, Any]: ...
+    def take_units(self) -> dict[str, NDArray[Any]]: ...
+    def blocks(self) -> dict[str, NDArray[np.int32]]: ...
+    def ref_decode_index(self) -> NDArray[np.int32]: ...
+    def ref_size(self) -> NDArray[np.int32]: ...
+    def slot_decode_index(self) -> NDArray[np.int32]: ...
+
+class Parser:
+    def __init__(
+        self,
+        operating_point: int = 0,
+        headers_only: bool = False,
+        keep_blocks: bool = False,
+        max_frame_size: int = 268435456,
+    ) -> None: ...
+    def parse(self, data: bytes) -> None: ...
+    def finish(self) -> None: ...
+    def take_events(self) -> list[Event]: ...
+    def sequence_header(self) -> dict[str, int] | None: ...
+
+class TrackBuilder:
+    def __init__(
+        self,
+        *,
+        min_length: int,
+        cosine: float,
+        cosine_relative_to_dominant: bool,
+        cosine_scale: float,
+        max_interval: int,
+        max_block_area: int,
+        max_uncoded_block_area: int,
+        smoothness: float,
+    ) -> None: ...
+    def add(self, **frame: Any) -> None: ...
+    def finish(
+        self,
+    ) -> tuple[int, int, int, NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]: ...
+
+def displacement(
+    list_index: int,
+    mv: NDArray[np.int16],
+    ref_frame: NDArray[np.int8],
+    is_inter: NDArray[np.uint8],
+    use_intrabc: NDArray[np.uint8],
+    motion_mode: NDArray[np.uint8],
+    interintra: NDArray[np.uint8],
+    mi_size: NDArray[np.uint8],
+    warp_index: NDArray[np.int32],
+    local_warp_params: NDArray[np.int32],
+    gm_type: NDArray[np.int32],
+    gm_params: NDArray[np.int32],
+    y_mode: NDArray[np.uint8],
+    ref_size: NDArray[np.int32],
+    width: int,
+    height: int,
+    force_integer_mv: bool = False,
+) -> NDArray[np.float32]: ...

@@ -1,0 +1,263 @@
+"""Motion of a video, read from the AV1 bitstream without decoding pixels."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import BitstreamError, ColmapAv1Error, LimitError
+from colmap_av1.options import ReadOptions
+from colmap_av1.video import open_stream
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """Block data of one coded frame (never of a repeated showing).
+
+    Arrays named after the AV1 specification hold one entry per 4x4 luma unit,
+    shape [mi_rows, mi_cols]. Units may lie beyond the picture edge (MiRows and
+    MiCols are even).
+
+    Attributes:
+        decode_index: number of the frame among the events (decoded frames and
+            show_existing_frame headers) of the stream, from 0, in bitstream order.
+        display_index: number of the frame among the shown frames, in output order,
+            from 0; -1 for a frame that is never shown.
+        width: width in pixels of the picture after super-resolution (UpscaledWidth).
+        height: height in pixels (FrameHeight).
+        header: the frame header's values under the specification's names in
+            snake_case, as Python ints or int32 arrays.
+        ref_decode_index: [8] decode_index of the frame behind RefFrame 0..7
+            (entry 0, INTRA_FRAME, and absent references: -1).
+        ref_display_index: [8] display_index of the same frames, -1 where never shown.
+        ref_size: [8, 2] (width, height) in pixels of the same frames, 0 where absent.
+        slot_decode_index: [8] decode_index of the frame in each reference slot after
+            this frame's reference frame update process; -1 for an empty slot.
+        ref_frame: int8 [mi_rows, mi_cols, 2] RefFrame: 0 INTRA, 1..7 LAST..ALTREF, -1 none.
+        mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list][0 = row, 1 = column] in 1/8 px.
+        mi_size: uint8 MiSize (BLOCK_4X4 = 0 .. BLOCK_64X16 = 21).
+        y_mode: uint8 YMode (DC_PRED = 0 .. NEW_NEWMV = 24).
+        is_inter: uint8; 1 also with use_intrabc.
+        skip: uint8; 1: no residual is coded.
+        skip_mode: uint8.
+        segment_id: uint8.
+        motion_mode: uint8; 0 SIMPLE, 1 OBMC, 2 LOCALWARP.
+        compound_type: uint8; 255 for intra.
+        interintra: uint8.
+        use_intrabc: uint8.
+        warp_index: int32; row of local_warp_params of the unit's block, -1 without
+            a valid local warp.
+        local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
+    """
+
+    decode_index: int
+    display_index: int
+    width: int
+    height: int
+    header: dict[str, Any]
+    ref_decode_index: NDArray[np.int32]
+    ref_display_index: NDArray[np.int32]
+    ref_size: NDArray[np.int32]
+    slot_decode_index: NDArray[np.int32]
+    ref_frame: NDArray[np.int8]
+    mv: NDArray[np.int16]
+    mi_size: NDArray[np.uint8]
+    y_mode: NDArray[np.uint8]
+    is_inter: NDArray[np.uint8]
+    skip: NDArray[np.uint8]
+    skip_mode: NDArray[np.uint8]
+    segment_id: NDArray[np.uint8]
+    motion_mode: NDArray[np.uint8]
+    compound_type: NDArray[np.uint8]
+    interintra: NDArray[np.uint8]
+    use_intrabc: NDArray[np.uint8]
+    warp_index: NDArray[np.int32]
+    local_warp_params: NDArray[np.int32]
+
+    def displacement(self, list_index: int) -> NDArray[np.float32]:
+        """Displacement of every unit's centre into the frame its list references.
+
+        Args:
+            list_index: 0 or 1, the reference list.
+
+        Returns:
+            float32 [mi_rows, mi_cols, 2], (x, y) in pixels of the coded frame (before
+            super-resolution), local and
+            global warp applied; NaN where the unit has no reference in this list.
+        """
+        return np.asarray(
+            _core.displacement(
+                list_index,
+                self.mv,
+                self.ref_frame,
+                self.is_inter,
+                self.use_intrabc,
+                self.motion_mode,
+                self.interintra,
+                self.mi_size,
+                self.warp_index,
+                self.local_warp_params,
+                self.header["gm_type"],
+                self.header["gm_params"],
+                self.y_mode,
+                self.ref_size,
+                self.header["frame_width"],
+                self.height,
+                bool(self.header["force_integer_mv"]),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """One frame of the output, in output order.
+
+    Attributes:
+        decode_index: the event that decoded the frame.
+        first_showing: False where the frame was shown before.
+    """
+
+    decode_index: int
+    first_showing: bool
+
+
+def read_motion(
+    video: str | PathLike[str], options: ReadOptions | None = None
+) -> Iterator[FrameMotion]:
+    """Read the motion of every coded frame of an AV1 video, in bitstream order.
+
+    No pixel is decoded. The headers are read once before, for the display order: which
+    picture a hidden frame becomes is said by a later header. Memory does not grow with the
+    length of the video, but for a few bytes a frame.
+
+    Args:
+        video: a file that `colmap_av1.video.open_stream` takes.
+        options: how to read.
+
+    Yields:
+        One FrameMotion per coded frame. A damaged stream yields the frames before the
+        damage, and a warning names the damage; see Raises.
+
+    Raises:
+        BitstreamError: the stream is damaged before its first frame is complete, or anywhere
+            with `options.strict`.
+        LimitError: a frame is larger than `options.max_frame_size`.
+        VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
+    """
+    options = options if options is not None else ReadOptions()
+    shown = shown_frames(video, options)
+    display_index: dict[int, int] = {}
+    for index, frame in enumerate(shown):
+        display_index.setdefault(frame.decode_index, index)
+    count = 0
+    try:
+        for event in _events(video, options, headers_only=False):
+            header = event.header()
+            if header["show_existing_frame"]:
+                continue
+            yield _frame_motion(event, header, display_index)
+            count += 1
+    except BitstreamError as error:
+        if options.strict or count == 0:
+            raise
+        warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
+
+
+def shown_frames(
+    video: str | PathLike[str], options: ReadOptions | None = None
+) -> list[ShownFrame]:
+    """Read the headers of a video and list its shown frames in output order.
+
+    Of a temporal unit with several spatial layers the highest is output (7.18.1).
+
+    Returns:
+        The shown frames before the first damage, if there is one; its error is left to
+        the reader of the blocks.
+
+    Raises:
+        LimitError: a frame is larger than `options.max_frame_size`.
+        VideoError: as `read_motion`.
+    """
+    options = options if options is not None else ReadOptions()
+    shown: list[ShownFrame] = []
+    seen: set[int] = set()
+    last_unit = -1
+    try:
+        for event in _events(video, options, headers_only=True):
+            header = event.header()
+            if not header["show_frame"]:
+                continue
+            repeated = bool(header["show_existing_frame"])
+            decoded = event.shown_decode_index if repeated else event.decode_index
+            if header["temporal_unit"] == last_unit and shown:
+                seen.discard(shown.pop().decode_index)
+            last_unit = header["temporal_unit"]
+            shown.append(ShownFrame(decoded, decoded not in seen))
+            seen.add(decoded)
+    except BitstreamError:
+        pass
+    return shown
+
+
+def _events(
+    video: str | PathLike[str], options: ReadOptions, *, headers_only: bool
+) -> Iterator[Any]:
+    """Events of the parser in bitstream order; those before an error come first."""
+    parser = _core.Parser(
+        operating_point=options.operating_point,
+        headers_only=headers_only,
+        max_frame_size=options.max_frame_size,
+    )
+    with open_stream(video) as stream:
+        if stream.configuration:
+            _parse(parser, stream.configuration, video, options)
+        for packet in stream.packets():
+            error = _parse(parser, packet.data, video, options)
+            yield from parser.take_events()
+            if error is not None:
+                raise error
+    try:
+        parser.finish()
+    except _core.BitstreamError as error:
+        raise BitstreamError(f"{video}: {error}") from error
+
+
+def _parse(
+    parser: Any, data: bytes, video: str | PathLike[str], options: ReadOptions
+) -> ColmapAv1Error | None:
+    """Parse a packet; an error is returned, so that the events before it can be taken."""
+    try:
+        parser.parse(data)
+    except _core.BitstreamError as error:
+        return BitstreamError(f"{video}: {error}")
+    except _core.LimitError as error:
+        return LimitError(
+            f"{video}: {error} of {options.max_frame_size} samples: allow more with max_frame_size"
+        )
+    return None
+
+
+def _frame_motion(event: Any, header: dict[str, Any], display_index: dict[int, int]) -> FrameMotion:
+    def displayed(indices: NDArray[np.int32]) -> NDArray[np.int32]:
+        return np.array([display_index.get(int(i), -1) for i in indices], dtype=np.int32)
+
+    ref_decode_index = event.ref_decode_index()
+    return FrameMotion(
+        decode_index=event.decode_index,
+        display_index=display_index.get(event.decode_index, -1),
+        width=header["upscaled_width"],
+        height=header["frame_height"],
+        header=header,
+        ref_decode_index=ref_decode_index,
+        ref_display_index=displayed(ref_decode_index),
+        ref_size=event.ref_size(),
+        slot_decode_index=event.slot_decode_index(),
+        **event.take_units(),
+    )
