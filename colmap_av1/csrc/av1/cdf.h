@@ -130,6 +130,7 @@ struct CdfContext {
 #undef COLMAP_AV1_DECLARE
   std::uint16_t delta_lf_multi[4][5];
   MvCdfs mv[2];  // MvCtx: 0, MV_INTRABC_CONTEXT
+  std::uint16_t padding[16];  // SymbolDecoder works on whole vectors
 
   void init_non_coeff_cdfs();
   void init_coeff_cdfs(int base_q_idx);

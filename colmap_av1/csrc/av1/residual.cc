@@ -2,7 +2,7 @@
 // then dropped (specification sections 5.11.15 to 5.11.17, 5.11.34, 5.11.37 to 5.11.41, 5.11.47,
 // 5.11.48; contexts as in 8.3.2).
 #include <algorithm>
-#include <cstring>
+#include <vector>
 
 #include "av1/error.h"
 #include "av1/spec_tables.h"
@@ -36,37 +36,98 @@ int tx_class(int tx_type) {
   }
 }
 
-// 5.11.41 Get scan function. Scans of 512 positions and more have 16-bit entries.
-struct Scan {
-  const void* positions;
-  bool wide;
+// What the levels loop needs of one scan position.
+struct ScanEntry {
+  std::uint16_t index;      // into TileParser::levels_
+  std::uint8_t base_offset; // added to the context of coeff_base
+  std::uint8_t br_offset;   // added to the context of coeff_br
 };
 
-Scan get_scan(int tx_size, int tx_type) {
-  if (tx_size == TX_16X64) return {kDefaultScan16x32, true};
-  if (tx_size == TX_64X16) return {kDefaultScan32x16, true};
-  if (kTxSizeSqrUp[tx_size] == TX_64X64) return {kDefaultScan32x32, true};
-  const int c = tx_class(tx_type);  // preferRow: TX_CLASS_VERT, preferCol: TX_CLASS_HORIZ
-  const auto choose = [c](const void* def, const void* mrow, const void* mcol) {
-    return Scan{c == TX_CLASS_2D ? def : c == TX_CLASS_VERT ? mrow : mcol, false};
-  };
-  switch (tx_size) {
-    case TX_4X4: return choose(kDefaultScan4x4, kMrowScan4x4, kMcolScan4x4);
-    case TX_4X8: return choose(kDefaultScan4x8, kMrowScan4x8, kMcolScan4x8);
-    case TX_8X4: return choose(kDefaultScan8x4, kMrowScan8x4, kMcolScan8x4);
-    case TX_8X8: return choose(kDefaultScan8x8, kMrowScan8x8, kMcolScan8x8);
-    case TX_8X16: return choose(kDefaultScan8x16, kMrowScan8x16, kMcolScan8x16);
-    case TX_16X8: return choose(kDefaultScan16x8, kMrowScan16x8, kMcolScan16x8);
-    case TX_16X16: return choose(kDefaultScan16x16, kMrowScan16x16, kMcolScan16x16);
-    case TX_4X16: return choose(kDefaultScan4x16, kMrowScan4x16, kMcolScan4x16);
-    case TX_16X4: return choose(kDefaultScan16x4, kMrowScan16x4, kMcolScan16x4);
-    case TX_8X32: return {kDefaultScan8x32, false};
-    case TX_32X8: return {kDefaultScan32x8, false};
-    case TX_16X32: return {kDefaultScan16x32, true};
-    case TX_32X16: return {kDefaultScan32x16, true};
-    default: return {kDefaultScan32x32, true};
+// The scans of all transform sizes and classes with the parts of the contexts that depend on the
+// position alone.
+class ScanTables {
+ public:
+  ScanTables() {
+    std::size_t size = 0;
+    for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) size += 3 * num_positions(tx_size);
+    entries_.reserve(size);
+    for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) {
+      for (int c = 0; c < 3; ++c) {
+        first_[tx_size][c] = entries_.size();
+        add(tx_size, c);
+      }
+    }
   }
-}
+
+  const ScanEntry* get(int tx_size, int tx_class) const {
+    return entries_.data() + first_[tx_size][tx_class];
+  }
+
+ private:
+  static std::size_t num_positions(int tx_size) {
+    const int adjusted = kAdjustedTxSize[tx_size];
+    return std::size_t{kTxWidth[adjusted]} * kTxHeight[adjusted];
+  }
+
+  // 5.11.41 Get scan function
+  template <typename Visit>
+  static void visit_scan(int tx_size, int c, Visit&& visit) {
+    const auto choose = [&](const auto& def, const auto& mrow, const auto& mcol) {
+      visit(c == TX_CLASS_2D ? def : c == TX_CLASS_VERT ? mrow : mcol);
+    };
+    switch (tx_size) {
+      case TX_4X4: return choose(kDefaultScan4x4, kMrowScan4x4, kMcolScan4x4);
+      case TX_4X8: return choose(kDefaultScan4x8, kMrowScan4x8, kMcolScan4x8);
+      case TX_8X4: return choose(kDefaultScan8x4, kMrowScan8x4, kMcolScan8x4);
+      case TX_8X8: return choose(kDefaultScan8x8, kMrowScan8x8, kMcolScan8x8);
+      case TX_8X16: return choose(kDefaultScan8x16, kMrowScan8x16, kMcolScan8x16);
+      case TX_16X8: return choose(kDefaultScan16x8, kMrowScan16x8, kMcolScan16x8);
+      case TX_16X16: return choose(kDefaultScan16x16, kMrowScan16x16, kMcolScan16x16);
+      case TX_4X16: return choose(kDefaultScan4x16, kMrowScan4x16, kMcolScan4x16);
+      case TX_16X4: return choose(kDefaultScan16x4, kMrowScan16x4, kMcolScan16x4);
+      case TX_8X32: return visit(kDefaultScan8x32);
+      case TX_32X8: return visit(kDefaultScan32x8);
+      case TX_16X32:
+      case TX_16X64: return visit(kDefaultScan16x32);
+      case TX_32X16:
+      case TX_64X16: return visit(kDefaultScan32x16);
+      default: return visit(kDefaultScan32x32);
+    }
+  }
+
+  void add(int tx_size, int c) {
+    const int bwl = kTxWidthLog2[kAdjustedTxSize[tx_size]];
+    visit_scan(tx_size, c, [&](const auto& scan) {
+      for (const int pos : scan) {
+        const int row = pos >> bwl;
+        const int col = pos - (row << bwl);
+        ScanEntry entry;
+        entry.index = static_cast<std::uint16_t>(pos + row * kMargin);
+        bool near;
+        if (c == TX_CLASS_2D) {
+          entry.base_offset = kCoeffBaseCtxOffset[tx_size][std::min(row, 4)][std::min(col, 4)];
+          near = row < 2 && col < 2;
+        } else {
+          const int along = c == TX_CLASS_VERT ? row : col;
+          entry.base_offset = kCoeffBasePosCtxOffset[std::min(along, 2)];
+          near = along == 0;
+        }
+        entry.br_offset = pos == 0 ? 0 : near ? 7 : 14;
+        entries_.push_back(entry);
+      }
+    });
+  }
+
+  std::vector<ScanEntry> entries_;
+  std::size_t first_[TX_SIZES_ALL][3];
+};
+
+const ScanTables kScanTables;
+
+// Levels are stored with their value up to 15 in the low six bits, for coeff_br, and their value
+// up to 3 in the high two, for coeff_base: one sum over the neighbours serves both contexts.
+constexpr int kLevelMask = 63;
+constexpr int kClippedShift = 6;
 
 }  // namespace
 
@@ -366,23 +427,16 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
     const int c = tx_class(tx_type);
     const int eob = read_eob(tx_size, tx_size_ctx, ptype, c);
     b_->num_coefficients += eob;
-    const Scan scan = get_scan(tx_size, tx_type);
-    if (c == TX_CLASS_2D) {
-      read_levels<TX_CLASS_2D>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
-    } else if (c == TX_CLASS_HORIZ) {
-      read_levels<TX_CLASS_HORIZ>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
-    } else {
-      read_levels<TX_CLASS_VERT>(tx_size, tx_size_ctx, ptype, scan.positions, scan.wide, eob);
-    }
-    const int bwl = kTxWidthLog2[kAdjustedTxSize[tx_size]];
-    const auto* scan8 = static_cast<const std::uint8_t*>(scan.positions);
-    const auto* scan16 = static_cast<const std::uint16_t*>(scan.positions);
-    for (int i = 0; i < eob; ++i) {
-      const int pos = scan.wide ? scan16[i] : scan8[i];
-      int level = levels_[pos + (pos >> bwl) * kMargin];
-      if (level == 0) continue;
+    const int num_levels =
+        c == TX_CLASS_2D      ? read_levels<TX_CLASS_2D>(tx_size, tx_size_ctx, ptype, eob)
+        : c == TX_CLASS_HORIZ ? read_levels<TX_CLASS_HORIZ>(tx_size, tx_size_ctx, ptype, eob)
+                              : read_levels<TX_CLASS_VERT>(tx_size, tx_size_ctx, ptype, eob);
+    for (int i = num_levels - 1; i >= 0; --i) {
+      const int index = nonzero_[i];
+      int level = levels_[index] & kLevelMask;
+      levels_[index] = 0;  // the array is all 0 between transform blocks
       bool sign;
-      if (i == 0) {
+      if (index == 0) {
         const int sign_ctx = dc_sum < 0 ? 1 : dc_sum > 0 ? 2 : 0;
         sign = read_flag(cdf_.dc_sign[ptype][sign_ctx]);
       } else {
@@ -391,13 +445,16 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
       if (level > NUM_BASE_LEVELS + COEFF_BASE_RANGE) {
         int length = 1;
         while (!symbols_.bit()) {
-          if (++length > 20) throw BitstreamError("coefficient is too large");
+          if (++length > 20) {
+            levels_.fill(0);
+            throw BitstreamError("coefficient is too large");
+          }
         }
         int x = 1;
         for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols_.bit();
         level = (x + COEFF_BASE_RANGE + NUM_BASE_LEVELS) & 0xFFFFF;
       }
-      if (pos == 0 && level > 0) dc_category = sign ? 1 : 2;
+      if (index == 0 && level > 0) dc_category = sign ? 1 : 2;
       cul_level = std::min(63, cul_level + level);
     }
   }
@@ -441,69 +498,65 @@ int TileParser::read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class) 
 }
 
 // The levels of coeffs( ) up to the Golomb codes, from the last position to the first, into
-// levels_ (row after row with a margin, so that neighbours need no checks)
+// levels_ (row after row with a margin, so that neighbours need no checks). Returns how many are
+// not 0; nonzero_ holds their places.
 template <int kTxClass>
-void TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, const void* scan, bool wide,
-                             int eob) {
+int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
   const int adjusted = kAdjustedTxSize[tx_size];
-  const int bwl = kTxWidthLog2[adjusted];
-  const int stride = (1 << bwl) + kMargin;
-  const int height = kTxHeight[adjusted];
-  std::memset(levels_.data(), 0, static_cast<std::size_t>(stride * (height + kMargin)));
-  const auto* scan8 = static_cast<const std::uint8_t*>(scan);
-  const auto* scan16 = static_cast<const std::uint16_t*>(scan);
+  const int stride = kTxWidth[adjusted] + kMargin;
+  const ScanEntry* scan = kScanTables.get(tx_size, kTxClass);
   auto& base_cdfs = cdf_.coeff_base[tx_size_ctx][ptype];
   auto& br_cdfs = cdf_.coeff_br[std::min(tx_size_ctx, TX_32X32)][ptype];
-  const auto clip3 = [](int level) { return std::min(level, 3); };
+  int num_levels = 0;
   for (int c = eob - 1; c >= 0; --c) {
-    const int pos = wide ? scan16[c] : scan8[c];
-    const int row = pos >> bwl;
-    const int col = pos - (row << bwl);
-    std::uint8_t* at = &levels_[row * stride + col];
+    const ScanEntry entry = scan[c];
+    std::uint8_t* at = &levels_[entry.index];
+    // Neighbours that both contexts use
+    int mag = at[1] + at[stride];
+    if constexpr (kTxClass == TX_CLASS_2D) {
+      mag += at[stride + 1];
+    } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
+      mag += at[2];
+    } else {
+      mag += at[2 * stride];
+    }
     int level;
     if (c == eob - 1) {
-      const int size = height << bwl;
+      const int size = kTxWidth[adjusted] * kTxHeight[adjusted];
       const int ctx = c == 0 ? 0 : c <= size / 8 ? 1 : c <= size / 4 ? 2 : 3;
       level = read(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
     } else {
-      int mag = clip3(at[1]) + clip3(at[stride]);
+      int sum = mag;
       if constexpr (kTxClass == TX_CLASS_2D) {
-        mag += clip3(at[stride + 1]) + clip3(at[2]) + clip3(at[2 * stride]);
+        sum += at[2] + at[2 * stride];
       } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
-        mag += clip3(at[2]) + clip3(at[3]) + clip3(at[4]);
+        sum += at[3] + at[4];
       } else {
-        mag += clip3(at[2 * stride]) + clip3(at[3 * stride]) + clip3(at[4 * stride]);
+        sum += at[3 * stride] + at[4 * stride];
       }
-      int ctx = std::min((mag + 1) >> 1, 4);
-      if constexpr (kTxClass == TX_CLASS_2D) {
-        ctx = pos == 0 ? 0 : ctx + kCoeffBaseCtxOffset[tx_size][std::min(row, 4)][std::min(col, 4)];
+      // Min( ( sum of clipped levels + 1 ) >> 1, 4 ). The low bits of five levels carry into
+      // the clipped sum only where that is 15.
+      int ctx = std::min((sum + (1 << kClippedShift)) >> (kClippedShift + 1), 4);
+      if (kTxClass == TX_CLASS_2D && c == 0) {
+        ctx = 0;
       } else {
-        ctx += kCoeffBasePosCtxOffset[std::min(kTxClass == TX_CLASS_VERT ? row : col, 2)];
+        ctx += entry.base_offset;
       }
       level = read(base_cdfs[ctx]);
+      if (level == 0) continue;
     }
     if (level > NUM_BASE_LEVELS) {
-      int mag = at[1] + at[stride];
-      bool near;
-      if constexpr (kTxClass == TX_CLASS_2D) {
-        mag += at[stride + 1];
-        near = row < 2 && col < 2;
-      } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
-        mag += at[2];
-        near = col == 0;
-      } else {
-        mag += at[2 * stride];
-        near = row == 0;
-      }
-      const int ctx = std::min((mag + 1) >> 1, 6) + (pos == 0 ? 0 : near ? 7 : 14);
+      const int ctx = std::min(((mag & kLevelMask) + 1) >> 1, 6) + entry.br_offset;
       for (int idx = 0; idx < COEFF_BASE_RANGE / (BR_CDF_SIZE - 1); ++idx) {
         const int coeff_br = read(br_cdfs[ctx]);
         level += coeff_br;
         if (coeff_br < BR_CDF_SIZE - 1) break;
       }
     }
-    *at = static_cast<std::uint8_t>(level);
+    *at = static_cast<std::uint8_t>(level | (std::min(level, 3) << kClippedShift));
+    nonzero_[num_levels++] = entry.index;
   }
+  return num_levels;
 }
 
 }  // namespace colmap_av1::av1

@@ -5,6 +5,10 @@
 #include <cstddef>
 #include <cstdint>
 
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
 namespace colmap_av1::av1 {
 
 // Reads symbols coded with adaptive cumulative distributions.
@@ -31,34 +35,45 @@ class SymbolDecoder {
   // 8.2.6 Symbol decoding process, N the number of symbols of the array
   template <int N>
   int symbol(std::uint16_t* icdf) {
-    const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
-    const std::uint32_t r = range_ >> 8;
-    std::uint32_t previous;
-    std::uint32_t current = range_;
-    int symbol = -1;
-    do {
-      ++symbol;
-      previous = current;
-      current = ((r * (static_cast<std::uint32_t>(icdf[symbol]) >> 6)) >> 1) +
-                4 * static_cast<std::uint32_t>(N - 1 - symbol);
-    } while (value < current);
-    renormalize(previous - current, current);
-    if (update_) adapt<N>(icdf, symbol);
-    return symbol;
+    static_assert(N >= 2 && N <= 16);
+    if constexpr (N == 2) {
+      return flag(icdf);
+    } else {
+      // Decoded symbols are close to random, so the search runs without branches: every bound
+      // is computed, and the symbol is the number of bounds above the value.
+      std::uint16_t bounds[kLanes<N> + 1];
+      const int symbol = find_symbol<N>(icdf, bounds + 1);
+      bounds[0] = static_cast<std::uint16_t>(range_);
+      renormalize(static_cast<std::uint32_t>(bounds[symbol] - bounds[symbol + 1]),
+                  bounds[symbol + 1]);
+      return symbol;
+    }
   }
 
-  bool flag(std::uint16_t* icdf) { return symbol<2>(icdf) != 0; }
+  // A symbol of an array of two.
+  bool flag(std::uint16_t* icdf) {
+    const std::uint32_t v = icdf[0];
+    const bool result = flag_without_update(v);
+    if (update_) {
+      const std::uint32_t count = icdf[2];
+      const int rate = 4 + (count > 15) + (count > 31);
+      const std::uint32_t target = result ? 32768 : 0;
+      const std::uint32_t up = (target - v) >> rate;  // of a symbol 1: the bound rises
+      const std::uint32_t down = v >> rate;
+      icdf[0] = static_cast<std::uint16_t>(result ? v + up : v - down);
+      icdf[2] = static_cast<std::uint16_t>(count + (count < 32));
+    }
+    return result;
+  }
 
   // A two-valued symbol whose distribution is built for the call and not adapted.
   bool flag_without_update(std::uint32_t icdf0) {
     const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
     const std::uint32_t current = (((range_ >> 8) * (icdf0 >> 6)) >> 1) + 4;
-    if (value < current) {
-      renormalize(current, 0);
-      return true;
-    }
-    renormalize(range_ - current, current);
-    return false;
+    const bool result = value < current;
+    const std::uint32_t mask = result ? 0U : ~0U;  // a select instead of an unpredictable branch
+    renormalize(current + ((range_ - 2 * current) & mask), current & mask);
+    return result;
   }
 
   // 8.2.3 Boolean decoding process
@@ -97,17 +112,104 @@ class SymbolDecoder {
   }
 
  private:
+  // Entries that find_symbol writes: whole vectors of 4, 8 or 16 lanes.
   template <int N>
-  static void adapt(std::uint16_t* icdf, int symbol) {
-    constexpr int kLog2 = N >= 4 ? 2 : 1;  // Min( FloorLog2( N ), 2 )
-    const int count = icdf[N];
-    const int rate = 3 + (count > 15) + (count > 31) + kLog2;
-    for (int i = 0; i < N - 1; ++i) {
-      const int v = icdf[i];
-      icdf[i] = static_cast<std::uint16_t>(i < symbol ? v + ((32768 - v) >> rate) : v - (v >> rate));
-    }
-    icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
+  static constexpr int kLanes = N <= 4 ? 4 : N <= 8 ? 8 : 16;
+
+  static int adaptation_rate(int count, int n) {
+    return 3 + (count > 15) + (count > 31) + (n >= 4 ? 2 : 1);  // Min( FloorLog2( N ), 2 )
   }
+
+#if defined(__SSE2__)
+  // Bounds of all symbols into `bounds`, the symbol as result, and the adaptation of the array.
+  // Arrays of 3 and 4 symbols take half a register; lanes behind the last symbol are read and
+  // written back unchanged (CdfContext has room behind its last array).
+  template <int N>
+  int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
+    constexpr int kVectors = N <= 8 ? 1 : 2;
+    // (((r >> 8) * (f >> 6)) >> 1) as the upper half of ((r >> 8) << 8) * ((f >> 6) << 7)
+    const __m128i r = _mm_set1_epi16(static_cast<short>(range_ & 0xFF00));
+    const __m128i value = _mm_set1_epi16(static_cast<short>(window_ >> 48));
+    const __m128i lane = _mm_set_epi16(7, 6, 5, 4, 3, 2, 1, 0);
+    __m128i f[kVectors];
+    __m128i below[kVectors];
+    unsigned mask = 0;
+    for (int k = 0; k < kVectors; ++k) {
+      f[k] = load<N>(icdf + 8 * k);
+      const __m128i scaled = _mm_slli_epi16(_mm_srli_epi16(f[k], 6), 7);
+      const __m128i least = _mm_slli_epi16(
+          _mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
+      const __m128i bound = _mm_add_epi16(_mm_mulhi_epu16(scaled, r), least);
+      store<N>(bounds + 8 * k, bound);
+      // value < bound, unsigned
+      const __m128i not_below = _mm_cmpeq_epi16(_mm_subs_epu16(bound, value), _mm_setzero_si128());
+      below[k] = _mm_xor_si128(not_below, _mm_set1_epi16(-1));
+      mask |= static_cast<unsigned>(_mm_movemask_epi8(below[k])) << (16 * k);
+    }
+    constexpr unsigned kMask =
+        N == 16 ? 0x3FFFFFFFU : static_cast<unsigned>((std::uint64_t{1} << (2 * (N - 1))) - 1);
+    const int symbol = std::countr_one(mask & kMask) >> 1;
+    if (update_) {
+      const int count = icdf[N];
+      const __m128i rate = _mm_cvtsi32_si128(adaptation_rate(count, N));
+      for (int k = 0; k < kVectors; ++k) {
+        // v + ((32768 - v) >> rate) before the symbol, v - (v >> rate) from it on
+        const __m128i one = _mm_set1_epi16(static_cast<short>(0x8000));
+        const __m128i flipped = _mm_sub_epi16(_mm_and_si128(below[k], one), f[k]);
+        const __m128i magnitude = _mm_or_si128(_mm_and_si128(below[k], flipped),
+                                               _mm_andnot_si128(below[k], f[k]));
+        const __m128i step = _mm_srl_epi16(magnitude, rate);
+        const __m128i negative = _mm_xor_si128(below[k], _mm_set1_epi16(-1));
+        const __m128i delta = _mm_sub_epi16(_mm_xor_si128(step, negative), negative);
+        const __m128i used =
+            _mm_cmplt_epi16(lane, _mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)));
+        store<N>(icdf + 8 * k, _mm_add_epi16(f[k], _mm_and_si128(delta, used)));
+      }
+      icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
+    }
+    return symbol;
+  }
+
+  template <int N>
+  static __m128i load(const std::uint16_t* p) {
+    const auto* v = reinterpret_cast<const __m128i*>(p);
+    return N <= 4 ? _mm_loadl_epi64(v) : _mm_loadu_si128(v);
+  }
+
+  template <int N>
+  static void store(std::uint16_t* p, __m128i value) {
+    auto* v = reinterpret_cast<__m128i*>(p);
+    if constexpr (N <= 4) {
+      _mm_storel_epi64(v, value);
+    } else {
+      _mm_storeu_si128(v, value);
+    }
+  }
+#else
+  template <int N>
+  int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
+    const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
+    const std::uint32_t r = range_ >> 8;
+    int symbol = 0;
+    for (int i = 0; i < N; ++i) {
+      const std::uint32_t bound = ((r * (static_cast<std::uint32_t>(icdf[i]) >> 6)) >> 1) +
+                                  4 * static_cast<std::uint32_t>(N - 1 - i);
+      bounds[i] = static_cast<std::uint16_t>(bound);
+      symbol += value < bound;
+    }
+    if (update_) {
+      const int count = icdf[N];
+      const int rate = adaptation_rate(count, N);
+      for (int i = 0; i < N - 1; ++i) {
+        const int v = icdf[i];
+        icdf[i] =
+            static_cast<std::uint16_t>(i < symbol ? v + ((32768 - v) >> rate) : v - (v >> rate));
+      }
+      icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
+    }
+    return symbol;
+  }
+#endif
 
   void renormalize(std::uint32_t range, std::uint32_t subtrahend) {
     const int bits = std::countl_zero(static_cast<std::uint16_t>(range));
@@ -119,6 +221,16 @@ class SymbolDecoder {
 
   void refill() {
     int shift = 40 - available_;
+    if (end_ - data_ >= 8) {
+      // As many whole bytes as fit, in one load.
+      std::uint64_t bytes = 0;
+      for (int i = 0; i < 8; ++i) bytes = (bytes << 8) | data_[i];
+      const int count = (shift >> 3) + 1;
+      window_ |= (~bytes >> (64 - 8 * count)) << (shift & 7);
+      data_ += count;
+      available_ += 8 * count;
+      return;
+    }
     for (; shift >= 0; shift -= 8) {
       std::uint64_t byte = 0;
       if (data_ < end_) {
