@@ -1,0 +1,43 @@
+// The motion that most of a frame shares: what the camera did, shake included.
+
+#ifndef COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_
+#define COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_
+
+#include <span>
+#include <vector>
+
+namespace colmap_av1::tracks {
+
+struct MotionSample {
+  float x = 0.F;
+  float y = 0.F;
+  float dx = 0.F;
+  float dy = 0.F;
+};
+
+// Displacement (dx, dy) = u, v . (1, (x - center_x) * scale, (y - center_y) * scale).
+struct DominantMotion {
+  bool valid = false;
+  double center_x = 0;
+  double center_y = 0;
+  double scale = 1;
+  double u[3] = {};
+  double v[3] = {};
+
+  double dx(double x, double y) const {
+    return u[0] + u[1] * (x - center_x) * scale + u[2] * (y - center_y) * scale;
+  }
+  double dy(double x, double y) const {
+    return v[0] + v[1] * (x - center_x) * scale + v[2] * (y - center_y) * scale;
+  }
+};
+
+// Affine motion field by iteratively reweighted least squares (Tukey's biweight,
+// started at the median). Not valid with too few samples to tell a majority.
+// `scratch` is working memory kept by the caller.
+DominantMotion fit_dominant_motion(std::span<const MotionSample> samples, double width,
+                                   double height, std::vector<float>& scratch);
+
+}  // namespace colmap_av1::tracks
+
+#endif  // COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_

@@ -1,0 +1,635 @@
+#include "tracks/track_builder.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+
+#include "av1/spec_tables.h"
+
+namespace colmap_av1::tracks {
+namespace {
+
+constexpr float kUnit = 4.F;
+constexpr float kHalfUnit = 2.F;
+constexpr std::size_t kMaxDominantSamples = 1024;
+constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
+
+int block_area(int mi_size) { return av1::kBlockWidth[mi_size] * av1::kBlockHeight[mi_size]; }
+
+}  // namespace
+
+TrackBuilder::TrackBuilder(const TrackBuilderOptions& options) : options_(options) {}
+
+void TrackBuilder::add(const CodedFrame& coded) {
+  check_motion_field(coded.field);
+  if (find_frame(coded.decode_index) != nullptr) {
+    throw std::invalid_argument("a decode_index occurs twice");
+  }
+  if (coded.display_index >= 0) {
+    if (coded.display_index <= last_display_ || is_waiting(coded.display_index)) {
+      throw std::invalid_argument("the frames are not in bitstream order: a display_index "
+                                  "comes twice or too late");
+    }
+    if (width_ == 0) {
+      width_ = coded.width;
+      height_ = coded.height;
+    }
+    num_frames_ = std::max(num_frames_, coded.display_index + 1);
+  }
+  Frame& frame = read_frame(coded);
+  if (frame.display_index < 0) {
+    chain_frame(frame);
+  } else if (coded.show_frame) {
+    // Frames are output in display order: all before this one have been read.
+    last_display_ = coded.display_index;
+    chain_up_to(frame.display_index);
+  }
+  release_frames(coded.slot_decode_index);
+}
+
+TrackArrays TrackBuilder::finish() {
+  chain_up_to(std::numeric_limits<int>::max());
+  for (const auto& frame : frames_) release(*frame);
+  frames_.clear();
+  std::sort(kept_.begin(), kept_.end(),
+            [](const Kept& a, const Kept& b) { return a.serial < b.serial; });
+
+  TrackArrays out;
+  out.num_frames = num_frames_;
+  out.width = width_;
+  out.height = height_;
+  out.offsets.reserve(kept_.size() + 1);
+  out.offsets.push_back(0);
+  for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
+  const auto total = static_cast<std::size_t>(out.offsets.back());
+  out.frame.reserve(total);
+  out.xy.reserve(2 * total);
+  std::vector<Observation> path;
+  for (const Kept& kept : kept_) {
+    path.clear();
+    for (int32_t o = kept.last_observation; o >= 0; o = observations_[o].previous) {
+      path.push_back(observations_[o]);
+    }
+    std::reverse(path.begin(), path.end());
+    for (const Observation& o : path) {
+      out.frame.push_back(o.frame);
+      out.xy.push_back(o.position.x);
+      out.xy.push_back(o.position.y);
+    }
+  }
+  *this = TrackBuilder(options_);
+  return out;
+}
+
+TrackBuilder::Frame* TrackBuilder::find_frame(int decode_index) const {
+  for (const auto& frame : frames_) {
+    if (frame->decode_index == decode_index) return frame.get();
+  }
+  return nullptr;
+}
+
+bool TrackBuilder::is_waiting(int display_index) const {
+  return std::any_of(frames_.begin(), frames_.end(), [display_index](const auto& frame) {
+    return !frame->chained && frame->display_index == display_index;
+  });
+}
+
+// Copies what chaining needs of a coded frame: the displacements that may be trusted.
+TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
+  if (idle_frames_.empty()) idle_frames_.push_back(std::make_unique<Frame>());
+  frames_.push_back(std::move(idle_frames_.back()));
+  idle_frames_.pop_back();
+  Frame& frame = *frames_.back();
+  MotionField field = coded.field;
+  const int num_units = field.num_units();
+  frame.decode_index = coded.decode_index;
+  frame.display_index = coded.display_index;
+  frame.chained = false;
+  frame.rows = field.mi_rows;
+  frame.cols = field.mi_cols;
+  frame.visible_rows = std::min(field.mi_rows, (field.height + 3) / 4);
+  frame.visible_cols = std::min(field.mi_cols, (field.width + 3) / 4);
+  frame.width = static_cast<float>(coded.width);
+  frame.height = static_cast<float>(coded.height);
+  frame.coded_width = static_cast<float>(field.width);
+  frame.upscale = frame.width / frame.coded_width;
+  for (int ref = 0; ref < kNumRefs; ++ref) {
+    const int display_index = coded.ref_display_index[ref];
+    frame.ref_decode_index[ref] = ref > 0 ? coded.ref_decode_index[ref] : -1;
+    frame.ref_interval[ref] = display_index >= 0 && coded.display_index >= 0
+                                  ? display_index - coded.display_index
+                                  : 0;
+  }
+  frame.warps.assign(field.local_warp_params, field.local_warp_params + 6 * field.num_local_warps);
+  frame.warps.insert(frame.warps.end(), field.gm_params, field.gm_params + 6 * (kNumRefs - 1));
+  field.local_warp_params = frame.warps.data();
+  field.gm_params = frame.warps.data() + 6 * field.num_local_warps;
+
+  const DisplacementModel model(field);
+  frame.mi_size.assign(field.mi_size, field.mi_size + num_units);
+  for (auto& list : frame.motion) list.assign(frame.mi_size.size(), UnitMotion{});
+  for (int row = 0; row < frame.visible_rows; ++row) {
+    for (int col = 0; col < frame.visible_cols; ++col) {
+      const int unit = row * field.mi_cols + col;
+      const int area = block_area(field.mi_size[unit]);
+      if (options_.max_block_area >= 0 && area > options_.max_block_area) continue;
+      if (options_.max_uncoded_block_area >= 0 && coded.skip[unit] != 0 &&
+          area > options_.max_uncoded_block_area) {
+        continue;
+      }
+      for (int list = 0; list < 2; ++list) {
+        const Displacement d = model.at(unit, list);
+        if (d.ref == 0 || !is_within_reach(frame.ref_interval[d.ref])) continue;
+        const int32_t warp =
+            d.warp == nullptr ? -1 : static_cast<int32_t>(d.warp - frame.warps.data());
+        frame.motion[list][unit] = {d.dx, d.dy, warp, static_cast<int8_t>(d.ref)};
+      }
+    }
+  }
+  if (options_.smoothness >= 0) apply_smoothness(frame);
+  return frame;
+}
+
+// Takes out the lists of blocks that most of the units around them contradict. A block
+// of w x h units lies at a multiple of (w, h), so its origin follows from its size.
+void TrackBuilder::apply_smoothness(Frame& frame) {
+  rough_.assign(frame.mi_size.size(), 0);
+  for (int row = 0; row < frame.visible_rows; ++row) {
+    for (int col = 0; col < frame.visible_cols; ++col) {
+      const int unit = row * frame.cols + col;
+      const int block_cols = av1::kBlockWidth[frame.mi_size[unit]] / 4;
+      const int block_rows = av1::kBlockHeight[frame.mi_size[unit]] / 4;
+      const int origin = (row & ~(block_rows - 1)) * frame.cols + (col & ~(block_cols - 1));
+      if (origin != unit) {
+        rough_[unit] = rough_[origin];
+        continue;
+      }
+      for (int list = 0; list < 2; ++list) {
+        if (frame.motion[list][unit].ref > 0 && !has_smooth_border(frame, row, col, list)) {
+          rough_[unit] = static_cast<uint8_t>(rough_[unit] | (1 << list));
+        }
+      }
+    }
+  }
+  for (std::size_t unit = 0; unit < rough_.size(); ++unit) {
+    for (int list = 0; list < 2; ++list) {
+      if ((rough_[unit] >> list & 1) != 0) frame.motion[list][unit].ref = 0;
+    }
+  }
+}
+
+bool TrackBuilder::has_smooth_border(const Frame& frame, int row, int col, int list) const {
+  int agreeing = 0;
+  int judged = 0;
+  // Each unit outside is held against the unit of the block that it touches.
+  const auto judge = [&](int inner_row, int inner_col, int outer_row, int outer_col) {
+    if (outer_row < 0 || outer_row >= frame.visible_rows || outer_col < 0 ||
+        outer_col >= frame.visible_cols || inner_row >= frame.visible_rows ||
+        inner_col >= frame.visible_cols) {
+      return;
+    }
+    const UnitMotion& own = frame.motion[list][inner_row * frame.cols + inner_col];
+    if (own.ref == 0) return;
+    const double interval = frame.ref_interval[own.ref];
+    double best = std::numeric_limits<double>::infinity();
+    for (const auto& motion : frame.motion) {
+      const UnitMotion& other = motion[outer_row * frame.cols + outer_col];
+      if (other.ref == 0) continue;
+      double ratio = 1;
+      if (frame.ref_decode_index[other.ref] != frame.ref_decode_index[own.ref]) {
+        const double other_interval = frame.ref_interval[other.ref];
+        if (interval == 0 || other_interval == 0) continue;
+        ratio = interval / other_interval;
+      }
+      best = std::min(best, std::max(std::abs(own.dx - ratio * other.dx),
+                                     std::abs(own.dy - ratio * other.dy)));
+    }
+    if (std::isinf(best)) return;
+    ++judged;
+    // Motion that is large changes much from place to place.
+    const double length = std::sqrt(own.dx * own.dx + own.dy * own.dy);
+    const double tolerance = options_.smoothness * (1 + length / 8);
+    if (best <= tolerance) ++agreeing;
+  };
+  const int mi_size = frame.mi_size[row * frame.cols + col];
+  const int end_row = row + av1::kBlockHeight[mi_size] / 4;
+  const int end_col = col + av1::kBlockWidth[mi_size] / 4;
+  for (int c = col; c < end_col; ++c) {
+    judge(row, c, row - 1, c);
+    judge(end_row - 1, c, end_row, c);
+  }
+  for (int r = row; r < end_row; ++r) {
+    judge(r, col, r, col - 1);
+    judge(r, end_col - 1, r, end_col);
+  }
+  return 2 * agreeing >= judged;
+}
+
+void TrackBuilder::chain_up_to(int display_index) {
+  while (true) {
+    Frame* next = nullptr;
+    for (const auto& frame : frames_) {
+      if (!frame->chained && frame->display_index <= display_index &&
+          (next == nullptr || frame->display_index < next->display_index)) {
+        next = frame.get();
+      }
+    }
+    if (next == nullptr) return;
+    chain_frame(*next);
+  }
+}
+
+void TrackBuilder::chain_frame(Frame& frame) {
+  current_ = &frame;
+  frame.chained = true;
+  frame.cells.assign(frame.mi_size.size(), Cell{});
+  if (uses_cosine()) frame.velocity.assign(frame.mi_size.size(), Point{kNan, kNan});
+  find_links();
+  for (Link& link : links_) {
+    if (uses_cosine() && options_.cosine_relative_to_dominant) fit_dominant(link);
+    for (int list = 0; list < 2; ++list) {
+      if (link.forward) {
+        chain_forward(link, list);
+      } else {
+        chain_backward(link, list);
+      }
+    }
+  }
+  seed();
+  if (frame.display_index >= 0) observe();
+  ++frames_chained_;
+}
+
+// Nearest in display first; a frame that is never shown has no place in time and comes
+// last.
+void TrackBuilder::find_links() {
+  links_.clear();
+  const auto add_link = [this](const Frame& from, const Frame& to, const Frame& other) {
+    Link link;
+    link.other = &other;
+    link.forward = &from == &other;
+    for (int ref = 1; ref < kNumRefs; ++ref) {
+      link.refs[ref] = from.ref_decode_index[ref] == to.decode_index;
+    }
+    if (other.display_index >= 0 && current_->display_index >= 0) {
+      link.interval = other.display_index - current_->display_index;
+    }
+    link.distance =
+        link.interval != 0 ? std::abs(link.interval) : std::numeric_limits<int>::max();
+    links_.push_back(link);
+  };
+  for (const auto& other : frames_) {
+    if (!other->chained || other.get() == current_) continue;
+    if (links(*current_, *other)) add_link(*current_, *other, *other);
+    if (links(*other, *current_)) add_link(*other, *current_, *other);
+  }
+  std::stable_sort(links_.begin(), links_.end(),
+                   [](const Link& a, const Link& b) { return a.distance < b.distance; });
+}
+
+bool TrackBuilder::is_within_reach(int interval) const {
+  return options_.max_interval < 0 || std::abs(interval) <= options_.max_interval;
+}
+
+bool TrackBuilder::links(const Frame& from, const Frame& to) const {
+  for (int ref = 1; ref < kNumRefs; ++ref) {
+    if (from.ref_decode_index[ref] == to.decode_index) {
+      return is_within_reach(from.ref_interval[ref]);
+    }
+  }
+  return false;
+}
+
+void TrackBuilder::fit_dominant(Link& link) {
+  const Frame& frame = link.forward ? *link.other : *current_;
+  std::size_t count = 0;
+  for (const auto& motion : frame.motion) {
+    for (const UnitMotion& unit : motion) count += link.refs[unit.ref] ? 1 : 0;
+  }
+  const std::size_t stride = count / kMaxDominantSamples + 1;
+  samples_.clear();
+  std::size_t index = 0;
+  for (const auto& motion : frame.motion) {
+    for (std::size_t unit = 0; unit < motion.size(); ++unit) {
+      if (!link.refs[motion[unit].ref] || index++ % stride != 0) continue;
+      const Point centre = unit_centre(frame, static_cast<int>(unit));
+      samples_.push_back({centre.x, centre.y, motion[unit].dx, motion[unit].dy});
+    }
+  }
+  link.dominant = fit_dominant_motion(samples_, frame.coded_width, frame.height, scratch_);
+}
+
+// By the current frame's displacements: every free unit asks for the track nearest to
+// its centre, every track goes to the unit that puts it nearest to its centre (a stable
+// matching, so the order of units does not matter).
+void TrackBuilder::chain_backward(const Link& link, int list) {
+  const auto& motion = current_->motion[list];
+  bool found = false;
+  for (int row = 0; row < current_->visible_rows; ++row) {
+    for (int col = 0; col < current_->visible_cols; ++col) {
+      const int first = row * current_->cols + col;
+      if (current_->cells[first].track >= 0 || !link.refs[motion[first].ref]) continue;
+      if (!found) claims_.assign(link.other->cells.size(), Claim{});
+      found = true;
+      for (int unit = first; unit >= 0;) {
+        int cell = -1;
+        Claim claim;
+        if (!best_cell(link, unit, motion[unit], &cell, &claim)) break;
+        unit = std::exchange(claims_[cell], claim).unit;
+      }
+    }
+  }
+  if (!found) return;
+  for (std::size_t cell = 0; cell < claims_.size(); ++cell) {
+    const Claim& claim = claims_[cell];
+    if (claim.unit >= 0) {
+      place(claim.unit, link.other->cells[cell].track, claim.position, claim.velocity);
+    }
+  }
+}
+
+// By the other frame's displacements: every track moves with the unit it lies in, and a
+// free unit takes the one that lands nearest to its centre.
+void TrackBuilder::chain_forward(const Link& link, int list) {
+  const Frame& other = *link.other;
+  const auto& motion = other.motion[list];
+  const float scale_x = current_->coded_width / other.coded_width;
+  const float scale_y = current_->height / other.height;
+  bool found = false;
+  for (int row = 0; row < other.visible_rows; ++row) {
+    for (int col = 0; col < other.visible_cols; ++col) {
+      const int unit = row * other.cols + col;
+      const Cell& cell = other.cells[unit];
+      if (!link.refs[motion[unit].ref] || cell.track < 0 ||
+          tracks_[cell.track].last_seen == frames_chained_) {
+        continue;
+      }
+      const Point from{cell.position.x / other.upscale, cell.position.y};
+      const Point moved = move(other, motion[unit], from);
+      Claim claim;
+      claim.unit = unit;
+      claim.position = {moved.x * scale_x, moved.y * scale_y};
+      if (!is_in_picture(claim.position)) continue;
+      const int target = static_cast<int>(claim.position.y / kUnit) * current_->cols +
+                         static_cast<int>(claim.position.x / kUnit);
+      if (current_->cells[target].track >= 0) continue;
+      const Point centre = unit_centre(*current_, target);
+      claim.cost = distance(claim.position, centre);
+      if (!found) claims_.assign(current_->cells.size(), Claim{});
+      found = true;
+      if (is_better(claim, claims_[target], other) &&
+          passes_cosine(link, unit, from, moved, &claim)) {
+        claims_[target] = claim;
+      }
+    }
+  }
+  if (!found) return;
+  for (std::size_t unit = 0; unit < claims_.size(); ++unit) {
+    const Claim& claim = claims_[unit];
+    if (claim.unit >= 0) {
+      place(static_cast<int>(unit), other.cells[claim.unit].track, claim.position,
+            claim.velocity);
+    }
+  }
+}
+
+// The nearest track that `unit` has a better claim on than the unit that holds it.
+bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
+                             Claim* best_claim) const {
+  const Frame& other = *link.other;
+  const float scale_x = current_->coded_width / other.width;
+  const float scale_y = current_->height / other.height;
+  const Point centre = unit_centre(*current_, unit);
+  // A valid warp stretches a unit by less than half its size.
+  const float reach = motion.warp < 0 ? kHalfUnit : 1.5F * kHalfUnit;
+  const Window window =
+      around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
+             reach / scale_x, reach / scale_y);
+  *best = -1;
+  for (int row = window.top; row <= window.bottom; ++row) {
+    for (int col = window.left; col <= window.right; ++col) {
+      const int cell = row * other.cols + col;
+      const Cell& found = other.cells[cell];
+      if (found.track < 0) continue;
+      const Point target{found.position.x * scale_x, found.position.y * scale_y};
+      Claim claim;
+      if (!move_back(*current_, motion, target, &claim.position) ||
+          !is_in_unit(claim.position, centre)) {
+        continue;
+      }
+      claim.unit = unit;
+      claim.cost = distance(claim.position, centre);
+      if ((*best >= 0 && claim.cost >= best_claim->cost) || !is_in_picture(claim.position) ||
+          !is_better(claim, claims_[cell], *current_) ||
+          tracks_[found.track].last_seen == frames_chained_ ||
+          !passes_cosine(link, cell, claim.position, target, &claim)) {
+        continue;
+      }
+      *best = cell;
+      *best_claim = claim;
+    }
+  }
+  return *best >= 0;
+}
+
+// The vectors of small blocks are the better ones. `frame` has the claiming units.
+bool TrackBuilder::is_better(const Claim& claim, const Claim& holder, const Frame& frame) {
+  if (holder.unit < 0) return true;
+  if (claim.cost != holder.cost) return claim.cost < holder.cost;
+  const int area = block_area(frame.mi_size[claim.unit]);
+  const int holder_area = block_area(frame.mi_size[holder.unit]);
+  return area != holder_area ? area < holder_area : claim.unit < holder.unit;
+}
+
+float TrackBuilder::distance(Point a, Point b) {
+  return std::max(std::abs(a.x - b.x), std::abs(a.y - b.y));
+}
+
+// Space-time cosine (the angular error of Barron, Fleet and Beauchemin, IJCV 1994)
+// between the motion of this step, `from` to `moved` in the frame whose displacement it
+// is, and the one predicted from the step before: the same motion relative to the
+// dominant one. Sets the claim's relative velocity.
+bool TrackBuilder::passes_cosine(const Link& link, int other_unit, Point from, Point moved,
+                                 Claim* claim) const {
+  if (!uses_cosine()) return true;
+  // Velocities are kept in pixels of the picture they belong to.
+  const Point stored = link.other->velocity[other_unit];
+  const float picture_scale = current_->width / link.other->width;
+  const Point previous{stored.x * picture_scale,
+                       stored.y * current_->height / link.other->height};
+  claim->velocity = previous;
+  const bool relative = options_.cosine_relative_to_dominant;
+  if (link.interval == 0 || (relative && !link.dominant.valid)) return true;
+
+  // A backward displacement spans the interval, a forward one its negative.
+  const Frame& frame = link.forward ? *link.other : *current_;
+  const double interval = link.forward ? -link.interval : link.interval;
+  const double to_x = current_->width / frame.coded_width / interval;
+  const double to_y = current_->height / frame.height / interval;
+  const double vx = (moved.x - from.x) * to_x;
+  const double vy = (moved.y - from.y) * to_y;
+  const double dominant_x = relative ? link.dominant.dx(from.x, from.y) * to_x : 0;
+  const double dominant_y = relative ? link.dominant.dy(from.x, from.y) * to_y : 0;
+  claim->velocity = {static_cast<float>(vx - dominant_x), static_cast<float>(vy - dominant_y)};
+  if (std::isnan(previous.x)) return true;
+  const double px = previous.x + dominant_x;
+  const double py = previous.y + dominant_y;
+  const double s2 = options_.cosine_scale * options_.cosine_scale;
+  const double norm = std::sqrt((vx * vx + vy * vy + s2) * (px * px + py * py + s2));
+  return vx * px + vy * py + s2 >= options_.cosine * norm;
+}
+
+void TrackBuilder::place(int unit, int32_t track, Point position, Point velocity) {
+  current_->cells[unit] = {track, {position.x * current_->upscale, position.y}};
+  if (uses_cosine()) current_->velocity[unit] = velocity;
+  tracks_[track].last_seen = frames_chained_;
+  ++tracks_[track].frames;
+}
+
+void TrackBuilder::seed() {
+  for (int row = 0; row < current_->visible_rows; ++row) {
+    for (int col = 0; col < current_->visible_cols; ++col) {
+      const int unit = row * current_->cols + col;
+      const Point centre = unit_centre(*current_, unit);
+      if (current_->cells[unit].track >= 0 || !is_in_picture(centre)) continue;
+      int32_t track = static_cast<int32_t>(tracks_.size());
+      if (free_tracks_.empty()) {
+        tracks_.emplace_back();
+      } else {
+        track = free_tracks_.back();
+        free_tracks_.pop_back();
+        tracks_[track] = Track{};
+      }
+      tracks_[track].serial = next_serial_++;
+      place(unit, track, centre, {kNan, kNan});
+    }
+  }
+}
+
+void TrackBuilder::observe() {
+  const float scale_x = static_cast<float>(width_) / current_->width;
+  const float scale_y = static_cast<float>(height_) / current_->height;
+  for (const Cell& cell : current_->cells) {
+    if (cell.track < 0) continue;
+    Track& track = tracks_[cell.track];
+    int32_t index = free_observation_;
+    if (index >= 0) {
+      free_observation_ = observations_[index].previous;
+    } else {
+      if (observations_.size() >= std::numeric_limits<int32_t>::max()) {
+        throw std::length_error("too many observations for one run: cut the video");
+      }
+      index = static_cast<int32_t>(observations_.size());
+      observations_.emplace_back();
+    }
+    observations_[index] = {track.last_observation, current_->display_index,
+                            {cell.position.x * scale_x, cell.position.y * scale_y}};
+    track.last_observation = index;
+    ++track.length;
+  }
+}
+
+// Lets go of the frames that no frame to come can be linked to.
+void TrackBuilder::release_frames(const int32_t* slots) {
+  const auto is_needed = [&](const Frame& frame) {
+    if (!frame.chained) return true;
+    if (std::find(slots, slots + kNumRefs, frame.decode_index) != slots + kNumRefs) return true;
+    return std::any_of(frames_.begin(), frames_.end(), [&](const auto& other) {
+      return !other->chained && (links(*other, frame) || links(frame, *other));
+    });
+  };
+  for (std::size_t i = 0; i < frames_.size();) {
+    if (is_needed(*frames_[i])) {
+      ++i;
+      continue;
+    }
+    release(*frames_[i]);
+    idle_frames_.push_back(std::move(frames_[i]));
+    frames_.erase(frames_.begin() + static_cast<std::ptrdiff_t>(i));
+  }
+}
+
+// A track that no frame holds any more is over: kept, or its memory used again.
+void TrackBuilder::release(Frame& frame) {
+  for (const Cell& cell : frame.cells) {
+    if (cell.track < 0) continue;
+    Track& track = tracks_[cell.track];
+    if (--track.frames > 0) continue;
+    free_tracks_.push_back(cell.track);
+    if (track.length >= options_.min_length) {
+      kept_.push_back({track.serial, track.last_observation, track.length});
+      continue;
+    }
+    for (int32_t o = track.last_observation; o >= 0;) {
+      const int32_t previous = observations_[o].previous;
+      observations_[o].previous = free_observation_;
+      free_observation_ = o;
+      o = previous;
+    }
+  }
+}
+
+// The cells within reach of a position of the picture, the reach itself left out on the
+// right and below.
+TrackBuilder::Window TrackBuilder::around(const Frame& frame, Point position, float reach_x,
+                                          float reach_y) {
+  // Far outside there are no cells; the clamp keeps the cast defined.
+  const auto first = [](float cell, int count) {
+    const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
+    return static_cast<int>(clamped);
+  };
+  const auto last = [](float cell, int count) {
+    const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
+    const int floor = static_cast<int>(clamped);
+    return (static_cast<float>(floor) == clamped ? floor : floor + 1) - 1;
+  };
+  const float unit_width = kUnit * frame.upscale;
+  return {first((position.y - reach_y) / kUnit, frame.rows),
+          last((position.y + reach_y) / kUnit, frame.rows),
+          first((position.x - reach_x) / unit_width, frame.cols),
+          last((position.x + reach_x) / unit_width, frame.cols)};
+}
+
+TrackBuilder::Point TrackBuilder::unit_centre(const Frame& frame, int unit) {
+  return {kUnit * static_cast<float>(unit % frame.cols) + kHalfUnit,
+          kUnit * static_cast<float>(unit / frame.cols) + kHalfUnit};
+}
+
+// Half-open, so that touching units share no position.
+bool TrackBuilder::is_in_unit(Point position, Point centre) {
+  return position.x >= centre.x - kHalfUnit && position.x < centre.x + kHalfUnit &&
+         position.y >= centre.y - kHalfUnit && position.y < centre.y + kHalfUnit;
+}
+
+bool TrackBuilder::is_in_picture(Point position) const {
+  return position.x >= 0.F && position.y >= 0.F && position.x < current_->coded_width &&
+         position.y < current_->height;
+}
+
+TrackBuilder::Point TrackBuilder::move(const Frame& frame, const UnitMotion& motion,
+                                       Point position) {
+  if (motion.warp < 0) return {position.x + motion.dx, position.y + motion.dy};
+  double x = 0;
+  double y = 0;
+  apply_warp(frame.warps.data() + motion.warp, position.x, position.y, &x, &y);
+  return {static_cast<float>(x), static_cast<float>(y)};
+}
+
+// The position that `move` takes to `target`. False where the warp has no inverse.
+bool TrackBuilder::move_back(const Frame& frame, const UnitMotion& motion, Point target,
+                             Point* source) {
+  if (motion.warp < 0) {
+    *source = {target.x - motion.dx, target.y - motion.dy};
+    return true;
+  }
+  double x = 0;
+  double y = 0;
+  if (!invert_warp(frame.warps.data() + motion.warp, target.x, target.y, &x, &y)) return false;
+  *source = {static_cast<float>(x), static_cast<float>(y)};
+  return true;
+}
+
+}  // namespace colmap_av1::tracks

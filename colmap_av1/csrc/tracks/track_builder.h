@@ -1,0 +1,212 @@
+// Chains the displacements of coded frames into point tracks.
+
+#ifndef COLMAP_AV1_TRACKS_TRACK_BUILDER_H_
+#define COLMAP_AV1_TRACKS_TRACK_BUILDER_H_
+
+#include <array>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "tracks/displacement.h"
+#include "tracks/dominant_motion.h"
+
+namespace colmap_av1::tracks {
+
+// Limits that are switched off hold a negative value, the cosine one below -1. Meaning
+// and units: TrackOptions in options.py.
+struct TrackBuilderOptions {
+  int min_length = 4;
+  double cosine = -2;
+  bool cosine_relative_to_dominant = true;
+  double cosine_scale = 1;
+  int max_interval = -1;
+  int max_block_area = -1;
+  int max_uncoded_block_area = -1;
+  double smoothness = -1;
+};
+
+// One coded frame. Borrowed for the call.
+struct CodedFrame {
+  MotionField field;
+  const uint8_t* skip = nullptr;
+  int decode_index = 0;
+  int display_index = -1;
+  bool show_frame = true;
+  int width = 0;   // UpscaledWidth
+  int height = 0;  // FrameHeight
+  const int32_t* ref_decode_index = nullptr;   // [8]
+  const int32_t* ref_display_index = nullptr;  // [8]
+  const int32_t* slot_decode_index = nullptr;  // [8]
+};
+
+struct TrackArrays {
+  int num_frames = 0;
+  int width = 0;
+  int height = 0;
+  std::vector<int64_t> offsets;
+  std::vector<int32_t> frame;
+  std::vector<float> xy;
+};
+
+// Frames come in bitstream order and are chained in display order, so that a frame that
+// was coded far ahead is reached by the short steps of the frames between, not by its own
+// long and poor vectors. Memory: the frames in reference slots, those that displacements
+// still link to a frame that waits for its turn, and the observations of tracks that are
+// alive or long enough to keep.
+class TrackBuilder {
+ public:
+  explicit TrackBuilder(const TrackBuilderOptions& options);
+  TrackBuilder(const TrackBuilder&) = delete;
+  TrackBuilder& operator=(const TrackBuilder&) = delete;
+  TrackBuilder(TrackBuilder&&) = default;
+  TrackBuilder& operator=(TrackBuilder&&) = default;
+
+  // Throws std::invalid_argument for block data or an order of frames that contradicts
+  // itself.
+  void add(const CodedFrame& frame);
+
+  // The kept tracks in the order of their seeds. The builder is empty afterwards.
+  TrackArrays finish();
+
+ private:
+  struct Point {
+    float x = 0.F;
+    float y = 0.F;
+  };
+  // What one 4x4 unit of a frame holds: at most one track, at its sub-pixel place in
+  // pixels of the picture.
+  struct Cell {
+    int32_t track = -1;
+    Point position;
+  };
+  // A unit's motion by one of its lists, after the trust rules: ref 0 where untrusted.
+  struct UnitMotion {
+    float dx = 0.F;  // at the unit's centre, in coded pixels
+    float dy = 0.F;
+    int32_t warp = -1;  // first of six entries of Frame::warps
+    int8_t ref = 0;
+  };
+  struct Frame {
+    int decode_index = -1;
+    int display_index = -1;
+    bool chained = false;
+    int rows = 0;
+    int cols = 0;
+    int visible_rows = 0;
+    int visible_cols = 0;
+    float width = 0.F;
+    float height = 0.F;
+    float coded_width = 0.F;
+    float upscale = 1.F;  // picture pixels to a coded one, above 1 by super-resolution
+    std::array<int, kNumRefs> ref_decode_index{};
+    std::array<int, kNumRefs> ref_interval{};  // in shown frames, 0 where unknown
+    std::array<std::vector<UnitMotion>, 2> motion;
+    std::vector<int32_t> warps;
+    std::vector<uint8_t> mi_size;
+    std::vector<Cell> cells;
+    // Velocity per shown frame by which the track came here, less the frame's dominant
+    // motion; NaN at a seed. Empty without the cosine test.
+    std::vector<Point> velocity;
+  };
+  struct Track {
+    int64_t serial = 0;
+    int64_t last_seen = -1;  // number of the frame in the order of chaining
+    int32_t last_observation = -1;
+    int32_t length = 0;
+    int32_t frames = 0;  // that hold it
+  };
+  struct Observation {
+    int32_t previous = -1;
+    int32_t frame = 0;
+    Point position;
+  };
+  struct Kept {
+    int64_t serial = 0;
+    int32_t last_observation = -1;
+    int32_t length = 0;
+  };
+  // A frame with tracks that displacements link to the frame being chained: from the
+  // current frame's units (backward) or from the other's (forward).
+  struct Link {
+    const Frame* other = nullptr;
+    bool forward = false;
+    std::array<bool, kNumRefs> refs{};  // the RefFrame values that name the link
+    int distance = 0;                   // in shown frames
+    int interval = 0;                   // other less current display index, 0 if unknown
+    DominantMotion dominant;            // of the field that the displacements come from
+  };
+  // What a unit would do with a track, and how well it fits.
+  struct Claim {
+    int32_t unit = -1;  // of the frame whose displacement it is
+    float cost = 0.F;   // distance from the claiming unit's centre, in coded pixels
+    Point position;  // in the current frame, coded pixels
+    Point velocity;
+  };
+  struct Window {
+    int top = 0;
+    int bottom = -1;  // included, as is right
+    int left = 0;
+    int right = -1;
+  };
+
+  bool uses_cosine() const { return options_.cosine >= -1; }
+  Frame* find_frame(int decode_index) const;
+  bool is_waiting(int display_index) const;
+  Frame& read_frame(const CodedFrame& coded);
+  void apply_smoothness(Frame& frame);
+  bool has_smooth_border(const Frame& frame, int row, int col, int list) const;
+  void chain_up_to(int display_index);
+  void chain_frame(Frame& frame);
+  void find_links();
+  bool is_within_reach(int interval) const;
+  bool links(const Frame& from, const Frame& to) const;
+  void fit_dominant(Link& link);
+  void chain_backward(const Link& link, int list);
+  void chain_forward(const Link& link, int list);
+  bool best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
+                 Claim* best_claim) const;
+  static bool is_better(const Claim& claim, const Claim& holder, const Frame& frame);
+  static float distance(Point a, Point b);
+  bool passes_cosine(const Link& link, int other_unit, Point from, Point moved,
+                     Claim* claim) const;
+  void place(int unit, int32_t track, Point position, Point velocity);
+  void seed();
+  void observe();
+  void release_frames(const int32_t* slots);
+  void release(Frame& frame);
+  static Window around(const Frame& frame, Point position, float reach_x, float reach_y);
+  static Point unit_centre(const Frame& frame, int unit);
+  static bool is_in_unit(Point position, Point centre);
+  bool is_in_picture(Point position) const;
+  static Point move(const Frame& frame, const UnitMotion& motion, Point position);
+  static bool move_back(const Frame& frame, const UnitMotion& motion, Point target,
+                        Point* source);
+
+  TrackBuilderOptions options_;
+  int width_ = 0;  // of the output's coordinates
+  int height_ = 0;
+  int num_frames_ = 0;
+  int last_display_ = -1;  // of the frames shown so far
+  int64_t frames_chained_ = 0;
+  int64_t next_serial_ = 0;
+  std::vector<Track> tracks_;
+  std::vector<int32_t> free_tracks_;
+  std::vector<Observation> observations_;
+  int32_t free_observation_ = -1;
+  std::vector<Kept> kept_;
+  std::vector<std::unique_ptr<Frame>> frames_;       // in bitstream order
+  std::vector<std::unique_ptr<Frame>> idle_frames_;  // their memory is used again
+
+  // The frame being chained, and buffers that are kept from frame to frame.
+  Frame* current_ = nullptr;
+  std::vector<Link> links_;
+  std::vector<Claim> claims_;
+  std::vector<uint8_t> rough_;
+  std::vector<MotionSample> samples_;
+  std::vector<float> scratch_;
+};
+
+}  // namespace colmap_av1::tracks
+
+#endif  // COLMAP_AV1_TRACKS_TRACK_BUILDER_H_

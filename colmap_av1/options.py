@@ -1,0 +1,114 @@
+"""Options of every stage: frozen dataclasses whose field comments are the help text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How the bitstream is read."""
+
+    # operating point of a scalable stream (7.20, choose_operating_point)
+    operating_point: int = 0
+    # fail on a damaged stream instead of using the frames before the damage
+    strict: bool = False
+    # largest accepted frame, in luma samples; guards memory against hostile headers
+    max_frame_size: int = 16384 * 16384
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """How displacements are chained into tracks."""
+
+    # shown frames a track is seen in at least
+    min_length: int = 4
+    # end a track where the space-time cosine between its motion and the motion predicted
+    # from the step before falls below this; None: never
+    cosine: float | None = 0.5
+    # 'dominant': predict the change of the frame's dominant motion too, so a shaking
+    # camera ends no track; 'none': expect the motion to stay as it was
+    cosine_relative_to: Literal["dominant", "none"] = "dominant"
+    # time component of the space-time vectors, in pixels per shown frame: motion well
+    # below it has no direction to test
+    cosine_scale: float = 1.0
+    # longest step a displacement may take, in shown frames; None: any
+    max_interval: int | None = 4
+    # largest block whose motion is trusted, in px^2; None: any
+    max_block_area: int | None = 1024
+    # the same for blocks without coded residual, which the encoder never corrected
+    max_uncoded_block_area: int | None = 256
+    # do not trust a block whose displacement d differs by more than this many pixels, and
+    # |d|/8 times as many on top, from that of most units around it; None: no such test
+    smoothness: float | None = 1.5
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Which image pairs are written."""
+
+    # distances between the images of a pair, in images, that every image is paired at
+    offsets: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10)
+    # beyond the last offset each distance is this times the one before, up to the longest
+    # span that still shares enough tracks; 1: no pairs beyond the last offset
+    growth: float = 1.4
+    # largest distance between the images of a pair; None: as far as tracks reach
+    max_span: int | None = None
+    # shared tracks a pair needs
+    min_matches: int = 15
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """How the two-view geometry of a pair is found; the defaults are COLMAP's."""
+
+    # largest Sampson (E, F) or transfer (H) error of an inlier, in pixels
+    max_error: float = 4.0
+    # inliers a geometry needs
+    min_num_inliers: int = 15
+    # the focal length prior is believed where E has more than this share of F's inliers
+    min_e_f_inlier_ratio: float = 0.95
+    # a pair is planar or panoramic where H has more than this share of the inliers
+    max_h_inlier_ratio: float = 0.8
+    # matches the models are estimated on, spread over the image; all are then tested
+    max_samples: int = 500
+    # iterations of the robust estimators at most
+    max_iterations: int = 10000
+    # probability with which a robust estimator stops on an outlier-free sample
+    confidence: float = 0.999
+    # the same seed gives the same bytes
+    seed: int = 0
+    # threads; None: one per CPU. The result does not depend on it
+    num_threads: int | None = None
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The camera written for new images."""
+
+    # name of one of COLMAP's camera models
+    camera_model: str = "SIMPLE_RADIAL"
+    # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: focal length 1.2
+    # times the longer side and the principal point in the centre, both to be refined
+    camera_params: str | None = None
+    # one camera for all images instead of one for each
+    single_camera: bool = True
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Everything `match` can be told; seed and threads are those of `verify`."""
+
+    read: ReadOptions = ReadOptions()
+    tracks: TrackOptions = TrackOptions()
+    pairs: PairOptions = PairOptions()
+    verify: VerifyOptions = VerifyOptions()
+    camera: CameraOptions = CameraOptions()
+    # file name of new images; the number is the frame's display index, from 0
+    image_name: str = "frame_%06d.png"
+    # every n-th frame becomes an image of a new database; tracks use all frames
+    image_step: int = 1
+    # number in a listed image's name of the video's first frame; None: only where the
+    # names and their count leave no doubt which frame an image is
+    first_number: int | None = None

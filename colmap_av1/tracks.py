@@ -1,0 +1,144 @@
+"""Tracks: chains of block displacements through the frames of a video."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.motion import FrameMotion
+from colmap_av1.options import TrackOptions
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Point tracks through a whole video, in compressed sparse row form.
+
+    Track t has the observations offsets[t] : offsets[t + 1], sorted by frame.
+
+    Attributes:
+        num_frames: number of shown frames of the video.
+        width: picture width in pixels, after super-resolution.
+        height: picture height in pixels.
+        offsets: int64 [num_tracks + 1].
+        frame: int32 [num_observations] display index of the observing frame.
+        xy: float32 [num_observations, 2] position in pixels, (x right, y down), origin at
+            the top-left corner of the image: the first pixel's centre is (0.5, 0.5).
+    """
+
+    num_frames: int
+    width: int
+    height: int
+    offsets: NDArray[np.int64]
+    frame: NDArray[np.int32]
+    xy: NDArray[np.float32]
+
+
+def build_tracks(
+    motion: Iterable[FrameMotion],
+    options: TrackOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Tracks:
+    """Chain the motion of a video into point tracks.
+
+    The motion of a block holds for each of its 4x4 units. A unit carries on the track
+    found where its displacement lands in the referenced frame, to the sub-pixel place
+    that moves exactly onto it, and a track moves with its unit into a reference shown
+    later. Frames are chained in display order and links to the nearest frame come first,
+    so a frame that was coded far ahead is reached by the short steps between; frames that
+    are never shown are chained through last. A unit without one starts a track at its centre. No
+    unit holds two tracks, no frame sees a track twice. Frames are consumed one
+    by one; beyond a few frames of motion, memory grows with the observations only.
+
+    Args:
+        motion: the coded frames of one video, in bitstream order.
+        options: how to chain; the defaults of TrackOptions if None.
+        progress: called after each coded frame with the number of frames so far.
+
+    Returns:
+        Tracks of at least `options.min_length` shown frames, in the order of their seeds
+        (display order of the frame, then raster order). Where frames differ in size,
+        positions are in pixels of the first shown frame's size.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+        VideoError: no frame is shown.
+        ValueError: the frames are not in bitstream order, or their arrays contradict
+            each other.
+    """
+    options = options if options is not None else TrackOptions()
+    _check_options(options)
+    builder = _core.TrackBuilder(
+        min_length=options.min_length,
+        cosine=-2.0 if options.cosine is None else options.cosine,
+        cosine_relative_to_dominant=options.cosine_relative_to == "dominant",
+        cosine_scale=options.cosine_scale,
+        max_interval=_or_off(options.max_interval),
+        max_block_area=_or_off(options.max_block_area),
+        max_uncoded_block_area=_or_off(options.max_uncoded_block_area),
+        smoothness=_or_off(options.smoothness),
+    )
+    for count, frame in enumerate(motion, start=1):
+        builder.add(
+            decode_index=frame.decode_index,
+            display_index=frame.display_index,
+            show_frame=bool(frame.header["show_frame"]),
+            width=frame.width,
+            height=frame.height,
+            coded_width=int(frame.header["frame_width"]),
+            ref_decode_index=frame.ref_decode_index,
+            ref_display_index=frame.ref_display_index,
+            slot_decode_index=frame.slot_decode_index,
+            mv=frame.mv,
+            ref_frame=frame.ref_frame,
+            is_inter=frame.is_inter,
+            use_intrabc=frame.use_intrabc,
+            motion_mode=frame.motion_mode,
+            interintra=frame.interintra,
+            mi_size=frame.mi_size,
+            skip=frame.skip,
+            warp_index=frame.warp_index,
+            local_warp_params=frame.local_warp_params,
+            gm_type=frame.header["gm_type"],
+            gm_params=frame.header["gm_params"],
+            y_mode=frame.y_mode,
+            ref_size=frame.ref_size,
+            force_integer_mv=bool(frame.header["force_integer_mv"]),
+        )
+        if progress is not None:
+            progress(count)
+    num_frames, width, height, offsets, frame_index, xy = builder.finish()
+    if num_frames == 0:
+        raise VideoError("the video shows no frame: give a video with at least one picture")
+    return Tracks(num_frames, width, height, offsets, frame_index, xy)
+
+
+_Limit = TypeVar("_Limit", int, float)
+
+
+def _or_off(limit: _Limit | None) -> _Limit | int:
+    """The core's spelling of a limit that is switched off."""
+    return -1 if limit is None else limit
+
+
+def _check_options(options: TrackOptions) -> None:
+    if options.min_length < 1:
+        raise OptionError(f"min_length is {options.min_length}: give 1 or more")
+    if options.cosine is not None and not -1.0 <= options.cosine <= 1.0:
+        raise OptionError(f"cosine is {options.cosine}: give a value from -1 to 1, or None")
+    if options.cosine_relative_to not in ("dominant", "none"):
+        raise OptionError(
+            f"cosine_relative_to is {options.cosine_relative_to!r}: give 'dominant' or 'none'"
+        )
+    if not (0.0 <= options.cosine_scale < math.inf):
+        raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
+    for name in ("max_interval", "max_block_area", "max_uncoded_block_area", "smoothness"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise OptionError(f"{name} is {value}: give 0 or more, or None")
