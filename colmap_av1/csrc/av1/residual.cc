@@ -431,6 +431,7 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
         c == TX_CLASS_2D      ? read_levels<TX_CLASS_2D>(tx_size, tx_size_ctx, ptype, eob)
         : c == TX_CLASS_HORIZ ? read_levels<TX_CLASS_HORIZ>(tx_size, tx_size_ctx, ptype, eob)
                               : read_levels<TX_CLASS_VERT>(tx_size, tx_size_ctx, ptype, eob);
+    SymbolDecoder symbols = symbols_;  // in registers, as in read_levels
     for (int i = num_levels - 1; i >= 0; --i) {
       const int index = nonzero_[i];
       int level = levels_[index] & kLevelMask;
@@ -438,25 +439,27 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
       bool sign;
       if (index == 0) {
         const int sign_ctx = dc_sum < 0 ? 1 : dc_sum > 0 ? 2 : 0;
-        sign = read_flag(cdf_.dc_sign[ptype][sign_ctx]);
+        sign = symbols.flag(cdf_.dc_sign[ptype][sign_ctx]);
       } else {
-        sign = symbols_.bit();
+        sign = symbols.bit();
       }
       if (level > NUM_BASE_LEVELS + COEFF_BASE_RANGE) {
         int length = 1;
-        while (!symbols_.bit()) {
+        while (!symbols.bit()) {
           if (++length > 20) {
             levels_.fill(0);
             throw BitstreamError("coefficient is too large");
           }
         }
         int x = 1;
-        for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols_.bit();
+        for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols.bit();
         level = (x + COEFF_BASE_RANGE + NUM_BASE_LEVELS) & 0xFFFFF;
       }
       if (index == 0 && level > 0) dc_category = sign ? 1 : 2;
-      cul_level = std::min(63, cul_level + level);
+      cul_level += level;
     }
+    cul_level = std::min(63, cul_level);
+    symbols_ = symbols;
   }
   if (plane == 0 && b_->is_inter) {
     for (int i = 0; i < h4; ++i) {
@@ -508,6 +511,9 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
   auto& base_cdfs = cdf_.coeff_base[tx_size_ctx][ptype];
   auto& br_cdfs = cdf_.coeff_br[std::min(tx_size_ctx, TX_32X32)][ptype];
   int num_levels = 0;
+  // A copy, so that its state stays in registers: writes to levels_ and to the CDFs could change a
+  // member for all the compiler knows.
+  SymbolDecoder symbols = symbols_;
   for (int c = eob - 1; c >= 0; --c) {
     const ScanEntry entry = scan[c];
     std::uint8_t* at = &levels_[entry.index];
@@ -524,7 +530,7 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
     if (c == eob - 1) {
       const int size = kTxWidth[adjusted] * kTxHeight[adjusted];
       const int ctx = c == 0 ? 0 : c <= size / 8 ? 1 : c <= size / 4 ? 2 : 3;
-      level = read(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
+      level = symbols.symbol<3>(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
     } else {
       int sum = mag;
       if constexpr (kTxClass == TX_CLASS_2D) {
@@ -542,13 +548,13 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
       } else {
         ctx += entry.base_offset;
       }
-      level = read(base_cdfs[ctx]);
+      level = symbols.symbol<4>(base_cdfs[ctx]);
       if (level == 0) continue;
     }
     if (level > NUM_BASE_LEVELS) {
       const int ctx = std::min(((mag & kLevelMask) + 1) >> 1, 6) + entry.br_offset;
       for (int idx = 0; idx < COEFF_BASE_RANGE / (BR_CDF_SIZE - 1); ++idx) {
-        const int coeff_br = read(br_cdfs[ctx]);
+        const int coeff_br = symbols.symbol<BR_CDF_SIZE>(br_cdfs[ctx]);
         level += coeff_br;
         if (coeff_br < BR_CDF_SIZE - 1) break;
       }
@@ -556,6 +562,7 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
     *at = static_cast<std::uint8_t>(level | (std::min(level, 3) << kClippedShift));
     nonzero_[num_levels++] = entry.index;
   }
+  symbols_ = symbols;
   return num_levels;
 }
 

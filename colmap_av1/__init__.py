@@ -1,0 +1,51 @@
+"""Dense COLMAP matches read from the motion vectors of an AV1 video."""
+
+from colmap_av1.errors import (
+    BitstreamError,
+    ColmapAv1Error,
+    DatabaseError,
+    ImageError,
+    LimitError,
+    NotAv1Error,
+    OptionError,
+    VideoError,
+)
+from colmap_av1.export import export_motion
+from colmap_av1.info import StreamReport, inspect
+from colmap_av1.match import MatchReport, match
+from colmap_av1.motion import FrameMotion, read_motion
+from colmap_av1.options import (
+    CameraOptions,
+    MatchOptions,
+    PairOptions,
+    ReadOptions,
+    TrackOptions,
+    VerifyOptions,
+)
+from colmap_av1.tracks import Tracks, build_tracks
+
+__all__ = [
+    "BitstreamError",
+    "CameraOptions",
+    "ColmapAv1Error",
+    "DatabaseError",
+    "FrameMotion",
+    "ImageError",
+    "LimitError",
+    "MatchOptions",
+    "MatchReport",
+    "NotAv1Error",
+    "OptionError",
+    "PairOptions",
+    "ReadOptions",
+    "StreamReport",
+    "TrackOptions",
+    "Tracks",
+    "VerifyOptions",
+    "VideoError",
+    "build_tracks",
+    "export_motion",
+    "inspect",
+    "match",
+    "read_motion",
+]

@@ -1,0 +1,409 @@
+"""The command line: parses words and calls one function per subcommand."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.metadata
+import inspect
+import re
+import sys
+import types
+import typing
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.export import export_motion
+from colmap_av1.info import StreamReport
+from colmap_av1.info import inspect as inspect_stream
+from colmap_av1.match import MatchReport, match
+from colmap_av1.options import (
+    CameraOptions,
+    MatchOptions,
+    PairOptions,
+    ReadOptions,
+    TrackOptions,
+    VerifyOptions,
+)
+
+_PROGRAM = "colmap-av1"
+_INTERRUPTED = 130
+_BAD_INPUT = 2
+# Rarer reference distances are summed up.
+_LEAST_LISTED_SHARE = 0.005
+
+_Options = TypeVar("_Options")
+_Report = Callable[[str, int, "int | None"], None]
+_Rows = list[tuple[str, str]]
+
+# Options under other names than their fields', and COLMAP's prefixes, which are accepted.
+_SPELLINGS = {"seed": ("--random_seed",)}
+_PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: words after the program's name; None: those of this process.
+
+    Returns:
+        Exit status: 0, 2 for bad input, 130 when interrupted.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _make_parser()
+    with _warnings_as_lines():
+        try:
+            # argparse exits by itself, with status 2 and one line, on words it does not know.
+            namespace = parser.parse_args([_underscored(word) for word in words])
+            namespace.run(namespace)
+        except ColmapAv1Error as error:
+            print(f"{_PROGRAM}: error: {error}", file=sys.stderr)
+            return _BAD_INPUT
+        except KeyboardInterrupt:
+            print(f"{_PROGRAM}: interrupted", file=sys.stderr)
+            return _INTERRUPTED
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(_BAD_INPUT, f"{_PROGRAM}: error: {message} (see {self.prog} --help)\n")
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        print(f"{_PROGRAM} {importlib.metadata.version(_PROGRAM)}")
+        parser.exit()
+
+
+def _make_parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog=_PROGRAM,
+        description="Dense COLMAP matches read from the motion vectors of an AV1 video.",
+        epilog="'-' and '_' are alike in option names.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    command = _add_command(commands, "match", _run_match, "fill a COLMAP database from a video")
+    command.add_argument(
+        "--database",
+        "--database_path",
+        required=True,
+        metavar="PATH",
+        help="COLMAP database; made where it is missing, else its images are used",
+    )
+    _add_video(command)
+    command.add_argument(
+        "--image_path",
+        metavar="PATH",
+        help="folder to write the images to; existing ones of the right size are kept",
+    )
+    _add_options(command, MatchOptions, "images")
+    _add_options(command, CameraOptions, "camera")
+    _add_options(command, TrackOptions, "tracks")
+    _add_options(command, PairOptions, "pairs")
+    _add_options(command, VerifyOptions, "two-view geometry")
+    _add_options(command, ReadOptions, "bitstream")
+    _add_quiet(command)
+
+    command = _add_command(
+        commands, "info", _run_info, "tell what a stream is made of and whether it is any good"
+    )
+    _add_video(command)
+    _add_options(command, ReadOptions, "bitstream")
+    _add_quiet(command)
+
+    command = _add_command(commands, "motion", _run_motion, "write the motion of every frame")
+    _add_video(command)
+    command.add_argument(
+        "--output", "--output_path", required=True, metavar="PATH", help="a .npz or .h5 file"
+    )
+    _add_options(command, ReadOptions, "bitstream")
+    _add_quiet(command)
+    return parser
+
+
+def _add_command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], None], summary: str
+) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.", allow_abbrev=False
+    )
+    command.set_defaults(run=run)
+    return command
+
+
+def _add_video(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--video", "--video_path", required=True, metavar="PATH", help="an AV1 video"
+    )
+
+
+def _add_quiet(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--quiet", action="store_true", help="no progress and no summary")
+
+
+def _underscored(word: str) -> str:
+    """The word with '_' for '-' in an option's name; its value stays as it is."""
+    if not word.startswith("--") or word == "--":
+        return word
+    name, equals, value = word[2:].partition("=")
+    return f"--{name.replace('-', '_')}{equals}{value}"
+
+
+def _add_options(command: argparse.ArgumentParser, kind: type, title: str) -> None:
+    """Add an option for each field of an options dataclass.
+
+    The field's comment is the help text. Fields that hold further options are left out; one
+    that is not given on the command line does not appear in the namespace.
+    """
+    group = command.add_argument_group(title)
+    hints = typing.get_type_hints(kind)
+    comments = _field_comments(kind)
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            continue
+        names = [*_SPELLINGS.get(field.name, ()), f"--{field.name}"]
+        if kind in _PREFIXES:
+            names.append(f"--{_PREFIXES[kind]}.{field.name}")
+        parse, metavar = _value_parser(hints[field.name])
+        default = _spell(field.default)
+        how: dict[str, Any] = {"nargs": "?", "const": True} if hints[field.name] is bool else {}
+        group.add_argument(
+            *names,
+            dest=f"{kind.__name__}.{field.name}",
+            type=parse,
+            metavar=metavar,
+            default=argparse.SUPPRESS,
+            help=f"{comments.get(field.name, '')} [{default}]".strip().replace("%", "%%"),
+            **how,
+        )
+
+
+def _given(namespace: argparse.Namespace, kind: type[_Options], **more: Any) -> _Options:
+    """The options of a kind, with those given on the command line in place of defaults."""
+    prefix = f"{kind.__name__}."
+    given = {k[len(prefix) :]: v for k, v in vars(namespace).items() if k.startswith(prefix)}
+    return kind(**given, **more)
+
+
+def _field_comments(kind: type) -> dict[str, str]:
+    """The comment above each field of a class; none where its source is not installed."""
+    try:
+        lines = inspect.getsource(kind).splitlines()
+    except OSError:
+        return {}
+    comments: dict[str, str] = {}
+    comment: list[str] = []
+    for line in map(str.strip, lines):
+        if line.startswith("#"):
+            comment.append(line.lstrip("# "))
+            continue
+        field = re.match(r"(\w+):", line)
+        if field and comment:
+            comments[field[1]] = " ".join(comment).replace("None", "none")
+        comment = []
+    return comments
+
+
+def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
+    """Parser and placeholder for the values of a field's type."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        (inner,) = (a for a in arguments if a is not type(None))
+        parse, metavar = _value_parser(inner)
+        return (lambda word: None if word.lower() == "none" else parse(word)), metavar
+    if origin is tuple:
+        parse, metavar = _value_parser(arguments[0])
+        return (lambda words: tuple(parse(word) for word in words.split(","))), f"{metavar},..."
+    if origin is typing.Literal:
+        return str, "|".join(arguments)
+    if hint is bool:
+        return _parse_bool, "0|1"
+    return {int: (int, "N"), float: (float, "X"), str: (str, "TEXT")}[hint]
+
+
+def _parse_bool(word: str) -> bool:
+    values = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+    if word.lower() not in values:
+        raise argparse.ArgumentTypeError(f"'{word}' is neither 0 nor 1")
+    return values[word.lower()]
+
+
+def _spell(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
+    return "none" if value is None else str(value)
+
+
+def _run_match(namespace: argparse.Namespace) -> None:
+    options = _given(
+        namespace,
+        MatchOptions,
+        read=_given(namespace, ReadOptions),
+        tracks=_given(namespace, TrackOptions),
+        pairs=_given(namespace, PairOptions),
+        verify=_given(namespace, VerifyOptions),
+        camera=_given(namespace, CameraOptions),
+    )
+    with _progress(namespace.quiet) as report:
+        result = match(
+            namespace.database,
+            namespace.video,
+            image_path=namespace.image_path,
+            options=options,
+            progress=report,
+        )
+    for warning in result.warnings:
+        _print_warning(warning)
+    if not namespace.quiet:
+        _print_summary(_match_rows(result))
+        _print_next(result)
+
+
+def _run_info(namespace: argparse.Namespace) -> None:
+    with _progress(namespace.quiet) as report:
+        result = inspect_stream(
+            namespace.video,
+            _given(namespace, ReadOptions),
+            lambda done: report("motion", done, None),
+        )
+    _print_summary(_info_rows(result))
+
+
+def _run_motion(namespace: argparse.Namespace) -> None:
+    with _progress(namespace.quiet) as report:
+        count = export_motion(
+            namespace.video,
+            namespace.output,
+            _given(namespace, ReadOptions),
+            lambda done: report("motion", done, None),
+        )
+    if not namespace.quiet:
+        _print_summary([("coded frames", str(count)), ("output", namespace.output)])
+
+
+def _match_rows(report: MatchReport) -> _Rows:
+    lengths = {f"{q:.0%}": length for q, length in report.track_lengths.items()}
+    images = max(report.num_images, 1)
+    inlier_share = report.num_inliers / max(report.num_matches, 1)
+    rows = [
+        ("database", str(report.database)),
+        ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
+        ("images", f"{report.num_images}, {report.num_written_images} written"),
+        ("tracks", str(report.num_tracks)),
+        ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
+        (
+            "keypoints",
+            f"{report.num_observations}, {report.num_observations / images:.0f} an image",
+        ),
+        ("pairs", f"{report.num_pairs}, {report.num_verified_pairs} verified"),
+        ("matches", str(report.num_matches)),
+        ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
+        ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
+    ]
+    rows += [(f"seconds, {stage}", f"{s:.2f}") for stage, s in report.seconds.items()]
+    return [*rows, ("seconds, total", f"{sum(report.seconds.values()):.2f}")]
+
+
+def _info_rows(report: StreamReport) -> _Rows:
+    rate = f"{report.frame_rate:.2f} per second" if report.frame_rate else "unknown"
+    distances = sorted(report.reference_distances.items(), key=lambda item: -item[1])
+    listed = [item for item in distances if item[1] >= _LEAST_LISTED_SHARE]
+    references = [f"{distance:+d} {share:.1%}" for distance, share in listed]
+    if len(listed) < len(distances):
+        rest = sum(share for _, share in distances[len(listed) :])
+        references.append(f"others {rest:.1%}")
+    if report.hidden_reference_share > 0:
+        references.append(f"hidden {report.hidden_reference_share:.1%}")
+    frames = (
+        f"{report.num_shown} shown, {report.num_coded} coded, {report.num_hidden} never shown, "
+        f"{report.num_key_frames} intra"
+    )
+    return [
+        ("video", str(report.path)),
+        ("container", report.container),
+        ("codec", "av1"),
+        ("size", f"{report.width}x{report.height}"),
+        ("rotation", str(report.rotation)),
+        ("frame rate", rate),
+        ("frames", frames),
+        ("references", ", ".join(references) or "none"),
+        ("inter units", f"{report.inter_share:.1%}"),
+        ("median motion", f"{report.median_motion:.2f} px per frame"),
+        ("bytes per frame", f"{report.bytes_per_frame:.0f}"),
+        ("bits per pixel", f"{report.bits_per_pixel:.3f}"),
+        ("for matching", "; ".join(report.reasons) or "good"),
+    ]
+
+
+def _print_summary(rows: _Rows) -> None:
+    """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
+    if not sys.stdout.isatty():
+        for name, value in rows:
+            print(f"{name}\t{value}")
+        return
+    table = Table(show_header=False)
+    for name, value in rows:
+        table.add_row(name, value)
+    Console().print(table)
+
+
+def _print_next(report: MatchReport) -> None:
+    with_colmap, with_pycolmap = report.next_commands
+    if sys.stdout.isatty():
+        # Printed bare, so that they can be copied from any terminal.
+        print(f"Map it with COLMAP:\n  {with_colmap}\nor with pycolmap:\n  {with_pycolmap}")
+    else:
+        print(f"next\t{with_colmap}\nor\t{with_pycolmap}")
+    if report.image_path is None:
+        print(f"{_PROGRAM}: IMAGES stands for a folder of the frames", file=sys.stderr)
+
+
+def _print_warning(message: object) -> None:
+    print(f"{_PROGRAM}: warning: {message}", file=sys.stderr)
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: _print_warning(message)
+        yield
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[_Report]:
+    """Progress bars on standard error where it is a terminal, one for each stage."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda stage, done, total: None
+        return
+    columns = (
+        TextColumn("{task.description:12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int | None) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total, rate="")
+            speed = progress.tasks[tasks[stage]].speed
+            rate = f"{speed:.1f}/s" if speed else ""
+            progress.update(tasks[stage], completed=done, rate=rate)
+
+        yield report

@@ -1,0 +1,339 @@
+"""Which frames of the video are images, under which names, and writing them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+
+import av
+import av.error
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.video import decode_frames
+
+_WRITE_PARAMETERS = {
+    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+}
+# Frames waiting to be compressed, per thread; bounds memory.
+_QUEUE_PER_THREAD = 2
+
+
+def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
+    """Name the images of frames by a printf pattern such as 'frame_%06d.png'.
+
+    Args:
+        pattern: file name with one integer field, which takes the display index from 0.
+        frames: display indices.
+
+    Raises:
+        OptionError: the pattern has no integer field, or no extension of an image.
+    """
+    _pattern_regex(pattern)
+    return [pattern % frame for frame in frames]
+
+
+def are_named_by(pattern: str, names: Sequence[str]) -> bool:
+    """Whether all names could come from `image_names` with this pattern."""
+    regex = _pattern_regex(pattern)
+    return all(regex.fullmatch(name) for name in names)
+
+
+def frames_of_images(
+    names: Sequence[str], num_frames: int, first_number: int | None = None
+) -> NDArray[np.int32]:
+    """Find the video frame of each image of a database that already lists images.
+
+    As many images as frames: they are the frames in the order of the names, numbers in
+    them compared as numbers. Otherwise the last number in a name is the frame's, counted
+    from `first_number`, which is guessed only where the names leave no doubt: gaps show
+    that they count frames of the video, and a 0 or the number of the last frame shows from
+    where. Image sequences cut at a lower rate are numbered without gaps; they say nothing.
+
+    Args:
+        names: names of the images, in any order.
+        num_frames: number of shown frames of the video.
+        first_number: number in the name of the video's first frame, usually 0 or 1; None:
+            only where names and count leave no doubt.
+
+    Returns:
+        int32 [len(names)] display index of each image.
+
+    Raises:
+        ImageError: count or names do not say which frame an image is.
+    """
+    numbers = [_last_number(name) for name in names]
+    if first_number is None and len(names) == num_frames:
+        order = sorted(range(len(names)), key=lambda i: _natural_key(names[i]))
+        frames = np.empty(len(names), dtype=np.int32)
+        frames[order] = np.arange(len(names), dtype=np.int32)
+        return frames
+
+    counts = f"the database lists {len(names)} images, the video has {num_frames} frames"
+    found = [number for number in numbers if number is not None]
+    if len(found) < len(numbers):
+        unnumbered = names[numbers.index(None)]
+        raise ImageError(
+            f"{counts}, and '{unnumbered}' has no frame number: extract every frame as an "
+            "image, or number the images by frame"
+        )
+    lowest, highest = min(found), max(found)
+    if first_number is None:
+        first_number = _guess_first_number(found, num_frames, counts)
+    if lowest < first_number or highest - first_number >= num_frames:
+        raise ImageError(
+            f"{counts}, but the image numbers run from {lowest} to {highest} where frames are "
+            f"numbered {first_number} to {first_number + num_frames - 1}: give the video the "
+            "images were cut from"
+        )
+    if len(set(found)) < len(found):
+        twice = next(number for number in found if found.count(number) > 1)
+        raise ImageError(f"two images of the database have the frame number {twice}")
+    return np.array([number - first_number for number in found], dtype=np.int32)
+
+
+def check_image_sizes(
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    video_size: tuple[int, int],
+    rotation: int = 0,
+) -> None:
+    """Check that the images a database lists have the size and orientation of the video.
+
+    Args:
+        names: names of the images.
+        sizes: (width, height) of the images' cameras.
+        video_size: (width, height) of the video, unrotated.
+        rotation: degrees players turn the video by, where the images may have been cut by
+            such a player; 0 otherwise.
+
+    Raises:
+        ImageError: an image has another size, or the images are rotated.
+    """
+    width, height = video_size
+    for name, size in zip(names, sizes, strict=True):
+        # A half turn, and any turn of a square, leaves the size as it is.
+        turned = (height, width) if rotation in (90, 270) else video_size
+        if rotation and size == turned:
+            raise ImageError(
+                f"the video is marked to be turned by {rotation} degrees, so the database's "
+                "images are turned against its bitstream: use a new database"
+            )
+        if size != video_size:
+            raise ImageError(
+                f"image '{name}' of the database is {size[0]}x{size[1]}, the video "
+                f"{width}x{height}: use images of the video's size or a new database"
+            )
+
+
+def check_image_folder(
+    folder: str | os.PathLike[str],
+    names: Sequence[str] | str,
+    video_size: tuple[int, int],
+) -> None:
+    """Check that images can be written to a folder and that those there have the right size.
+
+    Args:
+        folder: the folder; it need not exist.
+        names: the images' names, or the pattern of their names.
+        video_size: (width, height) of the video.
+
+    Raises:
+        ImageError: the folder is a file or not writable, a name leaves the folder, or an
+            image there is of another size or unreadable.
+        OptionError: the pattern or an extension is none of an image.
+    """
+    root = Path(folder)
+    existing_parent = root
+    while not existing_parent.exists() and existing_parent != existing_parent.parent:
+        existing_parent = existing_parent.parent
+    if not existing_parent.is_dir():
+        raise ImageError(f"{existing_parent}: is a file: give a folder for the images")
+    if not os.access(existing_parent, os.W_OK | os.X_OK):
+        raise ImageError(f"{existing_parent}: no permission to write images there")
+    if isinstance(names, str):
+        regex = _pattern_regex(names)
+        present = [p.name for p in root.iterdir()] if root.is_dir() else []
+        names = sorted(name for name in present if regex.fullmatch(name))
+    for name in names:
+        path = _image_file(root, name)
+        if path.exists():
+            size = _image_size(path)
+            if size != video_size:
+                raise ImageError(
+                    f"{path}: is {size[0]}x{size[1]}, the video {video_size[0]}x{video_size[1]}: "
+                    "give another folder or remove the images"
+                )
+
+
+def write_images(
+    video: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    names: Sequence[str],
+    frames: Sequence[int],
+    *,
+    num_threads: int | None = None,
+    operating_point: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write video frames as images, PNG or JPEG (quality 95) by the names' extensions.
+
+    An image appears under its name only when complete. Existing images are kept, see
+    `check_image_folder`.
+
+    Args:
+        video: the video file.
+        folder: where the images go; made where missing.
+        names: the images' names, which may hold folders.
+        frames: display index of each image.
+        num_threads: threads; None: one per CPU.
+        operating_point: operating point of a scalable stream.
+        progress: called with the number of images done so far.
+
+    Returns:
+        The number of images written; the others were there.
+
+    Raises:
+        ImageError: an image cannot be written, the frames change their size, or the decoder
+            gives fewer frames than asked for.
+        BitstreamError: the stream cannot be decoded up to the last frame asked for.
+    """
+    root = Path(folder)
+    wanted = {
+        int(frame): _image_file(root, name)
+        for frame, name in zip(frames, names, strict=True)
+        if not _image_file(root, name).exists()
+    }
+    num_kept = len(names) - len(wanted)
+    done = num_kept
+    if progress is not None:
+        progress(done)
+    if not wanted:
+        return 0
+    for parent in {path.parent for path in wanted.values()}:
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ImageError(f"{parent}: cannot be made: {error.strerror}") from error
+
+    last = max(wanted)
+    size: tuple[int, ...] | None = None
+    workers = num_threads or os.cpu_count() or 1
+    queue: list[Future[None]] = []
+    decoded = decode_frames(video, operating_point=operating_point, num_threads=num_threads)
+    # OpenCV releases the interpreter lock while it compresses.
+    with ThreadPoolExecutor(max_workers=workers) as executor:
+        try:
+            for index, image in decoded:
+                size = size or image.shape
+                if image.shape != size:
+                    raise ImageError(
+                        f"frame {index} is {image.shape[1]}x{image.shape[0]}, those before "
+                        f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
+                        "re-encode the video at one size"
+                    )
+                if index in wanted:
+                    queue.append(executor.submit(_write_image, wanted.pop(index), image))
+                while len(queue) > (workers * _QUEUE_PER_THREAD if index < last else 0):
+                    queue.pop(0).result()
+                    done += 1
+                    if progress is not None:
+                        progress(done)
+                if index >= last:
+                    break
+            for future in queue:  # left where the decoder ends early
+                future.result()
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+            decoded.close()
+    if wanted:
+        raise ImageError(
+            f"the decoder gives no frame {min(wanted)} of the {last + 1} that the stream shows: "
+            "leave out the images, or re-encode the video"
+        )
+    return len(names) - num_kept
+
+
+def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) -> int:
+    lowest, highest = min(numbers), max(numbers)
+    with_gaps = highest - lowest + 1 > len(numbers)
+    if with_gaps and lowest == 0 and highest < num_frames:
+        return 0
+    if with_gaps and highest == num_frames and lowest > 0:
+        return 1
+    raise ImageError(
+        f"{counts}, and the image numbers {lowest} to {highest} do not say which frames they "
+        "are: extract every frame, or number the images by frame and say with --first_number "
+        "how the first frame of the video is numbered"
+    )
+
+
+def _last_number(name: str) -> int | None:
+    digits = re.findall(r"\d+", PurePosixPath(name).stem)
+    return int(digits[-1]) if digits else None
+
+
+def _natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key under which 'f9' comes before 'f10'; the text itself breaks ties."""
+    parts = re.split(r"(\d+)", name)
+    key = [(1, int(p), p) if p.isdigit() else (0, 0, p) for p in parts]
+    return [*key, (0, 0, name)]
+
+
+def _pattern_regex(pattern: str) -> re.Pattern[str]:
+    fields = re.findall(r"%0?\d*d", pattern)
+    if len(fields) != 1 or pattern.count("%") != 1:
+        raise OptionError(
+            f"image name '{pattern}' needs exactly one number field, such as frame_%06d.png"
+        )
+    if Path(pattern).name != pattern or pattern.startswith("."):
+        raise OptionError(f"image name '{pattern}' must be a plain file name without a folder")
+    _check_extension(pattern)
+    before, after = pattern.split(fields[0])
+    return re.compile(re.escape(before) + r"\d+" + re.escape(after))
+
+
+def _check_extension(name: str) -> None:
+    if PurePosixPath(name).suffix.lower() not in _WRITE_PARAMETERS:
+        raise OptionError(f"image name '{name}' must end in .png, .jpg or .jpeg")
+
+
+def _image_file(root: Path, name: str) -> Path:
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise ImageError(f"image '{name}' of the database lies outside the image folder")
+    return root / name
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, without decoding it in full."""
+    size = (0, 0)
+    try:
+        with av.open(os.path.abspath(path)) as container:
+            if container.streams.video:
+                size = container.streams.video[0].width, container.streams.video[0].height
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise ImageError(f"{path}: is not a readable image: remove it") from error
+    if size == (0, 0):
+        raise ImageError(f"{path}: is not a readable image: remove it")
+    return size
+
+
+def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    _check_extension(path.name)
+    suffix = path.suffix.lower()
+    _, encoded = cv2.imencode(suffix, image, _WRITE_PARAMETERS[suffix])
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(encoded.tobytes())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ImageError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,331 @@
+"""Packets, facts and decoded pictures of an AV1 video; FFmpeg (through PyAV) demuxes."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+
+# Edit lists drop or hide samples, but a later frame may reference them: read them all.
+_CONTAINER_OPTIONS = {"ignore_editlist": "1"}
+
+_IVF_FRAME_HEADER_SIZE = 12
+_AV1C_HEADER_SIZE = 4
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One unit of the container, usually a temporal unit.
+
+    Attributes:
+        data: OBUs in low-overhead format (AV1 specification, section 5), whatever the
+            container; the last one may lack its obu_size.
+        pts: presentation time in seconds; None where the container gives none.
+        index: number of the packet in the stream, from 0.
+    """
+
+    data: bytes
+    pts: float | None
+    index: int
+
+
+class VideoStream:
+    """The AV1 stream of an open video file; a context manager that closes it.
+
+    Attributes:
+        path: the file.
+        container: FFmpeg's name of the container format.
+        codec: always "av1".
+        width: picture width in pixels as the container says, unrotated.
+        height: picture height likewise.
+        frame_rate: average frames per second; None where unknown.
+        duration: length in seconds; None where unknown.
+        num_frames: number of packets as the container says; None where it does not.
+        configuration: OBUs that precede the first packet: the configOBUs of the container's
+            av1C box, empty where the stream carries its sequence header itself.
+    """
+
+    def __init__(self, video: str | os.PathLike[str]) -> None:
+        self.path = Path(video)
+        self._container = _open_container(self.path)
+        try:
+            self._stream = _find_av1_stream(self._container, self.path)
+            context = self._stream.codec_context
+            self.container: str = self._container.format.name
+            self.codec = "av1"
+            self.width: int = context.width
+            self.height: int = context.height
+            rate = self._stream.average_rate or self._stream.guessed_rate
+            self.frame_rate = float(rate) if rate else None
+            self.duration = _stream_duration(self._container, self._stream)
+            self.num_frames = self._stream.frames or self._estimate_num_frames()
+            self.configuration = _configuration_obus(context.extradata)
+        except BaseException:
+            self._container.close()
+            raise
+
+    def __enter__(self) -> VideoStream:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def packets(self) -> Iterator[Packet]:
+        """Read the packets in bitstream order. Works once per opened stream.
+
+        Raises:
+            BitstreamError: the file is damaged or cut off; every packet before the damage
+                has been given.
+            VideoError: there is no packet at all.
+        """
+        index = 0
+        last: Any = None
+        demuxed = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(demuxed, None)
+            except (av.error.FFmpegError, OSError) as error:
+                raise BitstreamError(
+                    f"{self.path}: damaged after packet {index}: {_reason(error)}"
+                ) from error
+            if packet is None:
+                break
+            if packet.size == 0:  # PyAV's end-of-stream marker
+                continue
+            if packet.is_corrupt:
+                raise BitstreamError(f"{self.path}: cut off inside packet {index + 1}")
+            pts = None if packet.pts is None else float(packet.pts * packet.time_base)
+            last = packet
+            yield Packet(bytes(packet), pts, index)
+            index += 1
+        damage = self._missing_end(index, last)
+        if damage:
+            raise BitstreamError(f"{self.path}: {damage}")
+        if index == 0:
+            raise VideoError(f"{self.path}: holds no frame: give a video with pictures")
+
+    def _estimate_num_frames(self) -> int | None:
+        if self.duration is None or self.frame_rate is None:
+            return None
+        return round(self.duration * self.frame_rate) or None
+
+    def _missing_end(self, count: int, last: Any) -> str | None:
+        """What shows that the file is cut off, where demuxers end as if it were whole."""
+        if 0 < count < self._stream.frames and "mp4" in self.container:
+            return f"cut off: {count} of {self._stream.frames} packets are there"
+        if count == 0:
+            # Tables that point nowhere, or a cut inside the first packet.
+            if self._stream.frames or (self.duration and "matroska" in self.container):
+                return "damaged or cut off before the end of the first packet"
+            return None
+        size = self._container.size
+        if last.pos is not None and last.pos >= 0 and size > 0:
+            end = last.pos + last.size
+            if self.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
+                return f"cut off after packet {count}"
+            if self.container == "obu" and end != size:
+                return f"cut off after packet {count}"
+        if "matroska" in self.container and self.duration and last.pts is not None:
+            step = 1 / self.frame_rate if self.frame_rate else 0.0
+            length = float((last.duration or 0) * last.time_base)
+            end_time = float(last.pts * last.time_base) + max(length, step)
+            if end_time + 1.5 * step < self.duration:
+                return f"cut off: {end_time:.2f} of {self.duration:.2f} seconds are there"
+        return None
+
+
+def open_stream(video: str | os.PathLike[str]) -> VideoStream:
+    """Open the AV1 stream of a video file.
+
+    Reads every container FFmpeg demuxes, among them MP4, Matroska, WebM, IVF and bare OBU
+    files (Section 5 and Annex B).
+
+    Raises:
+        NotAv1Error: the video is coded otherwise; the message says how to convert it.
+        VideoError: the file is missing, empty, not a video, or holds no video stream.
+    """
+    return VideoStream(video)
+
+
+def packets(video: str | os.PathLike[str]) -> Iterator[Packet]:
+    """Read the packets of a video file: `VideoStream.packets` of a file opened for it."""
+    with open_stream(video) as stream:
+        yield from stream.packets()
+
+
+def decode_frames(
+    video: str | os.PathLike[str],
+    *,
+    operating_point: int = 0,
+    num_threads: int | None = None,
+) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
+    """Decode the shown frames in output order, without film grain and without rotation.
+
+    Args:
+        video: the file.
+        operating_point: operating point of a scalable stream.
+        num_threads: threads of the decoder; None: as many as it likes.
+
+    Yields:
+        (display_index, image): the image is uint8 [height, width, 3] in BGR order.
+
+    Raises:
+        BitstreamError: the stream is damaged; the frames before have been given.
+        VideoError: as `open_stream`.
+    """
+    count = 0
+    try:
+        for frame in _decode(video, operating_point, num_threads):
+            yield count, frame.to_ndarray(format="bgr24")
+            count += 1
+    except BitstreamError:
+        if num_threads == 1:
+            raise
+        # Threads lose the frames in flight at the damage; one thread has none in flight.
+        for index, frame in enumerate(_decode(video, operating_point, 1)):
+            if index >= count:
+                yield index, frame.to_ndarray(format="bgr24")
+
+
+def display_rotation(video: str | os.PathLike[str]) -> int:
+    """Find the rotation players apply to the pictures, from the container's display matrix.
+
+    Returns:
+        Degrees counter-clockwise: 0, 90, 180 or 270. The bitstream itself is unrotated.
+
+    Raises:
+        BitstreamError: no frame can be decoded.
+        VideoError: as `open_stream`.
+    """
+    for frame in _decode(video, 0, 1):
+        return int(round(frame.rotation / 90) * 90 % 360)
+    raise BitstreamError(f"{video}: no frame can be decoded: the file is damaged")
+
+
+def _decode(
+    video: str | os.PathLike[str], operating_point: int, num_threads: int | None
+) -> Iterator[Any]:
+    path = Path(video)
+    container = _open_container(path)
+    try:
+        stream = _find_av1_stream(container, path)
+        context = stream.codec_context
+        context.thread_type = "AUTO"
+        context.thread_count = num_threads or 0
+        options = {"oppoint": str(operating_point)} if operating_point else {}
+        # Grain is noise laid over the picture the motion was coded for.
+        context.options = {"export_side_data": "film_grain", **options}
+        damage: Exception | None = None
+        try:
+            for packet in container.demux(stream):
+                if packet.size == 0:  # PyAV's end-of-stream marker
+                    break
+                if packet.is_corrupt:
+                    damage = EOFError("cut off inside a packet")
+                    break
+                yield from context.decode(packet)
+        except (av.error.FFmpegError, OSError) as error:
+            damage = error
+        # The decoder holds frames back; those before the damage are still good.
+        try:
+            yield from context.decode(None)
+        except (av.error.FFmpegError, OSError) as error:
+            damage = damage or error
+        if damage is not None:
+            raise BitstreamError(
+                f"{path}: cannot be decoded further: {_reason(damage)}"
+            ) from damage
+    finally:
+        container.close()
+
+
+def _open_container(path: Path) -> Any:
+    try:
+        if not path.exists():
+            raise VideoError(f"{path}: no such file")
+        if path.is_dir():
+            raise VideoError(f"{path}: is a folder: give a video file")
+        if path.is_file() and path.stat().st_size == 0:
+            raise VideoError(f"{path}: is an empty file")
+        # An absolute path: FFmpeg would take 'name:...' for a protocol.
+        return av.open(os.path.abspath(path), container_options=_CONTAINER_OPTIONS)
+    except PermissionError as error:
+        raise VideoError(f"{path}: no permission to read it") from error
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise VideoError(
+            f"{path}: not a video, or damaged before its first frame: {_reason(error)}"
+        ) from error
+
+
+def _find_av1_stream(container: Any, path: Path) -> Any:
+    streams = container.streams.video
+    if not streams:
+        kinds = sorted({stream.type for stream in container.streams})
+        found = f"only {', '.join(kinds)}" if kinds else "nothing"
+        raise VideoError(f"{path}: holds no video stream, {found}: give a video")
+    for stream in streams:
+        if _codec_name(stream) == "av1":
+            return stream
+    target = path.with_name(f"{path.stem}_av1.mp4").name
+    raise NotAv1Error(
+        f"{path}: is {_codec_name(streams[0])}, not AV1; convert it: ffmpeg -i "
+        f"{shlex.quote(str(path))} -c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 "
+        f"-row-mt 1 -crf 20 -b:v 0 -g 9999 -an {shlex.quote(target)}"
+    )
+
+
+def _codec_name(stream: Any) -> str:
+    if stream.codec_context is None:  # no decoder for it
+        return "of an unknown codec"
+    return str(stream.codec_context.codec.canonical_name)
+
+
+def _configuration_obus(extradata: bytes | None) -> bytes:
+    """The configOBUs of an av1C box (AV1 in ISOBMFF, section 2.3), or bare OBUs as they are."""
+    if not extradata:
+        return b""
+    if extradata[0] == 0x81:  # marker and version; no OBU header starts so
+        return bytes(extradata[_AV1C_HEADER_SIZE:])
+    return bytes(extradata)
+
+
+def _stream_duration(container: Any, stream: Any) -> float | None:
+    if stream.duration is not None and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    tag = stream.metadata.get("DURATION")  # Matroska, as muxers write it: 00:00:01.234
+    if tag:
+        try:
+            hours, minutes, seconds = tag.split(":")
+            return float(hours) * 3600 + float(minutes) * 60 + float(seconds)
+        except ValueError:
+            pass
+    if container.duration is not None and len(container.streams) == 1:
+        return float(Fraction(container.duration, av.time_base))
+    return None
+
+
+def _reason(error: BaseException) -> str:
+    """FFmpeg's words for an error, without its number and the file's name."""
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(reason).split())

@@ -1,0 +1,82 @@
+"""Paths and clips that several tests use."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+PROJECT = Path(__file__).resolve().parents[1]
+SHARED = PROJECT.parent / "shared"
+
+AV1 = [
+    *("-c:v", "libaom-av1", "-usage", "realtime", "-cpu-used", "6", "-lag-in-frames", "0"),
+    *("-row-mt", "1", "-crf", "20", "-b:v", "0", "-g", "9999"),
+]
+
+Ffmpeg = Callable[..., Path]
+Encode = Callable[..., Path]
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("shared") and not SHARED.is_dir():
+        pytest.skip("needs the test data in ../shared")
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of test data beside the checkout."""
+    if not SHARED.is_dir():
+        pytest.skip("needs the test data in ../shared")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def ffmpeg() -> Ffmpeg:
+    """Runs ffmpeg with the given words, the last of which is the output, and returns it."""
+
+    def run(*words: str | Path, stdin: bytes | None = None) -> Path:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *map(str, words)]
+        subprocess.run(command, input=stdin, check=True, capture_output=True)
+        return Path(words[-1])
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def encode(ffmpeg: Ffmpeg) -> Encode:
+    """Encodes uint8 [n, height, width, 3] BGR frames, as AV1 unless told otherwise."""
+
+    def run(frames: NDArray[np.uint8], output: Path, *how: str) -> Path:
+        height, width = frames.shape[1:3]
+        source = f"-f rawvideo -pix_fmt bgr24 -s {width}x{height} -r 25 -i -".split()
+        how = how or tuple(AV1)
+        return ffmpeg(*source, *how, "-pix_fmt", "yuv420p", output, stdin=frames.tobytes())
+
+    return run
+
+
+def make_frames(count: int, width: int = 192, height: int = 128) -> NDArray[np.uint8]:
+    """Frames of a textured ground with textured posts before it, seen by a moving camera."""
+    rng = np.random.default_rng(7)
+    texture = rng.integers(0, 256, (height // 4 + 1, width // 2, 3), dtype=np.uint8)
+    far = texture.repeat(4, axis=0).repeat(4, axis=1)[:height]
+    near = np.roll(far[::-1], 50, axis=1)
+    post = (np.arange(far.shape[1]) // 24) % 3 == 0
+    frames = np.empty((count, height, width, 3), dtype=np.uint8)
+    for i in range(count):
+        back = np.roll(far, -2 * i, axis=1)[:, :width]
+        front = np.roll(near, -4 * i, axis=1)[:, :width]
+        frames[i] = np.where(np.roll(post, -4 * i)[None, :width, None], front, back)
+    return frames
+
+
+@pytest.fixture(scope="session")
+def clip(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An AV1 clip of 16 frames, 192x128, in MP4."""
+    return encode(make_frames(16), tmp_path_factory.mktemp("clip") / "clip.mp4")

@@ -1,0 +1,250 @@
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import AV1, Encode, Ffmpeg, make_frames
+
+from colmap_av1.database import read_images
+from colmap_av1.errors import (
+    BitstreamError,
+    ColmapAv1Error,
+    DatabaseError,
+    ImageError,
+    OptionError,
+    VideoError,
+)
+from colmap_av1.images import image_names, write_images
+from colmap_av1.match import match
+from colmap_av1.options import CameraOptions, MatchOptions, PairOptions, ReadOptions, VerifyOptions
+
+
+def tables(database: Path) -> dict[str, list[tuple]]:
+    with sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True) as connection:
+        return {
+            table: connection.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
+            for table in ("cameras", "images", "keypoints", "matches", "two_view_geometries")
+        }
+
+
+def listing_database(folder: Path, database: Path) -> Path:
+    """A database as COLMAP makes it from a folder of images."""
+    with pycolmap.Database.open(database):  # makes the file
+        pass
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE)
+    return database
+
+
+def test_new_database(clip: Path, tmp_path: Path) -> None:
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
+    rows = tables(tmp_path / "a.db")
+    names = image_names("frame_%06d.png", range(16))
+    assert [row[1] for row in rows["images"]] == names
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names
+    assert len(rows["cameras"]) == 1
+    assert rows["cameras"][0][2:4] == (192, 128)
+    assert report.num_frames == report.num_coded_frames == report.num_images == 16
+    assert report.num_written_images == 16
+    assert report.num_observations == sum(row[1] for row in rows["keypoints"]) > 1000
+    assert report.num_pairs == len(rows["matches"]) == sum(report.configs.values())
+    assert report.num_matches == sum(row[1] for row in rows["matches"])
+    assert report.num_inliers == sum(row[1] for row in rows["two_view_geometries"]) > 1000
+    assert report.track_lengths[0.0] >= 4
+    assert report.track_lengths[1.0] <= 16
+    assert list(report.seconds) == [
+        "motion", "tracks", "pairs", "verification", "images", "database"
+    ]  # fmt: skip
+    assert report.warnings == ()
+
+
+def test_same_input_gives_the_same_bytes(clip: Path, tmp_path: Path) -> None:
+    for name, threads in (("a", 1), ("b", 2)):
+        match(
+            tmp_path / f"{name}.db",
+            clip,
+            options=MatchOptions(verify=VerifyOptions(num_threads=threads)),
+        )
+    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
+
+
+def test_images_of_a_database_get_the_rows(clip: Path, tmp_path: Path) -> None:
+    """Images cut by another program, listed in another order than by name."""
+    folder = tmp_path / "cut"
+    names = [f"{i + 1:04d}.png" for i in range(16)]
+    write_images(clip, folder, names, range(16))
+    database = listing_database(folder, tmp_path / "listed.db")
+    with sqlite3.connect(database) as connection:
+        connection.execute("UPDATE images SET image_id = 100 - image_id")
+        for table in ("rig_sensors", "frame_data", "frames", "rigs"):
+            connection.execute(f"DELETE FROM {table}")
+    cameras = tables(database)["cameras"]
+    match(database, clip)
+    match(tmp_path / "new.db", clip)
+
+    listed, new = tables(database), tables(tmp_path / "new.db")
+    assert listed["cameras"] == cameras
+    frame_of_id = {row[0]: int(row[1][:4]) - 1 for row in listed["images"]}
+    assert set(frame_of_id) == set(range(84, 100))
+    found = {frame_of_id[row[0]]: row[1:] for row in listed["keypoints"]}
+    assert found == {row[0] - 1: row[1:] for row in new["keypoints"]}
+    assert len(listed["two_view_geometries"]) == len(new["two_view_geometries"])
+
+
+def test_tracks_match_the_pictures(clip: Path, tmp_path: Path) -> None:
+    """The layers move by 2 and 4 px a frame: matches do so."""
+    match(tmp_path / "a.db", clip)
+    rows = tables(tmp_path / "a.db")
+    xy = {r[0]: np.frombuffer(r[3], np.float32).reshape(r[1], r[2]) for r in rows["keypoints"]}
+    checked = 0
+    for pair_id, count, _, data, *_ in rows["two_view_geometries"]:
+        i, j = divmod(pair_id, 2147483647)
+        if not count or j - i != 1:
+            continue
+        a, b = np.frombuffer(data, np.uint32).reshape(count, 2).T
+        step = xy[j][b] - xy[i][a]
+        right = (np.abs(step[:, 0] + 2) < 0.5) | (np.abs(step[:, 0] + 4) < 0.5)
+        assert np.mean(right & (np.abs(step[:, 1]) < 0.5)) > 0.9
+        checked += 1
+    assert checked == 15
+
+
+def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
+    report = match(tmp_path / "a.db", clip, options=MatchOptions(image_step=2))
+    assert report.num_images == 8
+    names = [image.name for image in read_images(tmp_path / "a.db")]
+    assert names == image_names("frame_%06d.png", range(0, 16, 2))
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (MatchOptions(image_step=0), OptionError),
+        (MatchOptions(image_name="x.png"), OptionError),
+        (MatchOptions(camera=CameraOptions(camera_model="NONE")), OptionError),
+        (MatchOptions(pairs=PairOptions(offsets=())), OptionError),
+        (MatchOptions(verify=VerifyOptions(max_error=0)), OptionError),
+        (MatchOptions(pairs=PairOptions(min_matches=10**6)), VideoError),
+    ],
+)
+def test_options_that_cannot_work(
+    clip: Path, tmp_path: Path, options: MatchOptions, error: type[ColmapAv1Error]
+) -> None:
+    with pytest.raises(error):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "frames", options=options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_frame_intra(encode: Encode, tmp_path: Path) -> None:
+    intra = encode(make_frames(6), tmp_path / "intra.mp4", *AV1[:-1], "1")
+    with pytest.raises(VideoError, match="nothing to match"):
+        match(tmp_path / "a.db", intra)
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    whole = ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf")
+    cut = tmp_path / "cut.ivf"
+    cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * 0.9)])
+    strict = MatchOptions(read=ReadOptions(strict=True))
+    with pytest.raises(BitstreamError, match=r"cut\.ivf: cut off"):
+        match(tmp_path / "a.db", cut, options=strict)
+    assert not (tmp_path / "a.db").exists()
+    report = match(tmp_path / "a.db", cut, image_path=tmp_path / "frames")
+    assert 8 < report.num_frames < 16
+    assert report.num_images == len(list((tmp_path / "frames").iterdir())) == report.num_frames
+    (warning,) = report.warnings
+    assert "cut off" in warning
+    assert f"the {report.num_frames} frames before" in warning
+
+
+def test_locked_database(clip: Path, tmp_path: Path) -> None:
+    match(tmp_path / "a.db", clip)
+    before = (tmp_path / "a.db").read_bytes()
+    connection = sqlite3.connect(tmp_path / "a.db", isolation_level=None)
+    connection.execute("DELETE FROM keypoints")
+    connection.execute("DELETE FROM matches")
+    connection.execute("DELETE FROM two_view_geometries")
+    connection.execute("BEGIN IMMEDIATE")
+    with pytest.raises(DatabaseError, match="in use by another process"):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
+    connection.execute("ROLLBACK")
+    connection.close()
+    assert not (tmp_path / "frames").exists()
+    assert (tmp_path / "a.db").read_bytes() != before
+    match(tmp_path / "a.db", clip)
+    with pytest.raises(DatabaseError, match="already has"):
+        match(tmp_path / "a.db", clip)
+
+
+def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path) -> None:
+    other = encode(make_frames(2, 96, 64), tmp_path / "other.mp4")
+    write_images(other, tmp_path / "frames", ["frame_000001.png"], [1])
+    with pytest.raises(ImageError, match="is 96x64, the video 192x128"):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
+    assert not (tmp_path / "a.db").exists()
+    assert len(list((tmp_path / "frames").iterdir())) == 1
+
+
+def test_video_that_changes_its_size(encode: Encode, tmp_path: Path) -> None:
+    parts = [
+        encode(make_frames(8, width, 128), tmp_path / f"{width}.obu").read_bytes()
+        for width in (192, 128)
+    ]
+    both = tmp_path / "both.obu"
+    both.write_bytes(b"".join(parts))
+    with pytest.raises(ImageError, match="from 192x128 to 128x128"):
+        match(tmp_path / "a.db", both, image_path=tmp_path / "frames")
+    assert not (tmp_path / "frames").exists()
+    assert not (tmp_path / "a.db").exists()
+    assert match(tmp_path / "a.db", both).num_images == 16
+
+
+def test_images_that_do_not_fit_the_video(clip: Path, tmp_path: Path) -> None:
+    write_images(clip, tmp_path / "cut", [f"{i:03d}.png" for i in range(10)], range(10))
+    database = listing_database(tmp_path / "cut", tmp_path / "a.db")
+    before = database.read_bytes()
+    with pytest.raises(ImageError, match="lists 10 images, the video has 16 frames"):
+        match(database, clip)
+    assert database.read_bytes() == before
+    options = MatchOptions(first_number=0)
+    assert match(database, clip, options=options).num_images == 10
+
+
+def test_interrupt_leaves_the_database(clip: Path, tmp_path: Path) -> None:
+    write_images(clip, tmp_path / "cut", [f"{i:03d}.png" for i in range(16)], range(16))
+    database = listing_database(tmp_path / "cut", tmp_path / "a.db")
+    before = database.read_bytes()
+    for stage in ("motion", "verification"):
+
+        def interrupt(now: str, done: int, total: int | None, stage: str = stage) -> None:
+            if now == stage and done > 2:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            match(database, clip, progress=interrupt)
+        assert database.read_bytes() == before
+
+
+def test_known_camera(clip: Path, tmp_path: Path) -> None:
+    camera = CameraOptions(camera_model="PINHOLE", camera_params="200,200,96,64")
+    match(tmp_path / "a.db", clip, options=replace(MatchOptions(), camera=camera))
+    (row,) = tables(tmp_path / "a.db")["cameras"]
+    assert np.frombuffer(row[4]).tolist() == [200, 200, 96, 64]
+    assert row[5] == 1
+    each = replace(camera, single_camera=False)
+    match(tmp_path / "b.db", clip, options=MatchOptions(camera=each))
+    assert len(tables(tmp_path / "b.db")["cameras"]) == 16
+
+
+def test_hidden_frames(encode: Encode, tmp_path: Path) -> None:
+    """A pyramid: frames are coded hidden, out of order, and shown later."""
+    how = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "19", "-crf", "20"]
+    pyramid = encode(make_frames(20), tmp_path / "pyramid.mp4", *how)
+    report = match(tmp_path / "a.db", pyramid, image_path=tmp_path / "frames")
+    assert report.num_frames == report.num_images == 20
+    assert report.num_coded_frames >= 20
+    assert report.num_inliers > 1000
