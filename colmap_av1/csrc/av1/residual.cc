@@ -549,7 +549,6 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
         ctx += entry.base_offset;
       }
       level = symbols.symbol<4>(base_cdfs[ctx]);
-      if (level == 0) continue;
     }
     if (level > NUM_BASE_LEVELS) {
       const int ctx = std::min(((mag & kLevelMask) + 1) >> 1, 6) + entry.br_offset;
@@ -560,7 +559,8 @@ int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
       }
     }
     *at = static_cast<std::uint8_t>(level | (std::min(level, 3) << kClippedShift));
-    nonzero_[num_levels++] = entry.index;
+    nonzero_[num_levels] = entry.index;
+    num_levels += level != 0;
   }
   symbols_ = symbols;
   return num_levels;

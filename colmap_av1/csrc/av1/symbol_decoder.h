@@ -38,8 +38,6 @@ class SymbolDecoder {
     static_assert(N >= 2 && N <= 16);
     if constexpr (N == 2) {
       return flag(icdf);
-    } else if constexpr (N <= 4) {
-      return short_symbol<N>(icdf);
     } else {
       // Decoded symbols are close to random, so the search runs without branches: every bound
       // is computed, and the symbol is the number of bounds above the value.
@@ -114,44 +112,9 @@ class SymbolDecoder {
   }
 
  private:
-  // 3 or 4 symbols, by selects: a shorter chain from one symbol to the next than by vectors.
+  // Entries that find_symbol writes: whole vectors, of 4 lanes at least.
   template <int N>
-  int short_symbol(std::uint16_t* icdf) {
-    const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
-    const std::uint32_t r = range_ >> 8;
-    std::uint32_t bounds[N];
-    for (int i = 0; i < N - 1; ++i) {
-      bounds[i] = ((r * (static_cast<std::uint32_t>(icdf[i]) >> 6)) >> 1) +
-                  4 * static_cast<std::uint32_t>(N - 1 - i);
-    }
-    bounds[N - 1] = 0;
-    std::uint32_t high = range_;
-    std::uint32_t low = bounds[0];
-    std::uint32_t symbol = 0;
-    for (int i = 0; i < N - 1; ++i) {
-      const bool below = value < bounds[i];
-      high = below ? bounds[i] : high;
-      low = below ? bounds[i + 1] : low;
-      symbol += below;
-    }
-    renormalize(high - low, low);
-    if (update_) {
-      const std::uint32_t count = icdf[N];
-      const int rate = adaptation_rate(static_cast<int>(count), N);
-      for (std::uint32_t i = 0; i < N - 1; ++i) {
-        const std::uint32_t v = icdf[i];
-        const std::uint32_t up = v + ((32768 - v) >> rate);
-        const std::uint32_t down = v - (v >> rate);
-        icdf[i] = static_cast<std::uint16_t>(i < symbol ? up : down);
-      }
-      icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
-    }
-    return static_cast<int>(symbol);
-  }
-
-  // Entries that find_symbol writes: whole vectors of 8 lanes.
-  template <int N>
-  static constexpr int kLanes = N <= 8 ? 8 : 16;
+  static constexpr int kLanes = N <= 4 ? 4 : N <= 8 ? 8 : 16;
 
   static int adaptation_rate(int count, int n) {
     return 3 + (count > 15) + (count > 31) + (n >= 4 ? 2 : 1);  // Min( FloorLog2( N ), 2 )
@@ -172,12 +135,12 @@ class SymbolDecoder {
     __m128i below[kVectors];
     unsigned mask = 0;
     for (int k = 0; k < kVectors; ++k) {
-      f[k] = load(icdf + 8 * k);
+      f[k] = load<N>(icdf + 8 * k);
       const __m128i scaled = _mm_slli_epi16(_mm_srli_epi16(f[k], 6), 7);
       const __m128i least = _mm_slli_epi16(
           _mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
       const __m128i bound = _mm_add_epi16(_mm_mulhi_epu16(scaled, r), least);
-      store(bounds + 8 * k, bound);
+      store<N>(bounds + 8 * k, bound);
       // value < bound, unsigned
       const __m128i not_below = _mm_cmpeq_epi16(_mm_subs_epu16(bound, value), _mm_setzero_si128());
       below[k] = _mm_xor_si128(not_below, _mm_set1_epi16(-1));
@@ -200,19 +163,28 @@ class SymbolDecoder {
         const __m128i delta = _mm_sub_epi16(_mm_xor_si128(step, negative), negative);
         const __m128i used =
             _mm_cmplt_epi16(lane, _mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)));
-        store(icdf + 8 * k, _mm_add_epi16(f[k], _mm_and_si128(delta, used)));
+        store<N>(icdf + 8 * k, _mm_add_epi16(f[k], _mm_and_si128(delta, used)));
       }
       icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
     }
     return symbol;
   }
 
+  // Arrays of up to 4 symbols take half a register.
+  template <int N>
   static __m128i load(const std::uint16_t* p) {
-    return _mm_loadu_si128(reinterpret_cast<const __m128i*>(p));
+    const auto* v = reinterpret_cast<const __m128i*>(p);
+    return N <= 4 ? _mm_loadl_epi64(v) : _mm_loadu_si128(v);
   }
 
+  template <int N>
   static void store(std::uint16_t* p, __m128i value) {
-    _mm_storeu_si128(reinterpret_cast<__m128i*>(p), value);
+    auto* v = reinterpret_cast<__m128i*>(p);
+    if constexpr (N <= 4) {
+      _mm_storel_epi64(v, value);
+    } else {
+      _mm_storeu_si128(v, value);
+    }
   }
 #else
   template <int N>
@@ -241,7 +213,8 @@ class SymbolDecoder {
 #endif
 
   void renormalize(std::uint32_t range, std::uint32_t subtrahend) {
-    const int bits = std::countl_zero(static_cast<std::uint16_t>(range));
+    // 15 - FloorLog2( range ), in words that show the compiler an operand other than 0
+    const int bits = std::countl_zero(2 * range | 1) - 15;
     range_ = range << bits;
     window_ = (window_ - (static_cast<std::uint64_t>(subtrahend) << 48)) << bits;
     available_ -= bits;
