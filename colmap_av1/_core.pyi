@@ -24,6 +24,7 @@ class Parser:
         operating_point: int = 0,
         headers_only: bool = False,
         keep_blocks: bool = False,
+        num_threads: int = 1,
         max_frame_size: int = 268435456,
     ) -> None: ...
     def parse(self, data: bytes) -> None: ...

@@ -43,6 +43,9 @@ _Options = TypeVar("_Options")
 _Report = Callable[[str, int, "int | None"], None]
 _Rows = list[tuple[str, str]]
 
+# Prefix of the namespace entries that are fields of options.
+_OPTION = "option."
+
 # Options under other names than their fields', and COLMAP's prefixes, which are accepted.
 _SPELLINGS = {"seed": ("--random_seed",)}
 _PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
@@ -108,19 +111,24 @@ def _make_parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="folder to write the images to; existing ones of the right size are kept",
     )
-    _add_options(command, MatchOptions, "images")
-    _add_options(command, CameraOptions, "camera")
-    _add_options(command, TrackOptions, "tracks")
-    _add_options(command, PairOptions, "pairs")
-    _add_options(command, VerifyOptions, "two-view geometry")
-    _add_options(command, ReadOptions, "bitstream")
+    _add_options(
+        command,
+        {
+            MatchOptions: "images",
+            CameraOptions: "camera",
+            TrackOptions: "tracks",
+            PairOptions: "pairs",
+            VerifyOptions: "two-view geometry",
+            ReadOptions: "bitstream",
+        },
+    )
     _add_quiet(command)
 
     command = _add_command(
         commands, "info", _run_info, "tell what a stream is made of and whether it is any good"
     )
     _add_video(command)
-    _add_options(command, ReadOptions, "bitstream")
+    _add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
 
     command = _add_command(commands, "motion", _run_motion, "write the motion of every frame")
@@ -128,7 +136,7 @@ def _make_parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--output", "--output_path", required=True, metavar="PATH", help="a .npz or .h5 file"
     )
-    _add_options(command, ReadOptions, "bitstream")
+    _add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
     return parser
 
@@ -161,40 +169,46 @@ def _underscored(word: str) -> str:
     return f"--{name.replace('-', '_')}{equals}{value}"
 
 
-def _add_options(command: argparse.ArgumentParser, kind: type, title: str) -> None:
-    """Add an option for each field of an options dataclass.
+def _add_options(command: argparse.ArgumentParser, kinds: dict[type, str]) -> None:
+    """Add an option for each field of some options dataclasses, in groups of the given titles.
 
-    The field's comment is the help text. Fields that hold further options are left out; one
-    that is not given on the command line does not appear in the namespace.
+    The field's comment is the help text. Fields that hold further options are left out; a name
+    that several kinds have, such as num_threads, is one option for all of them. What is not
+    given on the command line does not appear in the namespace.
     """
-    group = command.add_argument_group(title)
-    hints = typing.get_type_hints(kind)
-    comments = _field_comments(kind)
-    for field in dataclasses.fields(kind):
-        if dataclasses.is_dataclass(field.default):
-            continue
-        names = [*_SPELLINGS.get(field.name, ()), f"--{field.name}"]
-        if kind in _PREFIXES:
-            names.append(f"--{_PREFIXES[kind]}.{field.name}")
-        parse, metavar = _value_parser(hints[field.name])
-        default = _spell(field.default)
-        how: dict[str, Any] = {"nargs": "?", "const": True} if hints[field.name] is bool else {}
-        group.add_argument(
-            *names,
-            dest=f"{kind.__name__}.{field.name}",
-            type=parse,
-            metavar=metavar,
-            default=argparse.SUPPRESS,
-            help=f"{comments.get(field.name, '')} [{default}]".strip().replace("%", "%%"),
-            **how,
-        )
+    added: set[str] = set()
+    for kind, title in kinds.items():
+        group = command.add_argument_group(title)
+        hints = typing.get_type_hints(kind)
+        comments = _field_comments(kind)
+        for field in dataclasses.fields(kind):
+            if dataclasses.is_dataclass(field.default) or field.name in added:
+                continue
+            added.add(field.name)
+            names = [*_SPELLINGS.get(field.name, ()), f"--{field.name}"]
+            if kind in _PREFIXES:
+                names.append(f"--{_PREFIXES[kind]}.{field.name}")
+            parse, metavar = _value_parser(hints[field.name])
+            default = _spell(field.default)
+            how: dict[str, Any] = {"nargs": "?", "const": True} if hints[field.name] is bool else {}
+            group.add_argument(
+                *names,
+                dest=f"{_OPTION}{field.name}",
+                type=parse,
+                metavar=metavar,
+                default=argparse.SUPPRESS,
+                help=f"{comments.get(field.name, '')} [{default}]".strip().replace("%", "%%"),
+                **how,
+            )
 
 
 def _given(namespace: argparse.Namespace, kind: type[_Options], **more: Any) -> _Options:
     """The options of a kind, with those given on the command line in place of defaults."""
-    prefix = f"{kind.__name__}."
-    given = {k[len(prefix) :]: v for k, v in vars(namespace).items() if k.startswith(prefix)}
-    return kind(**given, **more)
+    names = typing.get_type_hints(kind)
+    given = {
+        k.removeprefix(_OPTION): v for k, v in vars(namespace).items() if k.startswith(_OPTION)
+    }
+    return kind(**{k: v for k, v in given.items() if k in names}, **more)
 
 
 def _field_comments(kind: type) -> dict[str, str]:

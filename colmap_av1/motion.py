@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -213,11 +214,14 @@ def _events(
     parser = _core.Parser(
         operating_point=options.operating_point,
         headers_only=headers_only,
+        num_threads=options.num_threads or os.cpu_count() or 1,
         max_frame_size=options.max_frame_size,
     )
     with open_stream(video) as stream:
         if stream.configuration:
-            _parse(parser, stream.configuration, video, options)
+            error = _parse(parser, stream.configuration, video, options)
+            if error is not None:
+                raise error
         for packet in stream.packets():
             error = _parse(parser, packet.data, video, options)
             yield from parser.take_events()

@@ -280,12 +280,12 @@ void bind_av1(nb::module_& m) {
       .def(
           "__init__",
           [](Parser* self, int operating_point, bool headers_only, bool keep_blocks,
-             std::int64_t max_frame_size) {
-            new (self) Parser(
-                ParserOptions{operating_point, headers_only, keep_blocks, max_frame_size});
+             int num_threads, std::int64_t max_frame_size) {
+            new (self) Parser(ParserOptions{operating_point, headers_only, keep_blocks,
+                                            num_threads, max_frame_size});
           },
           "operating_point"_a = 0, "headers_only"_a = false, "keep_blocks"_a = false,
-          "max_frame_size"_a = std::int64_t{1} << 28)
+          "num_threads"_a = 1, "max_frame_size"_a = std::int64_t{1} << 28)
       .def(
           "parse",
           [](Parser& self, nb::bytes data) {

@@ -3,7 +3,9 @@
 #include "av1/parser.h"
 
 #include <algorithm>
-#include <string>
+#include <atomic>
+#include <exception>
+#include <thread>
 
 #include "av1/error.h"
 #include "av1/motion_field.h"
@@ -222,6 +224,7 @@ void Parser::start_frame() {
   const std::size_t num_tiles = static_cast<std::size_t>(header_.tile_cols * header_.tile_rows);
   tile_first_block_.assign(num_tiles, 0);
   tile_num_blocks_.assign(num_tiles, 0);
+  tile_local_warps_.assign(num_tiles, {});
   std::size_t first = 0;
   for (int row = 0; row < header_.tile_rows; ++row) {
     for (int col = 0; col < header_.tile_cols; ++col) {
@@ -250,6 +253,7 @@ void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
   reader.byte_alignment();
   ++event_->num_tile_groups;
   std::size_t position = reader.position() / 8;
+  std::vector<TileData> tiles;
   for (; tile_num_ <= tg_end; ++tile_num_) {
     std::size_t tile_size = size - position;
     if (tile_num_ != tg_end) {
@@ -264,36 +268,79 @@ void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
     }
     if (tile_size > size - position) throw BitstreamError("tile reaches beyond its tile group");
     if (tile_size == 0) throw BitstreamError("tile is empty");
-    if (!options_.headers_only) {
-      const std::size_t tile = static_cast<std::size_t>(tile_num_);
-      tile_parser_.parse(context_, tile_num_ / header_.tile_cols, tile_num_ % header_.tile_cols,
-                         data + position, tile_size,
-                         context_.blocks.get() + tile_first_block_[tile]);
-      tile_num_blocks_[tile] = tile_parser_.num_blocks();
-      const auto base = static_cast<std::int32_t>(event_->local_warps.size());
-      if (base > 0) {
-        BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
-        for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i) {
-          if (block[i].local_warp >= 0) block[i].local_warp += base;
-        }
-      }
-      event_->local_warps.insert(event_->local_warps.end(), tile_parser_.local_warps().begin(),
-                                 tile_parser_.local_warps().end());
-      if (!header_.disable_frame_end_update_cdf && tile_num_ == header_.context_update_tile_id) {
-        state_->cdfs = tile_parser_.cdfs();
-        state_->cdfs.clear_counters();
-      }
-      if (options_.keep_blocks) event_->tile_sizes.push_back(static_cast<int>(tile_size));
-    }
+    if (options_.keep_blocks) event_->tile_sizes.push_back(static_cast<int>(tile_size));
+    tiles.push_back({tile_num_, data + position, tile_size});
     position += tile_size;
   }
+  if (!options_.headers_only) parse_tiles(tiles);
   if (tile_num_ == num_tiles) finish_frame();
+}
+
+// Tiles do not depend on each other (5.11.2): each thread takes the next one. Of several errors
+// that of the first tile is reported, so that threads change nothing.
+void Parser::parse_tiles(const std::vector<TileData>& tiles) {
+  // Starting a thread takes about as long as parsing some kilobytes.
+  constexpr std::size_t kBytesPerThread = 8192;
+  std::size_t bytes = 0;
+  for (const TileData& tile : tiles) bytes += tile.size;
+  const std::size_t num_threads =
+      std::min({tiles.size(), static_cast<std::size_t>(std::max(1, options_.num_threads)),
+                1 + bytes / kBytesPerThread});
+  while (tile_parsers_.size() < num_threads) {
+    tile_parsers_.push_back(std::make_unique<TileParser>());
+  }
+  std::vector<std::exception_ptr> errors(tiles.size());
+  std::atomic<std::size_t> next{0};
+  const auto work = [&](TileParser& parser) {
+    for (std::size_t i; (i = next++) < tiles.size();) {
+      try {
+        const TileData& tile = tiles[i];
+        const auto number = static_cast<std::size_t>(tile.number);
+        parser.parse(context_, tile.number / header_.tile_cols, tile.number % header_.tile_cols,
+                     tile.data, tile.size, context_.blocks.get() + tile_first_block_[number]);
+        tile_num_blocks_[number] = parser.num_blocks();
+        tile_local_warps_[number] = parser.local_warps();
+        if (!header_.disable_frame_end_update_cdf &&
+            tile.number == header_.context_update_tile_id) {
+          state_->cdfs = parser.cdfs();
+          state_->cdfs.clear_counters();
+        }
+      } catch (...) {
+        errors[i] = std::current_exception();
+      }
+    }
+  };
+  std::vector<std::thread> threads;
+  for (std::size_t i = 1; i < num_threads; ++i) {
+    threads.emplace_back([&work, parser = tile_parsers_[i].get()] { work(*parser); });
+  }
+  work(*tile_parsers_[0]);
+  for (std::thread& thread : threads) thread.join();
+  for (const auto& error : errors) {
+    if (error) std::rethrow_exception(error);
+  }
+}
+
+// The local warps of all tiles in one array, and the blocks' places in it
+void Parser::collect_local_warps() {
+  for (std::size_t tile = 0; tile < tile_local_warps_.size(); ++tile) {
+    const auto base = static_cast<std::int32_t>(event_->local_warps.size());
+    if (base > 0 && !tile_local_warps_[tile].empty()) {
+      BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
+      for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i) {
+        if (block[i].local_warp >= 0) block[i].local_warp += base;
+      }
+    }
+    event_->local_warps.insert(event_->local_warps.end(), tile_local_warps_[tile].begin(),
+                               tile_local_warps_[tile].end());
+  }
 }
 
 // 7.4 Decode frame wrapup process
 void Parser::finish_frame() {
   seen_frame_header_ = false;
   if (!options_.headers_only) {
+    collect_local_warps();
     if (header_.disable_frame_end_update_cdf) state_->cdfs = context_.cdfs;
     save_motion(*seq_, context_, state_->saved_motion);
     const std::size_t units = context_.grid.size();

@@ -18,6 +18,8 @@ struct ParserOptions {
   bool headers_only = false;
   // Keeps BlockInfo, LocalWarp and tile sizes of every frame in its event.
   bool keep_blocks = false;
+  // Threads that parse the tiles of a tile group side by side; the result is the same.
+  int num_threads = 1;
   // Largest accepted frame in luma samples.
   std::int64_t max_frame_size = std::int64_t{1} << 28;
 };
@@ -86,6 +88,13 @@ class Parser {
                                int spatial_id);
   void start_frame();
   void tile_group_obu(const std::uint8_t* data, std::size_t size);
+  struct TileData {
+    int number;
+    const std::uint8_t* data;
+    std::size_t size;
+  };
+  void parse_tiles(const std::vector<TileData>& tiles);
+  void collect_local_warps();
   void finish_frame();
   void show_existing_frame();
   void update_references(const std::shared_ptr<const FrameState>& state, int refresh_frame_flags);
@@ -110,7 +119,8 @@ class Parser {
   FrameContext context_;
   std::vector<std::size_t> tile_first_block_;
   std::vector<std::size_t> tile_num_blocks_;
-  TileParser tile_parser_;
+  std::vector<std::vector<LocalWarp>> tile_local_warps_;
+  std::vector<std::unique_ptr<TileParser>> tile_parsers_;  // one per thread
 };
 
 }  // namespace colmap_av1::av1
