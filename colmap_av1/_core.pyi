@@ -44,6 +44,7 @@ class TrackBuilder:
         max_block_area: int,
         max_uncoded_block_area: int,
         smoothness: float,
+        border: float,
     ) -> None: ...
     def add(self, **frame: Any) -> None: ...
     def finish(

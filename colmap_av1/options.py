@@ -28,7 +28,7 @@ class TrackOptions:
     min_length: int = 4
     # end a track where the space-time cosine between its motion and the motion predicted
     # from the step before falls below this; None: never
-    cosine: float | None = 0.5
+    cosine: float | None = 0.3
     # 'dominant': predict the change of the frame's dominant motion too, so a shaking
     # camera ends no track; 'none': expect the motion to stay as it was
     cosine_relative_to: Literal["dominant", "none"] = "dominant"
@@ -43,7 +43,10 @@ class TrackOptions:
     max_uncoded_block_area: int | None = 256
     # do not trust a block whose displacement d differs by more than this many pixels, and
     # |d|/8 times as many on top, from that of most units around it; None: no such test
-    smoothness: float | None = 1.5
+    smoothness: float | None = 2.5
+    # do not trust motion that starts or ends within this many pixels of the picture's edge:
+    # the encoder had no picture to compare with beyond it; None: trust all
+    border: float | None = 16.0
 
 
 @dataclass(frozen=True)

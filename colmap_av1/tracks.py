@@ -83,6 +83,7 @@ def build_tracks(
         max_block_area=_or_off(options.max_block_area),
         max_uncoded_block_area=_or_off(options.max_uncoded_block_area),
         smoothness=_or_off(options.smoothness),
+        border=_or_off(options.border),
     )
     for count, frame in enumerate(motion, start=1):
         builder.add(
@@ -138,7 +139,8 @@ def _check_options(options: TrackOptions) -> None:
         )
     if not (0.0 <= options.cosine_scale < math.inf):
         raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
-    for name in ("max_interval", "max_block_area", "max_uncoded_block_area", "smoothness"):
+    limits = ("max_interval", "max_block_area", "max_uncoded_block_area", "smoothness", "border")
+    for name in limits:
         value = getattr(options, name)
         if value is not None and not value >= 0:
             raise OptionError(f"{name} is {value}: give 0 or more, or None")

@@ -32,7 +32,10 @@ OPEN = TrackOptions(
     max_block_area=None,
     max_uncoded_block_area=None,
     smoothness=None,
+    border=None,
 )
+# The rules of trust that do not depend on how large the picture is.
+SMALL_PICTURES = TrackOptions(border=None)
 
 # A list's motion: (dx, dy) in px for all units, or an int16 array [rows, cols, 2] (row, col).
 Motion = tuple[float, float] | NDArray[np.int16]
@@ -299,7 +302,7 @@ def test_rotation_and_zoom_stay_near_the_true_path(angle: float, zoom: float) ->
         return u - x, v - y
 
     motion = mv_of(flow, width, height)
-    tracks = build_tracks(low_delay([motion] * 8, width=width, height=height))
+    tracks = build_tracks(low_delay([motion] * 8, width=width, height=height), SMALL_PICTURES)
     check_invariants(tracks, 4)
     assert len(tracks.offsets) > 900
     errors = []
@@ -317,7 +320,7 @@ def test_warp_is_inverted_without_an_offset() -> None:
     params = similarity_params(0.03, 0.97, (1.5, 0.25))
     frames = low_delay([(0, 0)] * 4)
     frames[1:] = [warp_units(f, params) for f in frames[1:]]
-    tracks = build_tracks(frames)
+    tracks = build_tracks(frames, SMALL_PICTURES)
     check_invariants(tracks, 4)
     assert len(tracks.offsets) > 50
     matrix = np.array(params[2:], float).reshape(2, 2) / ONE
@@ -351,7 +354,7 @@ def hierarchy(step: Any, far: Any) -> list[FrameMotion]:
 @pytest.mark.parametrize("far", [(5.0, -2.0), (-17.0, 3.0)])
 def test_random_access_follows_short_steps_in_both_directions(far: tuple[float, float]) -> None:
     step = (1.25, -0.5)
-    tracks = build_tracks(hierarchy(step, far))
+    tracks = build_tracks(hierarchy(step, far), SMALL_PICTURES)
     check_invariants(tracks, 4)
     # What leaves the picture is left to the far vector.
     ends = [(xy, xy[0] - 4 * np.float32(step)) for shown, xy in split(tracks) if len(shown) == 5]
@@ -363,7 +366,9 @@ def test_random_access_follows_short_steps_in_both_directions(far: tuple[float, 
 
 def test_a_frame_coded_ahead_ends_the_video() -> None:
     # The last frames are shown by headers alone, which yield no motion.
-    tracks = build_tracks(hierarchy((0.0, 0.0), (0.0, 0.0))[:3], TrackOptions(min_length=3))
+    tracks = build_tracks(
+        hierarchy((0.0, 0.0), (0.0, 0.0))[:3], TrackOptions(min_length=3, border=None)
+    )
     assert tracks.num_frames == 5
     assert len(tracks.offsets) - 1 == 16 * 12
     np.testing.assert_array_equal(tracks.frame.reshape(-1, 3), [[0, 2, 4]] * (16 * 12))
@@ -381,7 +386,7 @@ def test_steps_longer_than_the_limit_are_not_taken() -> None:
     frames = [frame(0), frame(1, 3, {LAST: (0, 0)}, [(LAST, (0.0, 0.0))])]
 
     def count(limit: int | None) -> int:
-        options = TrackOptions(min_length=2, max_interval=limit)
+        options = TrackOptions(min_length=2, max_interval=limit, border=None)
         return len(build_tracks(frames, options).offsets) - 1
 
     assert count(3) == count(None) == 16 * 12
@@ -398,7 +403,7 @@ def test_hidden_frames_carry_tracks_and_are_not_observed() -> None:
         frame(4, 2, {LAST: (3, -1)}, [(LAST, step)]),
         frame(5, 3, {LAST: (4, 2)}, [(LAST, step)]),
     ]
-    tracks = build_tracks(frames)
+    tracks = build_tracks(frames, SMALL_PICTURES)
     check_invariants(tracks, 4)
     assert tracks.num_frames == 4
     paths = split(tracks)
@@ -433,7 +438,7 @@ def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
     hole.ref_frame[2:6, 3:7] = (0, -1)
     hole.is_inter[2:6, 3:7] = 0
     hole.mv[2:6, 3:7] = 0
-    tracks = build_tracks(frames)
+    tracks = build_tracks(frames, SMALL_PICTURES)
     check_invariants(tracks, 4)
     counts = {}
     for shown, xy in split(tracks):
@@ -476,7 +481,7 @@ def test_a_reference_of_another_size_is_scaled() -> None:
             ref_sizes={LAST: small},
         ),
     ]
-    tracks = build_tracks(frames)
+    tracks = build_tracks(frames, SMALL_PICTURES)
     check_invariants(tracks, 4)
     assert (tracks.width, tracks.height) == large
     paths = split(tracks)
@@ -504,7 +509,7 @@ def test_super_resolution_positions_are_in_the_upscaled_picture() -> None:
         )
         for i in range(1, 5)
     ]
-    tracks = build_tracks(frames)
+    tracks = build_tracks(frames, SMALL_PICTURES)
     assert tracks.width == 64
     paths = split(tracks)
     assert len(paths) > 30
@@ -515,9 +520,9 @@ def test_super_resolution_positions_are_in_the_upscaled_picture() -> None:
 
 def test_tracks_below_the_minimum_length_are_left_out() -> None:
     frames = low_delay([(0.0, 0.0)] * 3)
-    assert len(build_tracks(frames, TrackOptions(min_length=5)).offsets) == 1
-    assert len(build_tracks(frames, TrackOptions(min_length=4)).offsets) == 16 * 12 + 1
-    empty = build_tracks(frames, TrackOptions(min_length=5))
+    assert len(build_tracks(frames, TrackOptions(min_length=5, border=None)).offsets) == 1
+    assert len(build_tracks(frames, TrackOptions(min_length=4, border=None)).offsets) == 16 * 12 + 1
+    empty = build_tracks(frames, TrackOptions(min_length=5, border=None))
     assert empty.frame.shape == (0,)
     assert empty.xy.shape == (0, 2)
 
@@ -558,6 +563,14 @@ def test_smoothness_takes_out_the_block_that_disagrees() -> None:
     seen[row, col] = True
     assert not seen[4:6, 6:8].any()
     assert seen.sum() == 12 * 16 - 4
+
+
+def test_motion_at_the_edge_is_not_followed() -> None:
+    frames = low_delay([(0.0, 0.0)] * 5)
+    tracks = build_tracks(frames, replace(OPEN, border=8.0))
+    assert tracks.xy.min() >= 8
+    assert np.all(tracks.xy <= np.array([tracks.width, tracks.height]) - 8)
+    assert len(tracks.offsets) - 1 == (16 - 4) * (12 - 4)
 
 
 def shaking(seed: int = 0, frames: int = 20) -> list[FrameMotion]:
@@ -604,7 +617,7 @@ def test_cosine_ends_a_track_that_leaves_the_motion_around_it() -> None:
 @pytest.mark.parametrize("name", ["good_lag0", "good_cpu4_lag35", "svt4_p6", "gm_affine_scene"])
 def test_tracks_follow_the_decoded_pictures(shared: Path, name: str) -> None:
     stream = shared / "conformance" / "streams" / f"{name}.ivf"
-    tracks = build_tracks(read_motion(stream))
+    tracks = build_tracks(read_motion(stream), SMALL_PICTURES)
     check_invariants(tracks, 4)
     with av.open(str(stream)) as container:
         images = [f.to_ndarray(format="gray") for f in container.decode(video=0)]
@@ -696,6 +709,7 @@ any_options = st.builds(
     max_block_area=st.sampled_from([None, 1024]),
     max_uncoded_block_area=st.sampled_from([None, 256]),
     smoothness=st.sampled_from([None, 1.5]),
+    border=st.sampled_from([None, 6.0]),
 )
 
 
@@ -734,6 +748,7 @@ def test_no_shown_frame_is_an_error() -> None:
         {"cosine_scale": -1.0},
         {"max_block_area": -5},
         {"smoothness": math.nan},
+        {"border": -1.0},
     ],
 )
 def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:

@@ -129,6 +129,10 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
   field.gm_params = frame.warps.data() + 6 * field.num_local_warps;
 
   const DisplacementModel model(field);
+  const float border = static_cast<float>(std::max(0.0, options_.border));
+  const auto is_in_border = [&](float x, float y) {
+    return x < border || y < border || x > frame.coded_width - border || y > frame.height - border;
+  };
   frame.mi_size.assign(field.mi_size, field.mi_size + num_units);
   for (auto& list : frame.motion) list.assign(frame.mi_size.size(), UnitMotion{});
   for (int row = 0; row < frame.visible_rows; ++row) {
@@ -143,6 +147,9 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
       for (int list = 0; list < 2; ++list) {
         const Displacement d = model.at(unit, list);
         if (d.ref == 0 || !is_within_reach(frame.ref_interval[d.ref])) continue;
+        const float x = kUnit * static_cast<float>(col) + kUnit / 2.F;
+        const float y = kUnit * static_cast<float>(row) + kUnit / 2.F;
+        if (border > 0 && (is_in_border(x, y) || is_in_border(x + d.dx, y + d.dy))) continue;
         const int32_t warp =
             d.warp == nullptr ? -1 : static_cast<int32_t>(d.warp - frame.warps.data());
         frame.motion[list][unit] = {d.dx, d.dy, warp, static_cast<int8_t>(d.ref)};

@@ -24,6 +24,7 @@ struct TrackBuilderOptions {
   int max_block_area = -1;
   int max_uncoded_block_area = -1;
   double smoothness = -1;
+  double border = -1;
 };
 
 // One coded frame. Borrowed for the call.
