@@ -328,6 +328,8 @@ def _match_rows(report: MatchReport) -> _Rows:
         ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
     ]
+    if report.forward_motion:
+        rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     rows += [(f"seconds, {stage}", f"{s:.2f}") for stage, s in report.seconds.items()]
     return [*rows, ("seconds, total", f"{sum(report.seconds.values()):.2f}")]
 

@@ -35,13 +35,15 @@ from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import MatchOptions
 from colmap_av1.pairs import image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.tracks import Tracks, build_tracks
-from colmap_av1.verify import verify_pairs
+from colmap_av1.verify import TwoViewGeometry, verify_pairs
 from colmap_av1.video import display_rotation, open_stream
 
 # Called with a stage's name, what is done of it and, where known, of how much.
 Progress = Callable[[str, int, "int | None"], None]
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
+# The mapper's default limit for the translation along the axis of a first pair.
+_INIT_MAX_FORWARD_MOTION = 0.95
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -66,6 +68,8 @@ class MatchReport:
         num_matches: matches of all pairs.
         num_inliers: inlier matches of all pairs.
         configs: number of pairs by COLMAP's name of their two-view configuration.
+        forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
+            with no pair unless told to, and the focal length cannot be found.
         seconds: wall time of each stage.
         warnings: what the user should know, such as damage of the stream.
     """
@@ -85,6 +89,7 @@ class MatchReport:
     num_matches: int
     num_inliers: int
     configs: dict[str, int]
+    forward_motion: bool
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -97,10 +102,20 @@ class MatchReport:
             *("colmap", "mapper", "--database_path", str(self.database)),
             *("--image_path", images, "--output_path", output),
         ]
+        if self.forward_motion:
+            mapper += ["--Mapper.init_max_forward_motion", "1"]
+            mapper += [
+                "--Mapper.ba_refine_focal_length",
+                "0",
+                "--Mapper.ba_refine_extra_params",
+                "0",
+            ]
         script = [
             *("python", "examples/map_with_pycolmap.py", "--database", str(self.database)),
             *("--image_path", images, "--output", output),
         ]
+        if self.forward_motion:
+            script.append("--forward_motion")
         return f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}", shlex.join(script)
 
 
@@ -228,9 +243,19 @@ def match(
         num_matches=sum(len(m) for m in matches),
         num_inliers=sum(num_inliers),
         configs={kind: kinds.count(kind) for kind in sorted(set(kinds))},
+        forward_motion=_is_forward_motion(geometries),
         seconds=clock.seconds,
         warnings=notes,
     )
+
+
+def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
+    """Whether COLMAP's mapper would take most pairs for forward motion and not start with them.
+
+    Only pairs with known intrinsics say in which direction the camera moved.
+    """
+    along_axis = [abs(float(g.tvec[2])) for g in geometries if g.tvec is not None]
+    return bool(along_axis) and float(np.median(along_axis)) >= _INIT_MAX_FORWARD_MOTION
 
 
 def _check_options(options: MatchOptions, size: tuple[int, int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 from collections.abc import Generator, Iterator
@@ -22,6 +23,8 @@ from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
 
 _IVF_FRAME_HEADER_SIZE = 12
+_IVF_RATE_OFFSET = 16  # rate and scale, 32 bits each
+_IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
 _AV1C_HEADER_SIZE = 4
 
 
@@ -260,6 +263,34 @@ def _decode(
         container.close()
 
 
+class _IvfWithRate(io.FileIO):
+    """An IVF file read as if its header gave a frame rate; FFmpeg refuses one that is 0."""
+
+    def readinto(self, buffer: Any) -> int:
+        start = self.tell()
+        count = super().readinto(buffer) or 0
+        view = memoryview(buffer).cast("B")
+        for i, byte in enumerate(_IVF_ONE_TO_ONE, start=_IVF_RATE_OFFSET - start):
+            if 0 <= i < count:
+                view[i] = byte
+        return count
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is None or size < 0:
+            size = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        buffer = bytearray(size)
+        return bytes(buffer[: self.readinto(buffer)])
+
+
+def _is_ivf_without_rate(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        header = file.read(_IVF_RATE_OFFSET + len(_IVF_ONE_TO_ONE))
+    rate = header[_IVF_RATE_OFFSET:]
+    return header.startswith(b"DKIF") and b"\0" * 4 in (rate[:4], rate[4:])
+
+
 def _open_container(path: Path) -> Any:
     try:
         if not path.exists():
@@ -269,7 +300,10 @@ def _open_container(path: Path) -> Any:
         if path.is_file() and path.stat().st_size == 0:
             raise VideoError(f"{path}: is an empty file")
         # An absolute path: FFmpeg would take 'name:...' for a protocol.
-        return av.open(os.path.abspath(path), container_options=_CONTAINER_OPTIONS)
+        source: Any = os.path.abspath(path)
+        if _is_ivf_without_rate(path):
+            source = _IvfWithRate(source)
+        return av.open(source, container_options=_CONTAINER_OPTIONS)
     except PermissionError as error:
         raise VideoError(f"{path}: no permission to read it") from error
     except (av.error.FFmpegError, OSError, ValueError) as error:

@@ -19,6 +19,11 @@ def main() -> int:
     parser.add_argument("--database", type=Path, required=True, help="COLMAP database with matches")
     parser.add_argument("--image_path", type=Path, required=True, help="folder of its images")
     parser.add_argument("--output", type=Path, required=True, help="folder for the model")
+    parser.add_argument(
+        "--forward_motion",
+        action="store_true",
+        help="the camera moves along its axis: start with such a pair, keep the intrinsics",
+    )
     parser.add_argument("--seed", type=int, default=0, help="the mapper's random seed")
     arguments = parser.parse_args()
     if not arguments.database.is_file():
@@ -30,8 +35,13 @@ def main() -> int:
         images_in_database = database.execute("SELECT COUNT(*) FROM images").fetchone()[0]
     pycolmap.set_random_seed(arguments.seed)
     arguments.output.mkdir(parents=True, exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    if arguments.forward_motion:
+        options.mapper.init_max_forward_motion = 1.0
+        options.ba_refine_focal_length = False
+        options.ba_refine_extra_params = False
     models = pycolmap.incremental_mapping(
-        arguments.database, arguments.image_path, arguments.output
+        arguments.database, arguments.image_path, arguments.output, options=options
     )
     if not models:
         print(

@@ -488,6 +488,7 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
         [sys.executable, "-c", textwrap.dedent(script), path, Path(__file__).parent],
         stdout=subprocess.PIPE,
         text=True,
+        cwd=path.parent,  # else the checkout would hide the installed package
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "half-way\n"
@@ -519,7 +520,9 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
             print(error)
     """
     output = subprocess.check_output(
-        [sys.executable, "-c", textwrap.dedent(script), path, Path(__file__).parent], text=True
+        [sys.executable, "-c", textwrap.dedent(script), path, Path(__file__).parent],
+        text=True,
+        cwd=tmp_path,  # else the checkout would hide the installed package
     )
     assert "disk" in output
     assert output.count("\n") == 1

@@ -4,6 +4,7 @@ import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -248,3 +249,21 @@ def test_hidden_frames(encode: Encode, tmp_path: Path) -> None:
     assert report.num_frames == report.num_images == 20
     assert report.num_coded_frames >= 20
     assert report.num_inliers > 1000
+
+
+def test_forward_motion_is_noticed(
+    encode: Encode, clip: Path, shared: Path, tmp_path: Path
+) -> None:
+    """A drive gets the mapper's options for it, a sideways move does not."""
+    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:12]
+    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
+    street = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
+    report = match(tmp_path / "a.db", drive, options=MatchOptions(camera=street))
+    assert report.forward_motion
+    assert "--Mapper.init_max_forward_motion 1" in report.next_commands[0]
+    assert "--forward_motion" in report.next_commands[1]
+
+    aside = CameraOptions("PINHOLE", "200,200,96,64")
+    report = match(tmp_path / "b.db", clip, options=MatchOptions(camera=aside))
+    assert not report.forward_motion
+    assert "forward_motion" not in " ".join(report.next_commands)

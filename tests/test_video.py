@@ -270,3 +270,13 @@ def test_names_are_never_taken_for_protocols(
     monkeypatch.chdir(tmp_path)
     shutil.copy(clip, "concat:clip.mp4")
     assert len(list(packets("concat:clip.mp4"))) == 16
+
+
+def test_ivf_without_a_frame_rate_is_read(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    whole = ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf")
+    data = bytearray(whole.read_bytes())
+    data[16:24] = bytes(8)
+    path = tmp_path / "zero.ivf"
+    path.write_bytes(data)
+    assert [p.data for p in packets(path)] == [p.data for p in packets(whole)]
+    assert path.read_bytes() == data
