@@ -44,7 +44,7 @@ class TrackOptions:
     # do not trust a block whose displacement d differs by more than this many pixels, and
     # |d|/8 times as many on top, from that of most units around it; None: no such test
     smoothness: float | None = 2.5
-    # do not trust motion that starts or ends within this many pixels of the picture's edge:
+    # do not trust motion that points within this many pixels of the referenced picture's edge:
     # the encoder had no picture to compare with beyond it; None: trust all
     border: float | None = 16.0
 

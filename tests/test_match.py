@@ -266,4 +266,5 @@ def test_forward_motion_is_noticed(
     aside = CameraOptions("PINHOLE", "200,200,96,64")
     report = match(tmp_path / "b.db", clip, options=MatchOptions(camera=aside))
     assert not report.forward_motion
-    assert "forward_motion" not in " ".join(report.next_commands)
+    assert "--Mapper" not in report.next_commands[0]
+    assert "--forward_motion" not in report.next_commands[1]
