@@ -6,6 +6,7 @@ import io
 import os
 import shlex
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -62,7 +63,8 @@ class VideoStream:
 
     def __init__(self, video: str | os.PathLike[str]) -> None:
         self.path = Path(video)
-        self._container = _open_container(self.path)
+        self._opened = ExitStack()
+        self._container = self._opened.enter_context(_open_container(self.path))
         try:
             self._stream = _find_av1_stream(self._container, self.path)
             context = self._stream.codec_context
@@ -71,12 +73,15 @@ class VideoStream:
             self.width: int = context.width
             self.height: int = context.height
             rate = self._stream.average_rate or self._stream.guessed_rate
-            self.frame_rate = float(rate) if rate else None
-            self.duration = _stream_duration(self._container, self._stream)
+            self._is_timed = not _is_ivf_without_rate(self.path)
+            self.frame_rate = float(rate) if rate and self._is_timed else None
+            self.duration = (
+                _stream_duration(self._container, self._stream) if self._is_timed else None
+            )
             self.num_frames = self._stream.frames or self._estimate_num_frames()
             self.configuration = _configuration_obus(context.extradata)
         except BaseException:
-            self._container.close()
+            self.close()
             raise
 
     def __enter__(self) -> VideoStream:
@@ -92,7 +97,7 @@ class VideoStream:
 
     def close(self) -> None:
         """Close the file."""
-        self._container.close()
+        self._opened.close()
 
     def packets(self) -> Iterator[Packet]:
         """Read the packets in bitstream order. Works once per opened stream.
@@ -118,7 +123,8 @@ class VideoStream:
                 continue
             if packet.is_corrupt:
                 raise BitstreamError(f"{self.path}: cut off inside packet {index + 1}")
-            pts = None if packet.pts is None else float(packet.pts * packet.time_base)
+            is_timed = self._is_timed and packet.pts is not None
+            pts = float(packet.pts * packet.time_base) if is_timed else None
             last = packet
             yield Packet(bytes(packet), pts, index)
             index += 1
@@ -230,8 +236,7 @@ def _decode(
     video: str | os.PathLike[str], operating_point: int, num_threads: int | None
 ) -> Iterator[Any]:
     path = Path(video)
-    container = _open_container(path)
-    try:
+    with _open_container(path) as container:
         stream = _find_av1_stream(container, path)
         context = stream.codec_context
         context.thread_type = "AUTO"
@@ -259,8 +264,6 @@ def _decode(
             raise BitstreamError(
                 f"{path}: cannot be decoded further: {_reason(damage)}"
             ) from damage
-    finally:
-        container.close()
 
 
 class _IvfWithRate(io.FileIO):
@@ -291,7 +294,9 @@ def _is_ivf_without_rate(path: Path) -> bool:
     return header.startswith(b"DKIF") and b"\0" * 4 in (rate[:4], rate[4:])
 
 
-def _open_container(path: Path) -> Any:
+@contextmanager
+def _open_container(path: Path) -> Iterator[Any]:
+    file: _IvfWithRate | None = None
     try:
         if not path.exists():
             raise VideoError(f"{path}: no such file")
@@ -299,17 +304,24 @@ def _open_container(path: Path) -> Any:
             raise VideoError(f"{path}: is a folder: give a video file")
         if path.is_file() and path.stat().st_size == 0:
             raise VideoError(f"{path}: is an empty file")
-        # An absolute path: FFmpeg would take 'name:...' for a protocol.
-        source: Any = os.path.abspath(path)
         if _is_ivf_without_rate(path):
-            source = _IvfWithRate(source)
-        return av.open(source, container_options=_CONTAINER_OPTIONS)
-    except PermissionError as error:
-        raise VideoError(f"{path}: no permission to read it") from error
-    except (av.error.FFmpegError, OSError, ValueError) as error:
+            file = _IvfWithRate(path)
+        # An absolute path: FFmpeg would take 'name:...' for a protocol.
+        container = av.open(file or os.path.abspath(path), container_options=_CONTAINER_OPTIONS)
+    except (PermissionError, av.error.FFmpegError, OSError, ValueError) as error:
+        if file is not None:
+            file.close()
+        if isinstance(error, PermissionError):
+            raise VideoError(f"{path}: no permission to read it") from error
         raise VideoError(
             f"{path}: not a video, or damaged before its first frame: {_reason(error)}"
         ) from error
+    try:
+        yield container
+    finally:
+        container.close()
+        if file is not None:
+            file.close()
 
 
 def _find_av1_stream(container: Any, path: Path) -> Any:

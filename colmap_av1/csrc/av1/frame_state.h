@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <new>
 #include <vector>
 
 #include "av1/cdf.h"
@@ -95,13 +96,24 @@ struct MotionFieldEntry {
   std::int8_t ref_offset = 0;
 };
 
+// Room for blocks that touches no memory before a block is written: most frames have far fewer
+// blocks than units, and a header alone must not cost what a frame of its size would.
+struct FreeBlocks {
+  void operator()(BlockInfo* blocks) const { ::operator delete(blocks); }
+};
+using BlockBuffer = std::unique_ptr<BlockInfo[], FreeBlocks>;
+
+inline BlockBuffer make_block_buffer(std::size_t size) {
+  return BlockBuffer(static_cast<BlockInfo*>(::operator new(size * sizeof(BlockInfo))));
+}
+
 // Everything the tiles of one frame share.
 struct FrameContext {
   const SequenceHeader* seq = nullptr;
   const FrameHeader* header = nullptr;
   CdfContext cdfs;                                 // at the start of each tile
   std::vector<BlockInfo*> grid;                    // [mi_rows][mi_cols], null: not decoded yet
-  std::unique_ptr<BlockInfo[]> blocks;             // as many as units
+  BlockBuffer blocks;                              // room for as many as units
   std::size_t blocks_capacity = 0;
   std::vector<MotionFieldEntry> motion_field;      // [mi_rows / 2][mi_cols / 2]
   const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0

@@ -31,7 +31,13 @@ std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t&
 }  // namespace
 
 void Parser::parse(const std::uint8_t* data, std::size_t size) {
-  parse_obus(data, size);
+  try {
+    parse_obus(data, size);
+  } catch (...) {
+    // A frame with damage is over: tile groups to come must not complete it.
+    seen_frame_header_ = false;
+    throw;
+  }
 }
 
 void Parser::finish() const {
@@ -215,7 +221,7 @@ void Parser::start_frame() {
   }
   context_.grid.assign(units, nullptr);
   if (context_.blocks_capacity < units) {
-    context_.blocks = std::make_unique_for_overwrite<BlockInfo[]>(units);
+    context_.blocks = make_block_buffer(units);
     context_.blocks_capacity = units;
   }
   if (header_.use_ref_frame_mvs) {
@@ -276,8 +282,9 @@ void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
   if (tile_num_ == num_tiles) finish_frame();
 }
 
-// Tiles do not depend on each other (5.11.2): each thread takes the next one. Of several errors
-// that of the first tile is reported, so that threads change nothing.
+// Tiles do not depend on each other (5.11.2): each thread takes the next one, none after an error.
+// Of several errors that of the first tile is reported, so that threads change nothing: tiles are
+// taken in order, so no tile before the first damaged one is left out.
 void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   // Starting a thread takes about as long as parsing some kilobytes.
   constexpr std::size_t kBytesPerThread = 8192;
@@ -291,8 +298,9 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   }
   std::vector<std::exception_ptr> errors(tiles.size());
   std::atomic<std::size_t> next{0};
+  std::atomic<bool> failed{false};
   const auto work = [&](TileParser& parser) {
-    for (std::size_t i; (i = next++) < tiles.size();) {
+    for (std::size_t i; !failed && (i = next++) < tiles.size();) {
       try {
         const TileData& tile = tiles[i];
         const auto number = static_cast<std::size_t>(tile.number);
@@ -307,6 +315,7 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
         }
       } catch (...) {
         errors[i] = std::current_exception();
+        failed = true;
       }
     }
   };

@@ -59,7 +59,8 @@ class Parser {
 
   // Parses a temporal unit, or a part of one, of the low-overhead format (section 5.2). An OBU
   // without a size field reaches to the end of the data. Completed frames are appended to
-  // events() also when a later one throws BitstreamError or LimitError.
+  // events() also when a later one throws BitstreamError or LimitError. That frame is dropped;
+  // frames that refer to the slots it would have filled find what was there before.
   void parse(const std::uint8_t* data, std::size_t size);
 
   // Throws BitstreamError when the stream ends inside a frame.

@@ -9,14 +9,9 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// Intermediate products of the least squares fit need more than 64 bits for damaged or
-// extreme input; the specification's arithmetic is exact.
-__extension__ typedef __int128 Int128;
-
-template <typename T>
-T round2_signed(T x, int n) {
+std::int64_t round2_signed(std::int64_t x, int n) {
   if (n == 0) return x;
-  const T half = T{1} << (n - 1);
+  const std::int64_t half = std::int64_t{1} << (n - 1);
   return x >= 0 ? (x + half) >> n : -((-x + half) >> n);
 }
 
@@ -45,17 +40,18 @@ bool warp_valid(const std::array<std::int32_t, 6>& p) {
   const auto clip16 = [](std::int64_t v) { return std::clamp<std::int64_t>(v, -32768, 32767); };
   const std::int64_t alpha0 = clip16(p[2] - kOne);
   const std::int64_t beta0 = clip16(p[3]);
+  const auto reduce = [](std::int64_t x) {
+    return std::abs(round2_signed(x, WARP_PARAM_REDUCE_BITS) * (1 << WARP_PARAM_REDUCE_BITS));
+  };
+  // Leaves |p[3]| below 2^14: the products below fit 64 bits, whatever p[4] is.
+  if (4 * reduce(alpha0) + 7 * reduce(beta0) >= kOne) return false;
   const Divisor divisor = resolve_divisor(p[2]);
   const std::int64_t v = static_cast<std::int64_t>(p[4]) * kOne;
   const std::int64_t gamma0 = clip16(round2_signed(v * divisor.factor, divisor.shift));
   const std::int64_t w = static_cast<std::int64_t>(p[3]) * p[4];
   const std::int64_t delta0 =
       clip16(p[5] - round2_signed(w * divisor.factor, divisor.shift) - kOne);
-  const auto reduce = [](std::int64_t x) {
-    return std::abs(round2_signed(x, WARP_PARAM_REDUCE_BITS) * (1 << WARP_PARAM_REDUCE_BITS));
-  };
-  return 4 * reduce(alpha0) + 7 * reduce(beta0) < kOne &&
-         4 * reduce(gamma0) + 4 * reduce(delta0) < kOne;
+  return 4 * reduce(gamma0) + 4 * reduce(delta0) < kOne;
 }
 
 LocalWarp estimate_local_warp(int mi_row, int mi_col, int mi_size, Mv mv,
@@ -83,6 +79,11 @@ LocalWarp estimate_local_warp(int mi_row, int mi_col, int mi_size, Mv mv,
     by0 += ls_product(sx, dy) + 4;
     by1 += ls_product(sy, dy) + 8;
   }
+  // 64 bits hold every product exactly, also for damaged streams: blocks are at most 128 samples
+  // wide and samples come from blocks that touch this one, so |sx|, |sy| <= 1024 in 1/8 sample,
+  // |dx|, |dy| < 1024 + LS_MV_MAX, and each of the 8 terms of a sum is below 2^18.4. Sums stay
+  // below 2^21.4, determinants and the divided values below 2^43.8; the factor is at most 2^14,
+  // or 2^16 where shift is negative.
   const std::int64_t det = a00 * a11 - a01 * a01;
   if (det == 0) return warp;
   Divisor divisor = resolve_divisor(det);
@@ -91,24 +92,22 @@ LocalWarp estimate_local_warp(int mi_row, int mi_col, int mi_size, Mv mv,
     divisor.factor *= std::int64_t{1} << -divisor.shift;
     divisor.shift = 0;
   }
+  constexpr std::int64_t kOne = 1 << WARPEDMODEL_PREC_BITS;
+  constexpr std::int64_t kLimit = WARPEDMODEL_NONDIAGAFFINE_CLAMP - 1;
   const auto divide = [&](std::int64_t v) {
-    return round2_signed(static_cast<Int128>(v) * divisor.factor, divisor.shift);
+    return round2_signed(v * divisor.factor, divisor.shift);
   };
   const auto nondiag = [&](std::int64_t v) {
-    constexpr Int128 kLimit = WARPEDMODEL_NONDIAGAFFINE_CLAMP - 1;
-    return static_cast<std::int32_t>(std::clamp<Int128>(divide(v), -kLimit, kLimit));
+    return static_cast<std::int32_t>(std::clamp(divide(v), -kLimit, kLimit));
   };
   const auto diag = [&](std::int64_t v) {
-    constexpr Int128 kOne = 1 << WARPEDMODEL_PREC_BITS;
-    constexpr Int128 kLimit = WARPEDMODEL_NONDIAGAFFINE_CLAMP - 1;
-    return static_cast<std::int32_t>(std::clamp<Int128>(divide(v), kOne - kLimit, kOne + kLimit));
+    return static_cast<std::int32_t>(std::clamp(divide(v), kOne - kLimit, kOne + kLimit));
   };
   auto& p = warp.params;
   p[2] = diag(a11 * bx0 - a01 * bx1);
   p[3] = nondiag(-a01 * bx0 + a00 * bx1);
   p[4] = nondiag(a11 * by0 - a01 * by1);
   p[5] = diag(-a01 * by0 + a00 * by1);
-  constexpr std::int64_t kOne = 1 << WARPEDMODEL_PREC_BITS;
   const std::int64_t vx = std::int64_t{mv.col} * (1 << (WARPEDMODEL_PREC_BITS - 3)) -
                           (mid_x * (p[2] - kOne) + std::int64_t{mid_y} * p[3]);
   const std::int64_t vy = std::int64_t{mv.row} * (1 << (WARPEDMODEL_PREC_BITS - 3)) -

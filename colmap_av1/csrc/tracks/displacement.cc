@@ -12,6 +12,7 @@
 namespace colmap_av1::tracks {
 namespace {
 
+constexpr int kMaxSide = 65536;  // a frame header has 16 bits for a size less one
 constexpr double kWarpOne = 1 << av1::WARPEDMODEL_PREC_BITS;
 
 bool is_valid_warp(const int32_t* params) {
@@ -25,6 +26,9 @@ bool is_valid_warp(const int32_t* params) {
 }  // namespace
 
 void check_motion_field(const MotionField& field) {
+  if (field.width < 1 || field.width > kMaxSide || field.height < 1 || field.height > kMaxSide) {
+    throw std::invalid_argument("a frame's width and height are 1 to 65536 pixels");
+  }
   const int n = field.num_units();
   for (int u = 0; u < n; ++u) {
     if (field.mi_size[u] >= kNumBlockSizes) {

@@ -25,6 +25,11 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options) : options_(option
 
 void TrackBuilder::add(const CodedFrame& coded) {
   check_motion_field(coded.field);
+  const auto is_index = [](int index) { return index < std::numeric_limits<int>::max(); };
+  if (coded.width < 1 || !is_index(coded.display_index) ||
+      !std::all_of(coded.ref_display_index, coded.ref_display_index + kNumRefs, is_index)) {
+    throw std::invalid_argument("a width or a display_index is out of range");
+  }
   if (find_frame(coded.decode_index) != nullptr) {
     throw std::invalid_argument("a decode_index occurs twice");
   }

@@ -1,0 +1,49 @@
+// The fuzzers' input: bytes that say how to run, then temporal units.
+
+#ifndef COLMAP_AV1_FUZZ_INPUT_H_
+#define COLMAP_AV1_FUZZ_INPUT_H_
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <span>
+
+namespace colmap_av1::fuzz {
+
+class Input {
+ public:
+  Input(const std::uint8_t* data, std::size_t size) : rest_(data, size) {}
+
+  bool empty() const { return rest_.empty(); }
+
+  // Past the end come zeros: every input is a valid one.
+  std::uint8_t byte() {
+    if (rest_.empty()) return 0;
+    const std::uint8_t value = rest_.front();
+    rest_ = rest_.subspan(1);
+    return value;
+  }
+
+  template <typename T>
+  T number() {
+    std::uint64_t value = 0;
+    for (std::size_t i = 0; i < sizeof(T); ++i) value |= std::uint64_t{byte()} << (8 * i);
+    return static_cast<T>(value);
+  }
+
+  // A temporal unit: its size in four bytes, little-endian, and its data. A size beyond the end
+  // means what is left, so that a cut or grown input still says something.
+  std::span<const std::uint8_t> unit() {
+    const std::size_t size = std::min<std::size_t>(number<std::uint32_t>(), rest_.size());
+    const auto unit = rest_.first(size);
+    rest_ = rest_.subspan(size);
+    return unit;
+  }
+
+ private:
+  std::span<const std::uint8_t> rest_;
+};
+
+}  // namespace colmap_av1::fuzz
+
+#endif  // COLMAP_AV1_FUZZ_INPUT_H_

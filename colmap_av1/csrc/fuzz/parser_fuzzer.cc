@@ -1,0 +1,105 @@
+// Any bytes as an AV1 stream. Besides what the sanitizers see, the events must keep the promises
+// that their users index arrays by.
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <memory>
+#include <vector>
+
+#include "av1/error.h"
+#include "av1/parser.h"
+#include "fuzz/input.h"
+
+namespace {
+
+using colmap_av1::av1::BitstreamError;
+using colmap_av1::av1::Event;
+using colmap_av1::av1::LimitError;
+using colmap_av1::av1::Parser;
+using colmap_av1::av1::ParserOptions;
+
+// A few bytes ask for a whole frame; these bound the time of one input.
+constexpr std::int64_t kMaxFrameSize = 512 * 512;
+constexpr std::size_t kMaxEvents = 32;
+
+void check(bool promise, const char* what) {
+  if (promise) return;
+  std::fprintf(stderr, "broken promise: %s\n", what);
+  std::abort();
+}
+
+void check_event(const Event& event, const ParserOptions& options) {
+  const auto& header = event.header;
+  for (const int decoded : event.slot_decode_index) {
+    check(decoded >= -1 && decoded <= event.decode_index, "slots hold decoded frames");
+  }
+  if (header.show_existing_frame) {
+    check(event.shown_decode_index >= 0 && event.shown_decode_index < event.decode_index,
+          "a shown frame was decoded before");
+    return;
+  }
+  for (const int decoded : event.ref_decode_index) {
+    check(decoded >= -1 && decoded < event.decode_index, "references were decoded before");
+  }
+  check(std::int64_t{header.upscaled_width} * header.frame_height <= kMaxFrameSize,
+        "frames are within the limit");
+  const auto& units = event.units;
+  const std::size_t n = options.headers_only ? 0
+                                             : static_cast<std::size_t>(header.mi_rows) *
+                                                   static_cast<std::size_t>(header.mi_cols);
+  check(units.mv.size() == 2 * n && units.ref_frame.size() == 2 * n, "two lists for each unit");
+  for (const auto* field : {&units.mi_size, &units.y_mode, &units.is_inter, &units.skip,
+                            &units.skip_mode, &units.segment_id, &units.motion_mode,
+                            &units.compound_type, &units.interintra, &units.use_intrabc}) {
+    check(field->size() == n, "every field has every unit");
+  }
+  check(units.warp_index.size() == n, "every unit has a warp index");
+  const auto num_warps = static_cast<std::int64_t>(event.local_warps.size());
+  for (std::size_t i = 0; i < n; ++i) {
+    check(units.mi_size[i] < colmap_av1::av1::BLOCK_SIZES, "mi_size is a block size");
+    check(units.y_mode[i] <= colmap_av1::av1::NEW_NEWMV, "y_mode is a mode");
+    check(units.segment_id[i] < colmap_av1::av1::MAX_SEGMENTS, "segment_id is a segment");
+    for (std::size_t list = 2 * i; list < 2 * i + 2; ++list) {
+      const int ref = units.ref_frame[list];
+      check(ref >= -1 && ref <= colmap_av1::av1::ALTREF_FRAME, "ref_frame is a reference");
+      check(ref <= 0 || event.ref_decode_index[static_cast<std::size_t>(ref)] >= 0,
+            "blocks refer to frames that are there");
+    }
+    check(units.warp_index[i] >= -1 && units.warp_index[i] < num_warps, "warps are there");
+  }
+}
+
+}  // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  colmap_av1::fuzz::Input input(data, size);
+  const unsigned choice = input.byte();
+  ParserOptions options;
+  options.headers_only = (choice & 1) != 0;
+  options.keep_blocks = (choice & 2) != 0;
+  options.operating_point = static_cast<int>(choice >> 2 & 31);
+  options.num_threads = (choice & 128) != 0 ? 2 : 1;
+  options.max_frame_size = kMaxFrameSize;
+  Parser parser(options);
+  std::size_t num_events = 0;
+  while (!input.empty() && num_events < kMaxEvents) {
+    const auto unit = input.unit();
+    // The parser sees a copy: a read past the unit is a read past an allocation.
+    const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
+    try {
+      parser.parse(copy.data(), copy.size());
+    } catch (const BitstreamError&) {  // a caller may go on after an error
+    } catch (const LimitError&) {
+    }
+    num_events += parser.events().size();
+    for (const auto& event : parser.events()) check_event(*event, options);
+    parser.events().clear();
+  }
+  try {
+    parser.finish();
+  } catch (const BitstreamError&) {
+  }
+  return 0;
+}
