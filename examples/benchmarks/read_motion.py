@@ -1,0 +1,295 @@
+"""Time reading an AV1 file's motion against decoding the same file with dav1d.
+
+python examples/benchmarks/read_motion.py --cache benchmark_clips
+
+Both start from the file's name and end at its last frame: demuxing is part of either time, and
+no frame is converted. Runs take turns in one process; the table shows medians. The example clip
+is always there, the other clips are made of the sequences in ../shared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import av
+from rich.console import Console
+from rich.progress import Progress
+
+from colmap_av1 import ColmapAv1Error, ReadOptions, _core, read_motion
+from colmap_av1.video import open_stream
+
+EXAMPLES = Path(__file__).resolve().parents[1]
+SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
+
+LIBAOM = "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -b:v 0"
+SVT_AV1 = "-c:v libsvtav1 -preset 8"
+# 640x480 upscaled: what a real camera of this size resolves is not in it.
+TO_1080P = "-frames:v 120 -vf scale=1920:1440:flags=lanczos,crop=1920:1080"
+
+SOURCES = {
+    "street": ("street", ""),
+    "log_building": ("log_building", ""),
+    "1080p": ("kitchen", TO_1080P),
+}
+ENCODERS = {"aom": LIBAOM, "svt": SVT_AV1}
+RATES = (20, 40)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip of the benchmark; `sequence` is None for the one that need not be made."""
+
+    name: str
+    sequence: str | None = None
+    encoding: str = ""
+
+
+CLIPS = [
+    Clip("scene"),
+    *(
+        Clip(f"{source}-{encoder}{rate}", sequence, f"{filters} {words} -crf {rate} -g 9999")
+        for source, (sequence, filters) in SOURCES.items()
+        for encoder, words in ENCODERS.items()
+        for rate in RATES
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians in seconds over the whole clip; `reader` and `dav1d` by number of threads."""
+
+    clip: str
+    frames: int
+    megabits: float
+    reader: dict[int, float]
+    dav1d: dict[int, float]
+    demux: float
+    parse: float
+
+
+def main() -> int:
+    """Make the clips that are absent, time each, print a table."""
+    parser = argparse.ArgumentParser(
+        description="Time reading motion against decoding with dav1d.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument(
+        "--cache", type=Path, help="folder that keeps the clips; without, a temporary one"
+    )
+    parser.add_argument("--repeats", type=int, default=5, help="runs of each, in turns")
+    parser.add_argument(
+        "--clips",
+        nargs="+",
+        default=[""],
+        metavar="NAME",
+        help=f"only clips whose names hold one of these; names: {', '.join(c.name for c in CLIPS)}",
+    )
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads to time"
+    )
+    arguments = parser.parse_args()
+    if arguments.repeats < 1 or min(arguments.threads) < 1:
+        parser.error("--repeats and --threads start at 1")
+    clips = [clip for clip in CLIPS if any(word in clip.name for word in arguments.clips)]
+    if not clips:
+        parser.error(f"no clip is named like {' '.join(arguments.clips)}: see --help")
+
+    threads = sorted(set(arguments.threads))
+    timings = []
+    skipped = []
+    with contextlib.ExitStack() as stack:
+        folder = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        progress = stack.enter_context(
+            Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
+        )
+        task = progress.add_task("", total=len(clips))
+        for clip in clips:
+            try:
+                progress.update(task, description=f"making {clip.name}")
+                path = make_clip(clip, folder)
+                progress.update(task, description=f"timing {clip.name}")
+                timings.append(time_clip(clip.name, path, threads, arguments.repeats))
+            except FileNotFoundError as error:
+                skipped.append(f"{clip.name}: skipped, {error}")
+            except (ColmapAv1Error, RuntimeError) as error:
+                print(f"error: {clip.name}: {error}", file=sys.stderr)
+                return 1
+            progress.advance(task)
+    print_table(timings, threads)
+    print()
+    print(machine(arguments.repeats))
+    for line in skipped:
+        print(line)
+    return 0
+
+
+def make_clip(clip: Clip, folder: Path) -> Path:
+    """The clip's file, encoded unless `folder` holds it.
+
+    Raises:
+        FileNotFoundError: the sequence is not there.
+        RuntimeError: it cannot be encoded.
+    """
+    if clip.sequence is None:
+        return EXAMPLES / "scene.mp4"
+    path = folder / f"{clip.name}.mp4"
+    if path.exists():
+        return path
+    source = source_words(SEQUENCES / clip.sequence)
+    try:
+        import imageio_ffmpeg  # noqa: PLC0415  only those who make clips need it
+    except ImportError as error:
+        raise RuntimeError(f"{error}: pip install '.[dev]'") from error
+    unfinished = path.with_suffix(".part.mp4")
+    command = [
+        *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y", *source),
+        *(*clip.encoding.split(), "-pix_fmt", "yuv420p", "-an", str(unfinished)),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        unfinished.unlink(missing_ok=True)
+        raise RuntimeError(f"ffmpeg failed: {done.stderr.strip() or done.returncode}")
+    unfinished.replace(path)
+    return path
+
+
+def source_words(sequence: Path) -> list[str]:
+    """How ffmpeg opens a sequence: a clip, or images with consecutive numbers as names."""
+    if (sequence / "clip.mp4").is_file():
+        return ["-i", str(sequence / "clip.mp4")]
+    images = sorted((sequence / "frames").glob("*")) if sequence.is_dir() else []
+    if not images:
+        raise FileNotFoundError(f"no sequence at {sequence}")
+    first = images[0]
+    pattern = str(first.with_name(f"%0{len(first.stem)}d{first.suffix}"))
+    return ["-framerate", "25", "-start_number", str(int(first.stem)), "-i", pattern]
+
+
+def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing:
+    """Run everything in turns, once untimed and then `repeats` times."""
+    with open_stream(path) as stream:
+        configuration = stream.configuration
+        packets = [packet.data for packet in stream.packets()]
+    units = [configuration, *packets] if configuration else packets
+    runs: dict[tuple[str, int], Callable[[], int]] = {
+        ("demux", 1): partial(demux, path),
+        ("parse", 1): partial(parse, units),
+    }
+    for n in threads:
+        runs["reader", n] = partial(read, path, n)
+        runs["dav1d", n] = partial(decode, path, n)
+
+    frames = {key: run() for key, run in runs.items()}
+    shown = frames["dav1d", threads[0]]
+    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
+    for turn in range(repeats):
+        # Backwards every other time: what one run leaves in the caches serves each in turn.
+        for key in list(runs)[:: -1 if turn % 2 else 1]:
+            start = time.perf_counter()
+            runs[key]()
+            seconds[key].append(time.perf_counter() - start)
+    median = {key: statistics.median(values) for key, values in seconds.items()}
+    return Timing(
+        clip=name,
+        frames=shown,
+        megabits=sum(map(len, packets)) * 8 / 1e6,
+        reader={n: median["reader", n] for n in threads},
+        dav1d={n: median["dav1d", n] for n in threads},
+        demux=median["demux", 1],
+        parse=median["parse", 1],
+    )
+
+
+def read(path: Path, threads: int) -> int:
+    """Read the motion of a file; the number of coded frames."""
+    return count(read_motion(path, ReadOptions(num_threads=threads)))
+
+
+def demux(path: Path) -> int:
+    """Read the packets of a file; their number."""
+    with open_stream(path) as stream:
+        return count(stream.packets())
+
+
+def parse(units: list[bytes]) -> int:
+    """Parse temporal units without making arrays of what they hold; the number of frames."""
+    parser = _core.Parser(num_threads=1)
+    frames = 0
+    for unit in units:
+        parser.parse(unit)
+        frames += len(parser.take_events())
+    parser.finish()
+    return frames
+
+
+def decode(path: Path, threads: int) -> int:
+    """Decode a file with dav1d; the number of pictures."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        decoder = av.CodecContext.create("libdav1d", "r")
+        decoder.extradata = stream.codec_context.extradata
+        decoder.thread_count = threads
+        pictures = 0
+        for packet in container.demux(stream):
+            pictures += len(decoder.decode(packet if packet.size else None))
+        return pictures
+
+
+def count(items: Iterator[object]) -> int:
+    """Use up an iterator without keeping what it gives."""
+    return sum(1 for _ in items)
+
+
+def print_table(timings: list[Timing], threads: list[int]) -> None:
+    """Print milliseconds a shown frame, and how many times faster the reader is."""
+    first = [c for n in threads for c in (f"reader, {n}T", f"dav1d, {n}T", "ratio")]
+    header = ["clip", "frames", "Mbit", *first, "demux", "parse"]
+    print("| " + " | ".join(header) + " |")
+    print("|---|" + "---:|" * (len(header) - 1))
+    for timing in timings:
+        row = [timing.clip, str(timing.frames), f"{timing.megabits:.1f}"]
+        per_frame = 1e3 / timing.frames
+        for n in threads:
+            row += [
+                f"{timing.reader[n] * per_frame:.3f}",
+                f"{timing.dav1d[n] * per_frame:.3f}",
+                f"{timing.dav1d[n] / timing.reader[n]:.2f}",
+            ]
+        row += [f"{timing.demux * per_frame:.3f}", f"{timing.parse * per_frame:.3f}"]
+        print("| " + " | ".join(row) + " |")
+
+
+def machine(repeats: int) -> str:
+    """What the figures mean, and where they were taken."""
+    cpu = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                cpu = line.partition(":")[2].strip()
+                break
+    load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return (
+        f"Milliseconds per shown frame, medians of {repeats} runs in turns; T: threads. Of the "
+        "reader's time at one thread, demux is reading the packets once (the reader does it "
+        "twice), parse the parser alone.\n"
+        f"{os.cpu_count()} cores, {cpu}{load}; Python {platform.python_version()}, "
+        f"PyAV {av.__version__} with FFmpeg {av.ffmpeg_version_info} and its libdav1d."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
