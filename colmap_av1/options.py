@@ -40,13 +40,13 @@ class TrackOptions:
     # largest block whose motion is trusted, in px^2; None: any
     max_block_area: int | None = 1024
     # the same for blocks without coded residual, which the encoder never corrected
-    max_uncoded_block_area: int | None = 256
+    max_uncoded_block_area: int | None = 1024
     # do not trust a block whose displacement d differs by more than this many pixels, and
     # |d|/8 times as many on top, from that of most units around it; None: no such test
-    smoothness: float | None = 2.5
-    # do not trust motion that points within this many pixels of the referenced picture's edge:
+    smoothness: float | None = 4.0
+    # do not trust motion that starts or ends within this many pixels of the picture's edge:
     # the encoder had no picture to compare with beyond it; None: trust all
-    border: float | None = 16.0
+    border: float | None = 14.0
 
 
 @dataclass(frozen=True)
