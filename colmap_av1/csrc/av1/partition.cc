@@ -57,6 +57,7 @@ void TileParser::decode_tile() {
       clear_cdef();
       read_lr(r, c, sb_size);
       decode_partition(r, c, sb_size);
+      if (symbols_.is_past_end()) throw BitstreamError("tile ends before its last superblock");
     }
   }
 }

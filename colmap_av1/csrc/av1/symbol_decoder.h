@@ -95,6 +95,11 @@ class SymbolDecoder {
     return (v << 1) - m + bit();
   }
 
+  // Whether more bits were taken than a valid tile takes from behind its end (8.2.4).
+  bool is_past_end() const {
+    return 8 * (end_ - data_) + available_ - padding_bits_ < -14;
+  }
+
   // 8.2.4 Exit process for symbol decoder: whether the bits after the last symbol are the
   // trailing bits that the specification demands.
   bool trailing_bits_valid() const {
