@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import shlex
@@ -272,11 +273,28 @@ def test_names_are_never_taken_for_protocols(
     assert len(list(packets("concat:clip.mp4"))) == 16
 
 
-def test_ivf_without_a_frame_rate_is_read(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+@pytest.mark.parametrize("field", [slice(16, 20), slice(20, 24), slice(16, 24)])
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+def test_ivf_without_a_frame_rate_is_read(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, field: slice
+) -> None:
     whole = ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf")
     data = bytearray(whole.read_bytes())
-    data[16:24] = bytes(8)
+    data[field] = bytes(field.stop - field.start)
     path = tmp_path / "zero.ivf"
     path.write_bytes(data)
-    assert [p.data for p in packets(path)] == [p.data for p in packets(whole)]
+    with open_stream(path) as stream:
+        assert (stream.frame_rate, stream.duration) == (None, None)
+        read = list(stream.packets())
+    assert [p.data for p in read] == [p.data for p in packets(whole)]
+    assert {p.pts for p in read} == {None}
+    assert len(list(decode_frames(path))) == 16
     assert path.read_bytes() == data
+
+    path.write_bytes(data[:-50])
+    with pytest.raises(BitstreamError, match="cut off"):
+        list(packets(path))
+    path.write_bytes(data[:40])
+    with pytest.raises((BitstreamError, VideoError)):
+        list(packets(path))
+    gc.collect()  # a file left open would warn now
