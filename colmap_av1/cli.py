@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBars
 from rich.table import Table
 
 from colmap_av1.errors import ColmapAv1Error
@@ -32,6 +33,7 @@ from colmap_av1.options import (
     TrackOptions,
     VerifyOptions,
 )
+from colmap_av1.progress import Progress, no_progress
 
 _PROGRAM = "colmap-av1"
 _INTERRUPTED = 130
@@ -40,7 +42,6 @@ _BAD_INPUT = 2
 _LEAST_LISTED_SHARE = 0.005
 
 _Options = TypeVar("_Options")
-_Report = Callable[[str, int, "int | None"], None]
 _Rows = list[tuple[str, str]]
 
 # Prefix of the namespace entries that are fields of options.
@@ -400,10 +401,10 @@ def _warnings_as_lines() -> Iterator[None]:
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[_Report]:
+def _progress(quiet: bool) -> Iterator[Progress]:
     """Progress bars on standard error where it is a terminal, one for each stage."""
     if quiet or not sys.stderr.isatty():
-        yield lambda stage, done, total: None
+        yield no_progress
         return
     columns = (
         TextColumn("{task.description:12}"),
@@ -412,7 +413,7 @@ def _progress(quiet: bool) -> Iterator[_Report]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with ProgressBars(*columns, console=Console(stderr=True)) as progress:
         tasks: dict[str, Any] = {}
 
         def report(stage: str, done: int, total: int | None) -> None:

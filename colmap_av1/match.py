@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import shlex
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,13 +31,11 @@ from colmap_av1.images import (
 )
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import MatchOptions
-from colmap_av1.pairs import image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import Tracks, build_tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 from colmap_av1.video import display_rotation, open_stream
-
-# Called with a stage's name, what is done of it and, where known, of how much.
-Progress = Callable[[str, int, "int | None"], None]
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 # The mapper's default limit for the translation along the axis of a first pair.
@@ -119,6 +115,72 @@ class MatchReport:
         return f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}", shlex.join(script)
 
 
+@dataclass(frozen=True)
+class VideoSource:
+    """Where the motion and the pictures of a video come from.
+
+    Attributes:
+        stream: the AV1 file whose motion is read.
+        pictures: the file whose pictures become images.
+        width: picture width in pixels as the stream's container says, unrotated.
+        height: picture height likewise.
+        num_packets: number of packets of the stream; None where unknown.
+    """
+
+    stream: Path
+    pictures: Path
+    width: int
+    height: int
+    num_packets: int | None
+
+
+@dataclass(frozen=True)
+class TrackedVideo:
+    """The tracks of a video, and what was noticed while they were made.
+
+    Attributes:
+        tracks: tracks through all shown frames.
+        num_coded_frames: frames with block data, hidden ones included.
+        warnings: what the user should know, such as damage of the stream.
+    """
+
+    tracks: Tracks
+    num_coded_frames: int
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ChosenImages:
+    """The frames that are images.
+
+    Attributes:
+        names: name of each image, its path relative to the image folder.
+        frames: int32 [n] display index of each image, strictly ascending.
+    """
+
+    names: list[str]
+    frames: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class MatchedImages:
+    """Keypoints of the images, and the verified matches between them.
+
+    Attributes:
+        keypoints: keypoints of each image.
+        pairs: int32 [m, 2] indices of images.
+        matches: for each pair, uint32 [n, 2] indices of matching keypoints.
+        geometries: two-view geometry of each pair.
+        forward_motion: the camera moves along its axis, see `MatchReport`.
+    """
+
+    keypoints: list[ImageKeypoints]
+    pairs: NDArray[np.int32]
+    matches: list[NDArray[np.uint32]]
+    geometries: list[TwoViewGeometry]
+    forward_motion: bool
+
+
 def match(
     database: str | os.PathLike[str],
     video: str | os.PathLike[str],
@@ -150,37 +212,180 @@ def match(
         OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else MatchOptions()
+    progress = progress if progress is not None else no_progress
     database, video = Path(database), Path(video)
     folder = Path(image_path) if image_path is not None else None
-    report = progress if progress is not None else _no_progress
-    clock = _Clock()
+    clock = Clock()
 
     # What can be refused is refused before the long work.
-    with open_stream(video) as stream:
-        stream_size = (stream.width, stream.height)
-        num_packets = stream.num_frames
+    source = open_source(video)
+    stream_size = (source.width, source.height)
     listed = _read_listed_images(database)
-    _check_options(options, stream_size)
+    check_options(options, stream_size)
     if listed:
-        _check_listed_sizes(listed, stream_size, video, options)
+        _check_listed_sizes(listed, stream_size, source, options)
     if folder is not None:
         names_or_pattern = [i.name for i in listed] if listed else options.image_name
         check_image_folder(folder, names_or_pattern, stream_size)
 
-    motion = read_motion(video, options.read)
-    if folder is not None:
-        motion = _of_one_size(motion)
-    tracks, num_coded_frames, notes = _chain(motion, options, clock, report, num_packets)
-    names, frames = _choose_images(listed, tracks, options)
+    tracked = track_video(
+        source, options, one_size=folder is not None, clock=clock, progress=progress
+    )
+    tracks = tracked.tracks
+    chosen = choose_images(listed, tracks, options)
     size = (tracks.width, tracks.height)
     if size != stream_size:
         if listed:
-            _check_listed_sizes(listed, size, video, options)
+            _check_listed_sizes(listed, size, source, options)
         if folder is not None:
-            check_image_folder(folder, names, size)
+            check_image_folder(folder, chosen.names, size)
 
+    cameras, new_cameras = _cameras(database, listed, chosen.names, size, options)
+    matched = match_images(video, tracks, chosen, cameras, options, clock=clock, progress=progress)
+
+    num_written = 0
+    if folder is not None:
+        with clock.measure("images"):
+            num_written = write_images(
+                source.pictures,
+                folder,
+                chosen.names,
+                chosen.frames.tolist(),
+                num_threads=options.verify.num_threads,
+                operating_point=options.read.operating_point,
+                progress=lambda done: progress("images", done, len(chosen.names)),
+            )
+
+    with clock.measure("database"):
+        write_matches(
+            database,
+            chosen.names,
+            new_cameras,
+            matched.keypoints,
+            pairs=matched.pairs,
+            matches=matched.matches,
+            geometries=matched.geometries,
+        )
+    lengths = np.diff(tracks.offsets)
+    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
+    kinds = [geometry.config.name for geometry in matched.geometries]
+    num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
+    return MatchReport(
+        database=database,
+        video=video,
+        image_path=folder,
+        num_frames=tracks.num_frames,
+        num_coded_frames=tracked.num_coded_frames,
+        num_images=len(matched.keypoints),
+        num_written_images=num_written,
+        num_tracks=len(lengths),
+        track_lengths={q: int(v) for q, v in zip(_LENGTH_QUANTILES, quantiles, strict=True)},
+        num_observations=sum(len(k.xy) for k in matched.keypoints),
+        num_pairs=len(matched.geometries),
+        num_verified_pairs=sum(count > 0 for count in num_inliers),
+        num_matches=sum(len(m) for m in matched.matches),
+        num_inliers=sum(num_inliers),
+        configs={kind: kinds.count(kind) for kind in sorted(set(kinds))},
+        forward_motion=matched.forward_motion,
+        seconds=clock.seconds,
+        warnings=tracked.warnings,
+    )
+
+
+def open_source(video: Path) -> VideoSource:
+    """Find out where the motion and the pictures of a video come from.
+
+    Raises:
+        VideoError: the file is missing or no video that can be read.
+    """
+    with open_stream(video) as stream:
+        return VideoSource(video, video, stream.width, stream.height, stream.num_frames)
+
+
+def track_video(
+    source: VideoSource,
+    options: MatchOptions,
+    *,
+    one_size: bool,
+    clock: Clock,
+    progress: Progress,
+) -> TrackedVideo:
+    """Chain the motion of a video into tracks, as it is read: no frame's motion is kept.
+
+    Args:
+        source: the video.
+        options: those of reading and chaining are used.
+        one_size: refuse shown frames of several sizes.
+        clock: gets the stages "motion" and "tracks".
+        progress: told about the stage "motion".
+
+    Raises:
+        VideoError: the video shows no frame.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: the frames change their size and must not.
+    """
+    motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
+    if one_size:
+        motion = _of_one_size(motion)
+    num_coded_frames = 0
+
+    def count(done: int) -> None:
+        nonlocal num_coded_frames
+        num_coded_frames = done
+        progress("motion", done, source.num_packets)
+
+    with warnings.catch_warnings(record=True) as caught, clock.measure("tracks"):
+        warnings.simplefilter("always")
+        tracks = build_tracks(clock.iterate("motion", motion), options.tracks, count)
+    # Reading happened inside the chaining.
+    clock.seconds["tracks"] -= clock.seconds["motion"]
+    return TrackedVideo(tracks, num_coded_frames, tuple(str(w.message) for w in caught))
+
+
+def choose_images(
+    listed: Sequence[DatabaseImage], tracks: Tracks, options: MatchOptions
+) -> ChosenImages:
+    """Choose the frames that are images: those a database lists, else as options say.
+
+    Raises:
+        ImageError: count or names of the listed images do not say which frames they are.
+        OptionError: the pattern of the names has no number, or no extension of an image.
+    """
+    if not listed:
+        frames = np.arange(0, tracks.num_frames, options.image_step, dtype=np.int32)
+        return ChosenImages(image_names(options.image_name, frames.tolist()), frames)
+    names = [image.name for image in listed]
+    frames = frames_of_images(names, tracks.num_frames, options.first_number)
+    order = np.argsort(frames)
+    return ChosenImages([names[i] for i in order], frames[order])
+
+
+def match_images(
+    video: Path,
+    tracks: Tracks,
+    chosen: ChosenImages,
+    cameras: Any,
+    options: MatchOptions,
+    *,
+    clock: Clock,
+    progress: Progress,
+) -> MatchedImages:
+    """Match the images along the tracks, and verify the pairs.
+
+    Args:
+        video: the file that messages name.
+        tracks: tracks of the whole video.
+        chosen: the images.
+        cameras: the camera of all images, or one for each.
+        options: those of pairs and verification are used.
+        clock: gets the stages "pairs" and "verification".
+        progress: told about the stage "verification".
+
+    Raises:
+        VideoError: no two images share enough tracks.
+    """
     with clock.measure("pairs"):
-        keypoints = image_keypoints(tracks, frames.tolist())
+        keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options.pairs)
         if len(pairs) == 0:
             raise VideoError(
@@ -188,65 +393,34 @@ def match(
                 "nothing to match: 'colmap-av1 info --video' says what the stream lacks"
             )
         matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
-
     with clock.measure("verification"):
-        camera_of_image, new_cameras = _cameras(database, listed, names, size, options)
         geometries = verify_pairs(
             keypoints,
             pairs,
             matches,
-            camera_of_image,
+            cameras,
             options=options.verify,
-            progress=lambda done: report("verification", done, len(pairs)),
+            progress=lambda done: progress("verification", done, len(pairs)),
         )
+    return MatchedImages(keypoints, pairs, matches, geometries, _is_forward_motion(geometries))
 
-    num_written = 0
-    if folder is not None:
-        with clock.measure("images"):
-            num_written = write_images(
-                video,
-                folder,
-                names,
-                frames.tolist(),
-                num_threads=options.verify.num_threads,
-                operating_point=options.read.operating_point,
-                progress=lambda done: report("images", done, len(names)),
-            )
 
-    with clock.measure("database"):
-        write_matches(
-            database,
-            names,
-            new_cameras,
-            keypoints,
-            pairs=pairs,
-            matches=matches,
-            geometries=geometries,
-        )
-    lengths = np.diff(tracks.offsets)
-    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
-    kinds = [geometry.config.name for geometry in geometries]
-    num_inliers = [len(geometry.inlier_matches) for geometry in geometries]
-    return MatchReport(
-        database=database,
-        video=video,
-        image_path=folder,
-        num_frames=tracks.num_frames,
-        num_coded_frames=num_coded_frames,
-        num_images=len(keypoints),
-        num_written_images=num_written,
-        num_tracks=len(lengths),
-        track_lengths={q: int(v) for q, v in zip(_LENGTH_QUANTILES, quantiles, strict=True)},
-        num_observations=sum(len(k.xy) for k in keypoints),
-        num_pairs=len(geometries),
-        num_verified_pairs=sum(count > 0 for count in num_inliers),
-        num_matches=sum(len(m) for m in matches),
-        num_inliers=sum(num_inliers),
-        configs={kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        forward_motion=_is_forward_motion(geometries),
-        seconds=clock.seconds,
-        warnings=notes,
-    )
+def check_options(options: MatchOptions, size: tuple[int, int]) -> None:
+    """Refuse option values now that a stage would refuse after the long work.
+
+    Args:
+        options: options of every stage.
+        size: (width, height) of the images.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+    """
+    if options.image_step < 1:
+        raise OptionError(f"image_step is {options.image_step}: give 1 or more")
+    image_names(options.image_name, ())
+    camera = make_camera(options.camera, *size)
+    schedule_pairs((), options.pairs)
+    verify_pairs((), _NO_PAIRS, (), camera, options=options.verify)
 
 
 def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
@@ -256,16 +430,6 @@ def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
     """
     along_axis = [abs(float(g.tvec[2])) for g in geometries if g.tvec is not None]
     return bool(along_axis) and float(np.median(along_axis)) >= _INIT_MAX_FORWARD_MOTION
-
-
-def _check_options(options: MatchOptions, size: tuple[int, int]) -> None:
-    """Refuse option values now that a stage would refuse after the long work."""
-    if options.image_step < 1:
-        raise OptionError(f"image_step is {options.image_step}: give 1 or more")
-    image_names(options.image_name, ())
-    camera = make_camera(options.camera, *size)
-    schedule_pairs((), options.pairs)
-    verify_pairs((), _NO_PAIRS, (), camera, options=options.verify)
 
 
 def _read_listed_images(database: Path) -> list[DatabaseImage]:
@@ -286,13 +450,16 @@ def _read_listed_images(database: Path) -> list[DatabaseImage]:
 
 
 def _check_listed_sizes(
-    listed: Sequence[DatabaseImage], size: tuple[int, int], video: Path, options: MatchOptions
+    listed: Sequence[DatabaseImage],
+    size: tuple[int, int],
+    source: VideoSource,
+    options: MatchOptions,
 ) -> None:
     names = [image.name for image in listed]
     # Images of this package are never turned; those of other programs usually are.
     own = are_named_by(options.image_name, names)
     sizes = [(image.width, image.height) for image in listed]
-    check_image_sizes(names, sizes, size, 0 if own else display_rotation(video))
+    check_image_sizes(names, sizes, size, 0 if own else display_rotation(source.pictures))
 
 
 def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
@@ -308,42 +475,6 @@ def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
                     "leave out the image folder, or re-encode the video at one size"
                 )
         yield frame
-
-
-def _chain(
-    motion: Iterable[FrameMotion],
-    options: MatchOptions,
-    clock: _Clock,
-    report: Progress,
-    num_packets: int | None,
-) -> tuple[Tracks, int, tuple[str, ...]]:
-    """Chain the motion as it is read, so that no frame's motion is kept."""
-    num_coded_frames = 0
-
-    def count(done: int) -> None:
-        nonlocal num_coded_frames
-        num_coded_frames = done
-        report("motion", done, num_packets)
-
-    with warnings.catch_warnings(record=True) as caught, clock.measure("tracks"):
-        warnings.simplefilter("always")
-        tracks = build_tracks(clock.iterate("motion", motion), options.tracks, count)
-    # Reading happened inside the chaining.
-    clock.seconds["tracks"] -= clock.seconds["motion"]
-    return tracks, num_coded_frames, tuple(str(warning.message) for warning in caught)
-
-
-def _choose_images(
-    listed: Sequence[DatabaseImage], tracks: Tracks, options: MatchOptions
-) -> tuple[list[str], NDArray[np.int32]]:
-    """Names of the images and the frames they stand for, in display order."""
-    if not listed:
-        chosen = np.arange(0, tracks.num_frames, options.image_step, dtype=np.int32)
-        return image_names(options.image_name, chosen.tolist()), chosen
-    names = [image.name for image in listed]
-    frames = frames_of_images(names, tracks.num_frames, options.first_number)
-    order = np.argsort(frames)
-    return [names[i] for i in order], frames[order]
 
 
 def _cameras(
@@ -364,35 +495,3 @@ def _cameras(
     camera = make_camera(options.camera, *size)
     each = [camera] * len(names)
     return each, camera if options.camera.single_camera else each
-
-
-class _Clock:
-    """Wall time of named stages, in the order in which they first ran."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def measure(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            elapsed = time.perf_counter() - start
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
-
-    def iterate(self, stage: str, items: Iterable[Any]) -> Iterator[Any]:
-        """Yield from `items`, measuring the time they take to come."""
-        iterator = iter(items)
-        self.seconds.setdefault(stage, 0.0)
-        while True:
-            with self.measure(stage):
-                try:
-                    item = next(iterator)
-                except StopIteration:
-                    return
-            yield item
-
-
-def _no_progress(stage: str, done: int, total: int | None) -> None:
-    del stage, done, total

@@ -1,0 +1,51 @@
+"""What the stages of a long run tell: how far they are, and how long they took."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+# Called with a stage's name, what is done of it and, where known, of how much.
+Progress = Callable[[str, int, "int | None"], None]
+
+_Item = TypeVar("_Item")
+
+
+def no_progress(stage: str, done: int, total: int | None) -> None:
+    """A `Progress` that tells nobody."""
+    del stage, done, total
+
+
+class Clock:
+    """Wall time of named stages, in the order in which they first ran.
+
+    Attributes:
+        seconds: the time of each stage so far.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        """Add the time the body takes to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            elapsed = time.perf_counter() - start
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
+
+    def iterate(self, stage: str, items: Iterable[_Item]) -> Iterator[_Item]:
+        """Yield from `items`, adding the time they take to come to a stage."""
+        iterator = iter(items)
+        self.seconds.setdefault(stage, 0.0)
+        while True:
+            with self.measure(stage):
+                try:
+                    item = next(iterator)
+                except StopIteration:
+                    return
+            yield item
