@@ -420,14 +420,12 @@ def test_damage_before_the_first_frame_is_an_error(tmp_path: Path) -> None:
         list(read_motion(file))
 
 
-@pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537])
-def test_sizes_no_frame_has_are_refused(size: int) -> None:
-    units = (2, 2)
-    arguments: dict[str, Any] = {
+def unit_arrays(units: tuple[int, int]) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
         name: np.zeros(units, dtype=np.uint8)
         for name in ("is_inter", "use_intrabc", "motion_mode", "interintra", "mi_size", "y_mode")
     }
-    arguments |= {
+    arrays |= {
         "mv": np.zeros((*units, 2, 2), dtype=np.int16),
         "ref_frame": np.zeros((*units, 2), dtype=np.int8),
         "warp_index": np.full(units, -1, dtype=np.int32),
@@ -436,7 +434,19 @@ def test_sizes_no_frame_has_are_refused(size: int) -> None:
         "gm_params": np.zeros((7, 6), dtype=np.int32),
         "ref_size": np.zeros((8, 2), dtype=np.int32),
     }
+    return arrays
+
+
+@pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537])
+def test_sizes_no_frame_has_are_refused(size: int) -> None:
+    arguments = unit_arrays((2, 2))
     with pytest.raises(ValueError, match="1 to 65536"):
         _core.displacement(0, **arguments, width=size, height=8)
     with pytest.raises(ValueError, match="1 to 65536"):
         _core.displacement(0, **arguments, width=8, height=size)
+
+
+@pytest.mark.parametrize("units", [(0, 0), (1, 2), (2, 1)])
+def test_a_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="larger than its 4x4 units"):
+        _core.displacement(0, **unit_arrays(units), width=8, height=8)

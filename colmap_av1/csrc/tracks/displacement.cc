@@ -29,6 +29,9 @@ void check_motion_field(const MotionField& field) {
   if (field.width < 1 || field.width > kMaxSide || field.height < 1 || field.height > kMaxSide) {
     throw std::invalid_argument("a frame's width and height are 1 to 65536 pixels");
   }
+  if (field.width > 4 * field.mi_cols || field.height > 4 * field.mi_rows) {
+    throw std::invalid_argument("the picture is larger than its 4x4 units cover");
+  }
   const int n = field.num_units();
   for (int u = 0; u < n; ++u) {
     if (field.mi_size[u] >= kNumBlockSizes) {

@@ -45,8 +45,8 @@ struct Displacement {
   const int32_t* warp = nullptr;  // affine model in force, null for a translation
 };
 
-// Throws std::invalid_argument for a size that no frame has, and where a unit's value would
-// index outside a table.
+// Throws std::invalid_argument for a size that no frame has or that the units do not cover, and
+// where a unit's value would index outside a table.
 void check_motion_field(const MotionField& field);
 
 // The rules of 7.11.3.1 that choose between translation, local and global warp.
