@@ -36,5 +36,9 @@ class DatabaseError(ColmapAv1Error):
     """The database is locked, not a COLMAP database, or does not fit the video."""
 
 
+class ModelError(ColmapAv1Error):
+    """The COLMAP model is missing, unreadable, without poses, or not of this video."""
+
+
 class OptionError(ColmapAv1Error):
     """An option has a value that cannot work."""
