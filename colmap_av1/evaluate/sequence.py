@@ -1,0 +1,114 @@
+"""Sequences with what is truly known of their cameras."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_av1.errors import ImageError, VideoError
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A folder of frames or a clip, and its true cameras where they are known.
+
+    Attributes:
+        name: name of the sequence.
+        source: the clip, or the folder of frames.
+        num_frames: number of frames.
+        width: picture width in pixels.
+        height: picture height in pixels.
+        fps: frames per second.
+        camera: pycolmap.Camera with the true intrinsics; None where they are unknown.
+        cam_from_world: float64 [num_frames, 3, 4] true poses in metres, x_cam = R x_world + t,
+            NaN for frames without one; None where no pose is known.
+    """
+
+    name: str
+    source: Path
+    num_frames: int
+    width: int
+    height: int
+    fps: float
+    camera: Any | None
+    cam_from_world: NDArray[np.float64] | None
+
+
+def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
+    """Read a sequence's description and ground truth.
+
+    The folder holds `sequence.json` (name, frames, width, height, fps, intrinsics, clip), either
+    `frames/` or the clip named there, and, where poses are known, `groundtruth.txt`: one line a
+    frame, `name tx ty tz qx qy qz qw`, the camera-to-world pose with x right, y down, z forward.
+    The number in a name is its frame's index from 0. Intrinsics are a COLMAP model's name and its
+    parameters, in COLMAP's convention (first pixel's centre at (0.5, 0.5)).
+
+    Raises:
+        VideoError: the folder is no sequence.
+        ImageError: a pose names a frame that the sequence lacks.
+    """
+    folder = Path(folder)
+    try:
+        about = json.loads((folder / "sequence.json").read_text())
+    except (OSError, ValueError) as error:
+        raise VideoError(f"{folder}: no readable sequence.json there: {error}") from error
+    width, height = int(about["width"]), int(about["height"])
+    camera = None
+    if about.get("intrinsics"):
+        camera = pycolmap.Camera(
+            model=about["intrinsics"]["model"],
+            width=width,
+            height=height,
+            params=about["intrinsics"]["params"],
+        )
+    truth = folder / "groundtruth.txt"
+    # The clip's file name comes first in its description.
+    source = folder / (about["clip"].split()[0] if about.get("clip") else "frames")
+    if not source.exists():
+        raise VideoError(f"{folder}: sequence.json speaks of {source.name}, which is not there")
+    return Sequence(
+        name=about["name"],
+        source=source,
+        num_frames=int(about["frames"]),
+        width=width,
+        height=height,
+        fps=float(about["fps"]),
+        camera=camera,
+        cam_from_world=_read_poses(truth, int(about["frames"])) if truth.is_file() else None,
+    )
+
+
+def frame_number(name: str) -> int:
+    """The number of the frame a file name stands for: its last group of digits.
+
+    Raises:
+        ImageError: the name holds no number.
+    """
+    numbers = re.findall(r"\d+", Path(name).stem)
+    if not numbers:
+        raise ImageError(f"image '{name}': its name holds no frame number")
+    return int(numbers[-1])
+
+
+def _read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
+    cam_from_world = np.full((num_frames, 3, 4), np.nan)
+    for line in path.read_text().splitlines():
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        frame = frame_number(words[0])
+        if frame >= num_frames:
+            raise ImageError(f"{path}: '{words[0]}' is none of the {num_frames} frames")
+        values = np.array(words[1:], dtype=np.float64)
+        rotation = Rotation.from_quat(values[3:]).as_matrix().T
+        cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
+    return cam_from_world
