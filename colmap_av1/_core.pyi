@@ -49,8 +49,27 @@ class TrackBuilder:
     def add(self, **frame: Any) -> None: ...
     def finish(
         self,
-    ) -> tuple[int, int, int, NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]: ...
+    ) -> tuple[
+        int,
+        int,
+        int,
+        NDArray[np.int64],
+        NDArray[np.int32],
+        NDArray[np.float32],
+        NDArray[np.float32],
+    ]: ...
 
+def select_spread(
+    *,
+    num_frames: int,
+    offsets: NDArray[np.int64],
+    frame: NDArray[np.int32],
+    xy: NDArray[np.float32],
+    order: NDArray[np.int64],
+    spacing: float,
+    max_tracks_per_image: int,
+    min_length: int,
+) -> NDArray[np.uint8]: ...
 def displacement(
     list_index: int,
     mv: NDArray[np.int16],

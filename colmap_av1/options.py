@@ -50,6 +50,22 @@ class TrackOptions:
 
 
 @dataclass(frozen=True)
+class DensityOptions:
+    """How many of the tracks are used; options that are None are set by the preset."""
+
+    # 'sparse': few and sure ones, for poses; 'default': for maps; 'dense': all
+    preset: Literal["sparse", "default", "dense"] = "dense"
+    # tracks an image sees at most, the surest first; 0: any number
+    max_tracks_per_image: int | None = None
+    # width in pixels of the cells of an image that one track each is wanted in; 0: any
+    spacing: float | None = None
+    # images a track is seen in at least
+    min_length: int | None = None
+    # largest expected error of a position against its track's first, in pixels; 0: any
+    max_sigma: float | None = None
+
+
+@dataclass(frozen=True)
 class PairOptions:
     """Which image pairs are written."""
 

@@ -30,6 +30,10 @@ class Tracks:
         frame: int32 [num_observations] display index of the observing frame.
         xy: float32 [num_observations, 2] position in pixels, (x right, y down), origin at
             the top-left corner of the image: the first pixel's centre is (0.5, 0.5).
+        sigma: float32 [num_observations] expected standard deviation of the position along
+            either axis, in pixels, against the track's first observation.
+        confirmed: bool [num_observations] whether decoded pixels confirmed the position;
+            without refinement none is.
     """
 
     num_frames: int
@@ -38,6 +42,8 @@ class Tracks:
     offsets: NDArray[np.int64]
     frame: NDArray[np.int32]
     xy: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    confirmed: NDArray[np.bool_]
 
 
 def build_tracks(
@@ -111,13 +117,15 @@ def build_tracks(
             y_mode=frame.y_mode,
             ref_size=frame.ref_size,
             force_integer_mv=bool(frame.header["force_integer_mv"]),
+            base_q_idx=int(frame.header["base_q_idx"]),
         )
         if progress is not None:
             progress(count)
-    num_frames, width, height, offsets, frame_index, xy = builder.finish()
+    num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
     if num_frames == 0:
         raise VideoError("the video shows no frame: give a video with at least one picture")
-    return Tracks(num_frames, width, height, offsets, frame_index, xy)
+    confirmed = np.zeros(len(frame_index), dtype=np.bool_)
+    return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
 
 
 _Limit = TypeVar("_Limit", int, float)

@@ -76,6 +76,8 @@ def make_scene(
         offsets=offsets.astype(np.int64),
         frame=where.astype(np.int32),
         xy=xy[where, point].astype(np.float32),
+        sigma=np.full(len(where), noise, np.float32),
+        confirmed=np.zeros(len(where), bool),
     )
     return Scene(tracks, R, C)
 

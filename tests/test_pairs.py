@@ -20,7 +20,9 @@ def tracks_from(spans: list[list[int]], num_frames: int = 10) -> Tracks:
     track = np.repeat(np.arange(len(spans)), [len(s) for s in spans])
     offsets = np.concatenate([[0], np.cumsum([len(s) for s in spans])]).astype(np.int64)
     xy = np.stack([100 * track + frame, track], axis=1).astype(np.float32).reshape(-1, 2)
-    return Tracks(num_frames, 640, 480, offsets, frame, xy)
+    sigma = np.zeros(len(frame), np.float32)
+    confirmed = np.zeros(len(frame), bool)
+    return Tracks(num_frames, 640, 480, offsets, frame, xy, sigma, confirmed)
 
 
 def images_seeing(tracks_of_image: list[list[int]]) -> list[ImageKeypoints]:

@@ -101,6 +101,7 @@ def frame(
             "frame_width": width,
             "show_frame": int(shown),
             "force_integer_mv": 0,
+            "base_q_idx": 100,
             "gm_type": np.zeros(7, np.int32),
             "gm_params": np.tile(np.array([0, 0, ONE, 0, 0, ONE], np.int32), (7, 1)),
         },
@@ -160,10 +161,15 @@ def check_invariants(tracks: Tracks, min_length: int) -> None:
     lengths = np.diff(tracks.offsets)
     assert tracks.offsets[0] == 0
     assert tracks.offsets[-1] == len(tracks.frame) == len(tracks.xy)
+    assert len(tracks.sigma) == len(tracks.confirmed) == len(tracks.frame)
+    assert not tracks.confirmed.any()
     assert (lengths >= min_length).all()
     inside = np.ones(len(tracks.frame), bool)
     inside[tracks.offsets[:-1]] = False
     assert (np.diff(tracks.frame, prepend=-1)[inside] > 0).all()
+    assert np.isfinite(tracks.sigma).all()
+    assert (tracks.sigma[inside] > 0).all()
+    assert (tracks.sigma >= 0).all()
     assert ((tracks.xy >= 0) & (tracks.xy < (tracks.width, tracks.height))).all()
     assert ((tracks.frame >= 0) & (tracks.frame < tracks.num_frames)).all()
     units = np.column_stack([tracks.frame, np.floor(tracks.xy / 4).astype(np.int32)])
@@ -723,7 +729,7 @@ def test_any_motion_gives_valid_tracks(motion: list[FrameMotion], options: Track
     tracks = build_tracks(motion, options)
     check_invariants(tracks, options.min_length)
     again = build_tracks(iter(motion), options)
-    for name in ("offsets", "frame", "xy"):
+    for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
         assert getattr(tracks, name).tobytes() == getattr(again, name).tobytes()
 
 

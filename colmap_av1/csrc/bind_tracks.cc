@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "tracks/displacement.h"
+#include "tracks/spread.h"
 #include "tracks/track_builder.h"
 
 namespace nb = nanobind;
@@ -124,7 +125,8 @@ void add_frame(TrackBuilder& builder, int decode_index, int display_index, bool 
                const Units<uint8_t>& interintra, const Units<uint8_t>& mi_size,
                const Units<uint8_t>& skip, const Units<int32_t>& warp_index,
                const Warps& local_warp_params, const GmTypes& gm_type, const GmParams& gm_params,
-               const Units<uint8_t>& y_mode, const RefSizes& ref_size, bool force_integer_mv) {
+               const Units<uint8_t>& y_mode, const RefSizes& ref_size, bool force_integer_mv,
+               int base_q_idx) {
   if (width <= 0) throw std::invalid_argument("the picture has no size");
   CodedFrame frame;
   frame.field = make_field(mv, ref_frame, is_inter, use_intrabc, motion_mode, interintra, mi_size,
@@ -132,6 +134,7 @@ void add_frame(TrackBuilder& builder, int decode_index, int display_index, bool 
                            coded_width, height, force_integer_mv);
   check_units(skip, frame.field, "skip");
   frame.skip = skip.data();
+  frame.base_q_idx = base_q_idx;
   frame.decode_index = decode_index;
   frame.display_index = display_index;
   frame.show_frame = show_frame;
@@ -155,7 +158,27 @@ nb::tuple finish(TrackBuilder& builder) {
   return nb::make_tuple(tracks.num_frames, tracks.width, tracks.height,
                         to_numpy(std::move(tracks.offsets), {offsets}),
                         to_numpy(std::move(tracks.frame), {observations}),
-                        to_numpy(std::move(tracks.xy), {observations, 2}));
+                        to_numpy(std::move(tracks.xy), {observations, 2}),
+                        to_numpy(std::move(tracks.sigma), {observations}));
+}
+
+nb::ndarray<nb::numpy, uint8_t> select_spread(
+    int num_frames, const Input<int64_t, nb::ndim<1>>& offsets,
+    const Input<int32_t, nb::ndim<1>>& frame, const Input<float, nb::shape<-1, 2>>& xy,
+    const Input<int64_t, nb::ndim<1>>& order, double spacing, int max_tracks_per_image,
+    int min_length) {
+  colmap_av1::tracks::TrackView view;
+  view.num_frames = num_frames;
+  view.offsets = {offsets.data(), offsets.shape(0)};
+  view.frame = {frame.data(), frame.shape(0)};
+  view.xy = {xy.data(), 2 * xy.shape(0)};
+  std::vector<uint8_t> kept;
+  {
+    const nb::gil_scoped_release release;
+    kept = colmap_av1::tracks::select_spread(view, {order.data(), order.shape(0)},
+                                             {spacing, max_tracks_per_image, min_length});
+  }
+  return to_numpy(std::move(kept), {frame.shape(0)});
 }
 
 }  // namespace
@@ -197,7 +220,11 @@ void bind_tracks(nb::module_& m) {
            "slot_decode_index"_a, "mv"_a, "ref_frame"_a, "is_inter"_a, "use_intrabc"_a,
            "motion_mode"_a, "interintra"_a, "mi_size"_a, "skip"_a, "warp_index"_a,
            "local_warp_params"_a, "gm_type"_a, "gm_params"_a, "y_mode"_a, "ref_size"_a,
-           "force_integer_mv"_a, "Adds one coded frame, in bitstream order.")
+           "force_integer_mv"_a, "base_q_idx"_a, "Adds one coded frame, in bitstream order.")
       .def("finish", &finish,
-           "Ends all tracks: (num_frames, width, height, offsets, frame, xy).");
+           "Ends all tracks: (num_frames, width, height, offsets, frame, xy, sigma).");
+
+  m.def("select_spread", &select_spread, nb::kw_only(), "num_frames"_a, "offsets"_a, "frame"_a,
+        "xy"_a, "order"_a, "spacing"_a, "max_tracks_per_image"_a, "min_length"_a,
+        "Flags, uint8 [num_observations], of a spread choice of tracks, best first in `order`.");
 }

@@ -111,7 +111,8 @@ bool add(TrackBuilder& builder, const CodedFrame& frame) {
 void check_tracks(const TrackArrays& tracks, const TrackBuilderOptions& options) {
   check(!tracks.offsets.empty() && tracks.offsets.front() == 0, "offsets start at 0");
   check(tracks.offsets.back() == static_cast<std::int64_t>(tracks.frame.size()) &&
-            tracks.xy.size() == 2 * tracks.frame.size(),
+            tracks.xy.size() == 2 * tracks.frame.size() &&
+            tracks.sigma.size() == tracks.frame.size(),
         "offsets end at the observations");
   for (std::size_t t = 0; t + 1 < tracks.offsets.size(); ++t) {
     const std::int64_t first = tracks.offsets[t];
@@ -120,6 +121,7 @@ void check_tracks(const TrackArrays& tracks, const TrackBuilderOptions& options)
     for (std::int64_t o = first; o < last; ++o) {
       const auto i = static_cast<std::size_t>(o);
       check(tracks.frame[i] >= 0 && tracks.frame[i] < tracks.num_frames, "frames are shown ones");
+      check(tracks.sigma[i] >= 0.F, "the expected error is a number");
       check(o == first || tracks.frame[i - 1] < tracks.frame[i], "a frame sees a track once");
       const float x = tracks.xy[2 * i];
       const float y = tracks.xy[2 * i + 1];
@@ -180,6 +182,7 @@ void run_parsed(Input input, TrackBuilder& builder) {
     frame.coded.decode_index = event->decode_index;
     frame.coded.display_index = displayed(event->decode_index);
     frame.coded.show_frame = header.show_frame;
+    frame.coded.base_q_idx = header.base_q_idx;
     frame.coded.width = header.upscaled_width;
     frame.coded.height = header.frame_height;
     frame.ref_frame = units.ref_frame;

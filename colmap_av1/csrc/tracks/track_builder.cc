@@ -7,7 +7,9 @@
 #include <stdexcept>
 #include <utility>
 
+#include "av1/constants.h"
 #include "av1/spec_tables.h"
+#include "tracks/trust.h"
 
 namespace colmap_av1::tracks {
 namespace {
@@ -72,6 +74,7 @@ TrackArrays TrackBuilder::finish() {
   const auto total = static_cast<std::size_t>(out.offsets.back());
   out.frame.reserve(total);
   out.xy.reserve(2 * total);
+  out.sigma.reserve(total);
   std::vector<Observation> path;
   for (const Kept& kept : kept_) {
     path.clear();
@@ -83,6 +86,7 @@ TrackArrays TrackBuilder::finish() {
       out.frame.push_back(o.frame);
       out.xy.push_back(o.position.x);
       out.xy.push_back(o.position.y);
+      out.sigma.push_back(o.sigma);
     }
   }
   *this = TrackBuilder(options_);
@@ -157,45 +161,66 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
         if (border > 0 && (is_in_border(x, y) || is_in_border(x + d.dx, y + d.dy))) continue;
         const int32_t warp =
             d.warp == nullptr ? -1 : static_cast<int32_t>(d.warp - frame.warps.data());
-        frame.motion[list][unit] = {d.dx, d.dy, warp, static_cast<int8_t>(d.ref)};
+        frame.motion[list][unit] = {d.dx, d.dy, warp, 0.F, static_cast<int8_t>(d.ref)};
       }
     }
   }
-  if (options_.smoothness >= 0) apply_smoothness(frame);
+  judge_blocks(frame, coded);
   return frame;
 }
 
-// Takes out the lists of blocks that most of the units around them contradict. A block
-// of w x h units lies at a multiple of (w, h), so its origin follows from its size.
-void TrackBuilder::apply_smoothness(Frame& frame) {
-  rough_.assign(frame.mi_size.size(), 0);
+// Says how far to trust the lists of every block, and takes out those that most of the units
+// around it contradict. A block of w x h units lies at a multiple of (w, h), so its origin follows
+// from its size.
+void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
+  struct Verdict {
+    float variance;
+    bool rough;
+  };
+  std::array<std::vector<Verdict>, 2> verdicts;
+  for (auto& list : verdicts) list.assign(frame.mi_size.size(), Verdict{0.F, false});
   for (int row = 0; row < frame.visible_rows; ++row) {
     for (int col = 0; col < frame.visible_cols; ++col) {
       const int unit = row * frame.cols + col;
       const int block_cols = av1::kBlockWidth[frame.mi_size[unit]] / 4;
       const int block_rows = av1::kBlockHeight[frame.mi_size[unit]] / 4;
       const int origin = (row & ~(block_rows - 1)) * frame.cols + (col & ~(block_cols - 1));
-      if (origin != unit) {
-        rough_[unit] = rough_[origin];
-        continue;
-      }
       for (int list = 0; list < 2; ++list) {
-        if (frame.motion[list][unit].ref > 0 && !has_smooth_border(frame, row, col, list)) {
-          rough_[unit] = static_cast<uint8_t>(rough_[unit] | (1 << list));
+        if (origin != unit) {
+          verdicts[list][unit] = verdicts[list][origin];
+          continue;
         }
+        // Of a block at the picture's border, other units may be trusted than the origin.
+        const UnitMotion& motion = frame.motion[list][unit];
+        const Agreement around = judge_border(frame, row, col, list);
+        StepTraits traits;
+        traits.block_area = block_area(frame.mi_size[unit]);
+        traits.y_mode = coded.field.y_mode[unit];
+        traits.coded = coded.skip[unit] == 0;
+        traits.warped = motion.warp >= 0;
+        traits.overlapped = coded.field.motion_mode[unit] == av1::OBMC;
+        traits.base_q_idx = coded.base_q_idx;
+        traits.length = std::hypot(motion.dx, motion.dy);
+        if (around.judged > 0) {
+          traits.disagreement = static_cast<float>(around.distance / around.judged);
+        }
+        const float sigma = step_sigma(traits);
+        verdicts[list][unit] = {sigma * sigma, options_.smoothness >= 0 &&
+                                                   2 * around.agreeing < around.judged};
       }
     }
   }
-  for (std::size_t unit = 0; unit < rough_.size(); ++unit) {
+  for (std::size_t unit = 0; unit < frame.mi_size.size(); ++unit) {
     for (int list = 0; list < 2; ++list) {
-      if ((rough_[unit] >> list & 1) != 0) frame.motion[list][unit].ref = 0;
+      frame.motion[list][unit].variance = verdicts[list][unit].variance;
+      if (verdicts[list][unit].rough) frame.motion[list][unit].ref = 0;
     }
   }
 }
 
-bool TrackBuilder::has_smooth_border(const Frame& frame, int row, int col, int list) const {
-  int agreeing = 0;
-  int judged = 0;
+TrackBuilder::Agreement TrackBuilder::judge_border(const Frame& frame, int row, int col,
+                                                   int list) const {
+  Agreement result;
   // Each unit outside is held against the unit of the block that it touches.
   const auto judge = [&](int inner_row, int inner_col, int outer_row, int outer_col) {
     if (outer_row < 0 || outer_row >= frame.visible_rows || outer_col < 0 ||
@@ -220,11 +245,12 @@ bool TrackBuilder::has_smooth_border(const Frame& frame, int row, int col, int l
                                      std::abs(own.dy - ratio * other.dy)));
     }
     if (std::isinf(best)) return;
-    ++judged;
+    ++result.judged;
+    result.distance += best;
     // Motion that is large changes much from place to place.
     const double length = std::sqrt(own.dx * own.dx + own.dy * own.dy);
     const double tolerance = options_.smoothness * (1 + length / 8);
-    if (best <= tolerance) ++agreeing;
+    if (best <= tolerance) ++result.agreeing;
   };
   const int mi_size = frame.mi_size[row * frame.cols + col];
   const int end_row = row + av1::kBlockHeight[mi_size] / 4;
@@ -237,7 +263,7 @@ bool TrackBuilder::has_smooth_border(const Frame& frame, int row, int col, int l
     judge(r, col, r, col - 1);
     judge(r, end_col - 1, r, end_col);
   }
-  return 2 * agreeing >= judged;
+  return result;
 }
 
 void TrackBuilder::chain_up_to(int display_index) {
@@ -358,7 +384,8 @@ void TrackBuilder::chain_backward(const Link& link, int list) {
   for (std::size_t cell = 0; cell < claims_.size(); ++cell) {
     const Claim& claim = claims_[cell];
     if (claim.unit >= 0) {
-      place(claim.unit, link.other->cells[cell].track, claim.position, claim.velocity);
+      place(claim.unit, link.other->cells[cell].track, claim.position, claim.velocity,
+            claim.variance);
     }
   }
 }
@@ -384,6 +411,7 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
       Claim claim;
       claim.unit = unit;
       claim.position = {moved.x * scale_x, moved.y * scale_y};
+      claim.variance = cell.variance + motion[unit].variance;
       if (!is_in_picture(claim.position)) continue;
       const int target = static_cast<int>(claim.position.y / kUnit) * current_->cols +
                          static_cast<int>(claim.position.x / kUnit);
@@ -403,7 +431,7 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
     const Claim& claim = claims_[unit];
     if (claim.unit >= 0) {
       place(static_cast<int>(unit), other.cells[claim.unit].track, claim.position,
-            claim.velocity);
+            claim.velocity, claim.variance);
     }
   }
 }
@@ -434,6 +462,7 @@ bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motio
       }
       claim.unit = unit;
       claim.cost = distance(claim.position, centre);
+      claim.variance = found.variance + motion.variance;
       if ((*best >= 0 && claim.cost >= best_claim->cost) || !is_in_picture(claim.position) ||
           !is_better(claim, claims_[cell], *current_) ||
           tracks_[found.track].last_seen == frames_chained_ ||
@@ -494,8 +523,9 @@ bool TrackBuilder::passes_cosine(const Link& link, int other_unit, Point from, P
   return vx * px + vy * py + s2 >= options_.cosine * norm;
 }
 
-void TrackBuilder::place(int unit, int32_t track, Point position, Point velocity) {
-  current_->cells[unit] = {track, {position.x * current_->upscale, position.y}};
+void TrackBuilder::place(int unit, int32_t track, Point position, Point velocity,
+                         float variance) {
+  current_->cells[unit] = {track, {position.x * current_->upscale, position.y}, variance};
   if (uses_cosine()) current_->velocity[unit] = velocity;
   tracks_[track].last_seen = frames_chained_;
   ++tracks_[track].frames;
@@ -516,7 +546,7 @@ void TrackBuilder::seed() {
         tracks_[track] = Track{};
       }
       tracks_[track].serial = next_serial_++;
-      place(unit, track, centre, {kNan, kNan});
+      place(unit, track, centre, {kNan, kNan}, 0.F);
     }
   }
 }
@@ -538,7 +568,8 @@ void TrackBuilder::observe() {
       observations_.emplace_back();
     }
     observations_[index] = {track.last_observation, current_->display_index,
-                            {cell.position.x * scale_x, cell.position.y * scale_y}};
+                            {cell.position.x * scale_x, cell.position.y * scale_y},
+                            std::sqrt(cell.variance) * scale_y};
     track.last_observation = index;
     ++track.length;
   }

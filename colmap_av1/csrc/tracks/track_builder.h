@@ -31,6 +31,7 @@ struct TrackBuilderOptions {
 struct CodedFrame {
   MotionField field;
   const uint8_t* skip = nullptr;
+  int base_q_idx = 0;
   int decode_index = 0;
   int display_index = -1;
   bool show_frame = true;
@@ -48,6 +49,7 @@ struct TrackArrays {
   std::vector<int64_t> offsets;
   std::vector<int32_t> frame;
   std::vector<float> xy;
+  std::vector<float> sigma;
 };
 
 // Frames come in bitstream order and are chained in display order, so that a frame that
@@ -80,12 +82,14 @@ class TrackBuilder {
   struct Cell {
     int32_t track = -1;
     Point position;
+    float variance = 0.F;  // of the position against the track's seed, in coded px^2
   };
   // A unit's motion by one of its lists, after the trust rules: ref 0 where untrusted.
   struct UnitMotion {
     float dx = 0.F;  // at the unit's centre, in coded pixels
     float dy = 0.F;
     int32_t warp = -1;  // first of six entries of Frame::warps
+    float variance = 0.F;  // expected of the displacement, in coded px^2
     int8_t ref = 0;
   };
   struct Frame {
@@ -121,6 +125,7 @@ class TrackBuilder {
     int32_t previous = -1;
     int32_t frame = 0;
     Point position;
+    float sigma = 0.F;
   };
   struct Kept {
     int64_t serial = 0;
@@ -143,6 +148,13 @@ class TrackBuilder {
     float cost = 0.F;   // distance from the claiming unit's centre, in coded pixels
     Point position;  // in the current frame, coded pixels
     Point velocity;
+    float variance = 0.F;
+  };
+  // How the units around a block move, against the block.
+  struct Agreement {
+    int judged = 0;
+    int agreeing = 0;
+    double distance = 0;  // summed over the judged ones
   };
   struct Window {
     int top = 0;
@@ -155,8 +167,8 @@ class TrackBuilder {
   Frame* find_frame(int decode_index) const;
   bool is_waiting(int display_index) const;
   Frame& read_frame(const CodedFrame& coded);
-  void apply_smoothness(Frame& frame);
-  bool has_smooth_border(const Frame& frame, int row, int col, int list) const;
+  void judge_blocks(Frame& frame, const CodedFrame& coded) const;
+  Agreement judge_border(const Frame& frame, int row, int col, int list) const;
   void chain_up_to(int display_index);
   void chain_frame(Frame& frame);
   void find_links();
@@ -171,7 +183,7 @@ class TrackBuilder {
   static float distance(Point a, Point b);
   bool passes_cosine(const Link& link, int other_unit, Point from, Point moved,
                      Claim* claim) const;
-  void place(int unit, int32_t track, Point position, Point velocity);
+  void place(int unit, int32_t track, Point position, Point velocity, float variance);
   void seed();
   void observe();
   void release_frames(const int32_t* slots);
@@ -203,7 +215,6 @@ class TrackBuilder {
   Frame* current_ = nullptr;
   std::vector<Link> links_;
   std::vector<Claim> claims_;
-  std::vector<uint8_t> rough_;
   std::vector<MotionSample> samples_;
   std::vector<float> scratch_;
 };

@@ -1,0 +1,28 @@
+// How far the bitstream's motion can be trusted.
+
+#ifndef COLMAP_AV1_TRACKS_TRUST_H_
+#define COLMAP_AV1_TRACKS_TRUST_H_
+
+namespace colmap_av1::tracks {
+
+// What the bitstream says about one displacement of a 4x4 unit.
+struct StepTraits {
+  int block_area = 16;  // px^2
+  int y_mode = 0;
+  bool coded = false;  // has a residual
+  bool warped = false;
+  bool overlapped = false;  // OBMC
+  int base_q_idx = 0;
+  float length = 0.F;  // of the displacement, px
+  // Mean distance in px to the displacements of the units around the block; negative where there
+  // are none.
+  float disagreement = -1.F;
+};
+
+// Expected standard deviation, in pixels along either axis, of where a point lands that is moved
+// by the displacement.
+float step_sigma(const StepTraits& traits);
+
+}  // namespace colmap_av1::tracks
+
+#endif  // COLMAP_AV1_TRACKS_TRUST_H_
