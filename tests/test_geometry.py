@@ -56,6 +56,21 @@ def tracks():
     return build_tracks(read_motion(EXAMPLES / "scene.mp4"))
 
 
+def _tracks(size, offsets, frame, xy):
+    """Tracks of a video of size (frames, width, height)."""
+    num_frames, width, height = size
+    return Tracks(
+        num_frames=num_frames,
+        width=width,
+        height=height,
+        offsets=np.asarray(offsets, np.int64),
+        frame=np.asarray(frame, np.int32),
+        xy=np.asarray(xy, np.float32),
+        sigma=np.full(len(frame), 0.5, np.float32),
+        confirmed=np.zeros(len(frame), bool),
+    )
+
+
 @pytest.fixture(scope="module")
 def true_tracks(render_scene, scene):
     """Surface points followed exactly, from frame 10 to 20."""
@@ -65,14 +80,9 @@ def true_tracks(render_scene, scene):
     seen = [render_scene.project(scene, f, points) for f in frames]
     visible = np.all([v for _, _, v in seen], axis=0)
     points, xy = points[visible], np.stack([xy[visible] for xy, _, _ in seen], 1)
-    return Tracks(
-        num_frames=len(scene.cam_from_world),
-        width=scene.width,
-        height=scene.height,
-        offsets=np.arange(len(points) + 1) * len(frames),
-        frame=np.tile(frames, len(points)).astype(np.int32),
-        xy=xy.reshape(-1, 2).astype(np.float32),
-    )
+    offsets = np.arange(len(points) + 1) * len(frames)
+    size = (len(scene.cam_from_world), scene.width, scene.height)
+    return _tracks(size, offsets, np.tile(frames, len(points)), xy.reshape(-1, 2))
 
 
 # By span: median and 90th percentile in px, some 15 % above what is reached.
@@ -141,7 +151,7 @@ def test_pairs_at_span_are_all_pairs_and_only_these():
     frame = np.array([0, 1, 3, 1, 3, 5, 0, 4, 5], dtype=np.int32)
     offsets = np.array([0, 3, 6, 9])
     xy = np.zeros((9, 2), np.float32)
-    tracks = Tracks(6, 64, 64, offsets, frame, xy)
+    tracks = _tracks((6, 64, 64), offsets, frame, xy)
     of = {0: 0, 1: 0, 2: 0, 3: 1, 4: 1, 5: 1, 6: 2, 7: 2, 8: 2}
     for span in range(1, 8):
         wanted = [
@@ -160,7 +170,7 @@ def test_track_statistics_count_what_images_see():
     # Three frames of 2x1 cells; the second cell is cut at 20 px.
     frame = np.array([0, 1, 2, 0, 2, 1], dtype=np.int32)
     xy = np.float32([[1, 1], [2, 2], [17, 3], [18, 9], [19, 9], [20, 10]])
-    tracks = Tracks(3, 20, 16, np.array([0, 3, 5, 6]), frame, xy)
+    tracks = _tracks((3, 20, 16), [0, 3, 5, 6], frame, xy)
     all_frames = track_statistics(tracks)
     assert (all_frames.num_images, all_frames.num_tracks, all_frames.mean_length) == (3, 2, 2.5)
     assert all_frames.tracks_by_length == {2: 2, 4: 0, 8: 0, 16: 0, 32: 0}
