@@ -133,3 +133,18 @@ class MatchOptions:
     # number in a listed image's name of the video's first frame; None: only where the
     # names and their count leave no doubt which frame an image is
     first_number: int | None = None
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How motion and tracks are drawn over the frames of a video."""
+
+    # 'motion': direction of motion as colour; 'tracks': tracks with tails; 'both': one
+    # beside the other
+    draw: Literal["motion", "tracks", "both"] = "both"
+    # share of the motion's colour in the picture
+    opacity: float = 0.6
+    # frames a track's tail reaches back
+    tail: int = 8
+    # one track is drawn for each square of this many pixels
+    spacing: int = 8
