@@ -8,6 +8,7 @@ import importlib.metadata
 import inspect
 import re
 import sys
+import threading
 import types
 import typing
 import warnings
@@ -20,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as ProgressBars
 from rich.table import Table
 
-from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.errors import ColmapAv1Error, OptionError
 from colmap_av1.export import export_motion
 from colmap_av1.info import StreamReport
 from colmap_av1.info import inspect as inspect_stream
@@ -32,8 +33,10 @@ from colmap_av1.options import (
     ReadOptions,
     TrackOptions,
     VerifyOptions,
+    ViewOptions,
 )
 from colmap_av1.progress import Progress, no_progress
+from colmap_av1.view import serve_model, view_model, view_video, write_picture
 
 _PROGRAM = "colmap-av1"
 _INTERRUPTED = 130
@@ -138,6 +141,34 @@ def _make_parser() -> argparse.ArgumentParser:
         "--output", "--output_path", required=True, metavar="PATH", help="a .npz or .h5 file"
     )
     _add_options(command, {ReadOptions: "bitstream"})
+    _add_quiet(command)
+
+    command = _add_command(commands, "view", _run_view, "draw motion, tracks, matches or a model")
+    subject = command.add_mutually_exclusive_group(required=True)
+    subject.add_argument(
+        "--video", "--video_path", metavar="PATH", help="draw motion and tracks of an AV1 video"
+    )
+    subject.add_argument(
+        "--model", "--model_path", metavar="PATH", help="draw points and camera path of a model"
+    )
+    command.add_argument(
+        "--output",
+        "--output_path",
+        metavar="PATH",
+        help="an .mp4 file or a folder for PNG files (video), a .png or .jpg file (model)",
+    )
+    command.add_argument(
+        "--interactive",
+        action="store_true",
+        help="show the model in the browser (needs the viewer extra)",
+    )
+    command.add_argument(
+        "--port", type=int, default=8080, metavar="N", help="port of the interactive viewer [8080]"
+    )
+    _add_options(
+        command,
+        {ViewOptions: "drawing", TrackOptions: "tracks", ReadOptions: "bitstream"},
+    )
     _add_quiet(command)
     return parser
 
@@ -308,6 +339,37 @@ def _run_motion(namespace: argparse.Namespace) -> None:
         )
     if not namespace.quiet:
         _print_summary([("coded frames", str(count)), ("output", namespace.output)])
+
+
+def _run_view(namespace: argparse.Namespace) -> None:
+    if namespace.model is not None and namespace.interactive:
+        _serve(namespace)
+        return
+    if namespace.output is None:
+        raise OptionError("nowhere to draw: give --output")
+    if namespace.model is not None:
+        write_picture(view_model(namespace.model), namespace.output)
+        return
+    with _progress(namespace.quiet) as report:
+        count = view_video(
+            namespace.video,
+            namespace.output,
+            options=_given(namespace, ViewOptions),
+            tracks=_given(namespace, TrackOptions),
+            read=_given(namespace, ReadOptions),
+            progress=report,
+        )
+    if not namespace.quiet:
+        _print_summary([("frames", str(count)), ("output", namespace.output)])
+
+
+def _serve(namespace: argparse.Namespace) -> None:
+    server = serve_model(namespace.model, port=namespace.port)
+    try:
+        print(f"http://127.0.0.1:{namespace.port} (end with Ctrl-C)", flush=True)
+        threading.Event().wait()
+    finally:
+        server.stop()
 
 
 def _match_rows(report: MatchReport) -> _Rows:

@@ -387,6 +387,8 @@ def _bgr(
 ) -> NDArray[np.uint8]:
     """BGR colours [n, 3] of OpenCV's hue (0 to 180), saturation and value (0 to 255)."""
     hsv = np.stack([hue, saturation, value], axis=-1).astype(np.uint8)
+    if len(hsv) == 0:  # OpenCV refuses empty arrays
+        return hsv
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0], dtype=np.uint8)
 
 

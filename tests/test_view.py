@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import urllib.request
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import Encode
+
+from colmap_av1 import view
+from colmap_av1.cli import main
+from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.options import TrackOptions, ViewOptions
+
+
+@pytest.fixture(scope="session")
+def panning(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip whose upper half moves right by 3 pixels a frame, and whose lower half left."""
+    rng = np.random.default_rng(1)
+    texture = cv2.resize(rng.integers(0, 256, (40, 160, 3), dtype=np.uint8), (640, 160))
+    halves = [
+        np.roll(texture, [3 * i, -3 * i][k], axis=1)[:, :256] for i in range(10) for k in (0, 1)
+    ]
+    frames = np.array(halves).reshape(10, 2 * 160, 256, 3)
+    return encode(frames, tmp_path_factory.mktemp("view") / "panning.mp4")
+
+
+def hue_of(picture: np.ndarray) -> np.ndarray:
+    """Hues in degrees of the pixels that are not grey."""
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV).reshape(-1, 3)
+    return hsv[hsv[:, 1] > 60, 0] * 2.0
+
+
+def test_motion_is_coloured_by_direction(panning: Path, tmp_path: Path) -> None:
+    output = tmp_path / "motion"
+    options = ViewOptions(draw="motion")
+    # The encoder takes large blocks that refer to the first frame.
+    tracks = TrackOptions(max_block_area=None, max_uncoded_block_area=None, max_interval=None)
+    assert view.view_video(panning, output, options=options, tracks=tracks) == 10
+    names = sorted(p.name for p in output.iterdir())
+    assert names == [f"frame_{i:06d}.png" for i in range(10)]
+    picture = cv2.imread(str(output / "frame_000005.png"))
+    assert picture.shape == (320, 256, 3)
+    upper, lower = hue_of(picture[64:144, 64:]), hue_of(picture[176:300, 64:])
+    assert len(upper) > 1000
+    assert len(lower) > 1000
+    # To the right is red, to the left its opposite.
+    assert np.median(np.minimum(upper, 360 - upper)) < 20
+    assert abs(np.median(lower) - 180) < 20
+
+
+def test_tails_lead_to_where_tracks_were(panning: Path, tmp_path: Path) -> None:
+    view.view_video(panning, tmp_path / "t", options=ViewOptions(draw="tracks", tail=6))
+    first = cv2.imread(str(tmp_path / "t" / "frame_000000.png"))
+    later = cv2.imread(str(tmp_path / "t" / "frame_000007.png"))
+    plain = next(image for i, image in view.decode_frames(panning) if i == 7)
+    changed = np.any(later != plain, axis=2)
+    # Tails of 6 frames at 3 pixels a frame.
+    drawn = cv2.connectedComponentsWithStats(changed.astype(np.uint8))[2][1:]
+    assert np.median(drawn[:, cv2.CC_STAT_WIDTH]) >= 15
+    assert first.shape == later.shape
+
+
+def test_mp4_shows_both_and_is_the_same_each_time(panning: Path, tmp_path: Path) -> None:
+    for name in ("a.mp4", "b.mp4"):
+        assert view.view_video(panning, tmp_path / name) == 10
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        pictures = list(container.decode(video=0))
+        assert float(container.streams.video[0].average_rate or 0) == 25
+    assert [(p.width, p.height) for p in pictures] == [(512, 320)] * 10
+
+
+def test_odd_sizes_are_padded(encode: Encode, tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (4, 63, 95, 3), dtype=np.uint8)
+    clip = encode(frames, tmp_path / "odd.mp4")
+    view.view_video(clip, tmp_path / "odd_view.mp4", options=ViewOptions(draw="motion"))
+    with av.open(str(tmp_path / "odd_view.mp4")) as container:
+        assert {(p.width, p.height) for p in container.decode(video=0)} == {(96, 64)}
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "message"),
+    [
+        ("x.gif", ViewOptions(), r"ends in \.mp4"),
+        ("missing/x.mp4", ViewOptions(), "cannot be written"),
+        ("x.mp4", ViewOptions(opacity=2), "opacity"),
+        ("x.mp4", ViewOptions(tail=-1), "tail"),
+        ("x.mp4", ViewOptions(spacing=0), "spacing"),
+    ],
+)
+def test_bad_options_leave_nothing(
+    panning: Path, tmp_path: Path, output: str, options: ViewOptions, message: str
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        view.view_video(panning, tmp_path / output, options=options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_matches_join_their_keypoints() -> None:
+    black = np.zeros((100, 60, 3), dtype=np.uint8)
+    left, right = np.array([[10.5, 20.5]], np.float32), np.array([[30.5, 70.5]], np.float32)
+    matches = np.array([[0, 0]], dtype=np.uint32)
+    picture = view.view_pair(black, black, left, right, matches)
+    assert picture.shape == (100, 120, 3)
+    lit = picture.any(axis=2)
+    assert lit[20, 10]
+    assert lit[70, 90]
+    assert lit[45, 50]  # half way
+    assert not lit[70, 30]
+    none = view.view_pair(black, black, left, right, matches[:0])
+    assert not none.any()
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 6, 300
+    reconstruction = pycolmap.synthesize_dataset(options)
+    for point in reconstruction.points3D.values():
+        point.color = np.array([10, 200, 30], dtype=np.uint8)
+    path = tmp_path_factory.mktemp("model")
+    reconstruction.write(path)
+    return path
+
+
+def test_model_shows_points_in_their_colours_and_the_path(model: Path, tmp_path: Path) -> None:
+    assert main(["view", "--model", str(model), "--output", str(tmp_path / "m.png")]) == 0
+    picture = cv2.imread(str(tmp_path / "m.png"))
+    assert picture.shape == (1200, 1600, 3)
+    for panel in (
+        picture[:600, :800],
+        picture[:600, 800:],
+        picture[600:, :800],
+        picture[600:, 800:],
+    ):
+        assert np.count_nonzero(np.all(panel == (30, 200, 10), axis=2)) > 200
+        assert np.count_nonzero(np.all(panel == view._PATH_COLOUR, axis=2)) > 50
+
+
+def test_model_in_the_browser(model: Path) -> None:
+    pytest.importorskip("viser")
+    server = view.serve_model(model, port=18080)
+    try:
+        with urllib.request.urlopen("http://127.0.0.1:18080", timeout=10) as page:
+            assert page.status == 200
+        with pytest.raises(OptionError, match="port 18080 is taken"):
+            view.serve_model(model, port=18080)
+    finally:
+        server.stop()
+
+
+def test_view_says_what_it_lacks(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", "--model", str(model)]) == 2
+    assert "give --output" in capsys.readouterr().err
+    with pytest.raises(ModelError, match="holds no COLMAP model"):
+        view.view_model(tmp_path)
+    with pytest.raises(OptionError, match=r"ends in \.png"):
+        view.write_picture(view.view_model(model), tmp_path / "m.tiff")
