@@ -1,20 +1,16 @@
 """Rows of COLMAP's database: cameras, images, keypoints, matches, two-view geometries.
 
-A new file has the layout of COLMAP 3.8, the oldest still in use: later versions read it and
-migrate it, while older ones refuse what later ones make. An existing file keeps its layout,
-so columns are always named and only those present are written. SQLite is used directly,
-because opening a file with pycolmap migrates it.
+An existing file keeps its layout, so columns are always named and only those present are
+written.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import os
-import secrets
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,50 +19,27 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.errors import DatabaseError, OptionError
-from colmap_av1.options import CameraOptions
-from colmap_av1.pairs import ImageKeypoints
-from colmap_av1.verify import TwoViewGeometry
-
-# COLMAP's kMaxNumImages: image ids stay below it, and it spreads pair ids.
-MAX_NUM_IMAGES = 2147483647
-
-_USER_VERSION = 3800
-# Seconds to wait for another writer: one that is only closing a file is soon done.
-_BUSY_TIMEOUT = 2.0
-
-_SCHEMA = (
-    "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, "
-    "model INTEGER NOT NULL, width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, "
-    "prior_focal_length INTEGER NOT NULL)",
-    "CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, "
-    "name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL, "
-    "prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL, "
-    "prior_tx REAL, prior_ty REAL, prior_tz REAL, "
-    f"CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < {MAX_NUM_IMAGES}), "
-    "FOREIGN KEY(camera_id) REFERENCES cameras(camera_id))",
-    "CREATE UNIQUE INDEX index_name ON images(name)",
-    "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB, "
-    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)",
-    "CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB, "
-    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)",
-    "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB)",
-    "CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, "
-    "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, "
-    "F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB)",
+from colmap_av1.database_file import (
+    MAX_NUM_IMAGES,
+    check_layout,
+    columns,
+    is_new,
+    open_database,
+    write_existing,
+    write_new,
 )
+from colmap_av1.errors import DatabaseError, OptionError
+from colmap_av1.options import CameraOptions, OnExisting
+from colmap_av1.pairs import ImageKeypoints
+from colmap_av1.verify import TwoViewConfig, TwoViewGeometry
 
-# Columns without which a file is not a COLMAP database; others are written where present.
-_REQUIRED_COLUMNS = {
-    "cameras": {"camera_id", "model", "width", "height", "params", "prior_focal_length"},
-    "images": {"image_id", "name", "camera_id"},
-    "keypoints": {"image_id", "rows", "cols", "data"},
-    "matches": {"pair_id", "rows", "cols", "data"},
-    "two_view_geometries": {"pair_id", "rows", "cols", "data", "config"},
-}
+# COLMAP's kinds of two-view geometry beside those of TwoViewConfig.
+_UNDEFINED, _WATERMARK, _MULTIPLE = 0, 7, 8
+# COLMAP's SensorType of a camera.
+_CAMERA_SENSOR = 0
+# A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
+# or a 2x2 affine shape.
+_SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -159,10 +132,10 @@ def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
         DatabaseError: the file is locked, unreadable, or not a COLMAP database.
     """
     path = Path(database)
-    if _is_new(path):
+    if is_new(path):
         return []
-    with _connect(path) as connection:
-        _check_layout(connection, path)
+    with open_database(path) as connection:
+        check_layout(connection, path)
         rows = connection.execute(
             "SELECT image_id, name, camera_id, COALESCE(width, 0), COALESCE(height, 0), "
             "COALESCE(keypoints.rows, 0) FROM images LEFT JOIN cameras USING (camera_id) "
@@ -193,10 +166,10 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
             camera of a model that the installed pycolmap does not know.
     """
     path = Path(database)
-    if _is_new(path):
+    if is_new(path):
         return {}
-    with _connect(path) as connection:
-        _check_layout(connection, path)
+    with open_database(path) as connection:
+        check_layout(connection, path)
         rows = connection.execute(
             "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras "
             "ORDER BY camera_id"
@@ -230,28 +203,44 @@ def write_matches(
     pairs: NDArray[np.int32],
     matches: Sequence[NDArray[np.uint32]],
     geometries: Sequence[TwoViewGeometry],
+    on_existing: OnExisting = "error",
 ) -> None:
     """Write keypoints, matches and two-view geometries: all rows, or none.
 
     A file that is absent or empty is made; where it lists no images, cameras and images are
     inserted. Where it lists images, the rows go to those of the given names, and their
     cameras stay as they are. Rows of these images that hold nothing, as matchers leave them
-    for pairs they could not match, are replaced.
+    for pairs they could not match, are replaced. A file with frames, as COLMAP 3.12 and later
+    write them, gets one for every image that has none: the mappers refuse a mixture.
+
+    What becomes of keypoints and matches that the images have already, `on_existing` says:
+
+    - "error": the file is refused.
+    - "append": the new keypoints follow the present ones, which keep their numbers, columns
+      and matches. They have no shape of their own, and where the present ones have
+      descriptors, theirs are zero, which SIFT's matchers match with nothing. A pair that has
+      rows gets both sets of matches and of inliers; its models are those of the geometry with
+      more inliers. Matches that were never verified stay unverified.
+    - "replace": keypoints, descriptors, matches and geometries of these images are removed,
+      with all pairs they are part of. Other images keep theirs.
+
+    Other than with "error", named images that the file does not list are inserted.
 
     Args:
         database: path of the file.
         names: name of each image, its path relative to the image folder.
-        cameras: the camera of all images, or one for each; may be None where the database
-            lists the images.
+        cameras: the camera of all inserted images, or one for each image; may be None where
+            the database lists the images.
         keypoints: keypoints of each image.
         pairs: int32 [m, 2] indices of images.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
         geometries: for each pair, its verified geometry.
+        on_existing: what becomes of rows that the images have already.
 
     Raises:
         DatabaseError: the file is locked, not a COLMAP database, lists other images, already
-            has keypoints or matches of these images, or cannot be written (no space, no
-            permission). The file is then as it was.
+            has keypoints or matches of these images and must not, has these very keypoints,
+            or cannot be written (no space, no permission). The file is then as it was.
     """
     path = Path(database)
     if not (len(names) == len(keypoints) and len(pairs) == len(matches) == len(geometries)):
@@ -265,163 +254,72 @@ def write_matches(
             raise ValueError(f"matches of images {i} and {j} name keypoints that are not there")
 
     def fill(connection: sqlite3.Connection) -> None:
-        image_ids = _find_images(connection, path, names)
-        if image_ids is None:
-            image_ids = _insert_images(connection, path, names, cameras)
-        _check_nothing_lost(connection, path, dict(zip(image_ids, names, strict=True)))
-        _insert_keypoints(connection, image_ids, keypoints)
-        _insert_pairs(connection, _order_pairs(image_ids, pairs), matches, geometries)
+        image_ids = _place_images(connection, path, names, cameras, on_existing)
+        if on_existing == "error":
+            _check_nothing_lost(connection, path, dict(zip(image_ids, names, strict=True)))
+        elif on_existing == "replace":
+            _clear_images(connection, set(image_ids))
+        firsts = _append_keypoints(connection, path, image_ids, keypoints)
+        shifts = [np.array([firsts[i], firsts[j]], dtype=np.uint32) for i, j in pairs]
+        _append_pairs(
+            connection,
+            path,
+            _order_pairs(image_ids, pairs),
+            shifts=shifts,
+            matches=matches,
+            geometries=geometries,
+        )
+        if names:
+            _complete_frames(connection, path)
 
-    if _is_new(path):
-        _write_new(path, fill)
+    if is_new(path):
+        write_new(path, fill)
     else:
-        _write_existing(path, fill)
+        write_existing(path, fill)
 
 
-def _is_new(path: Path) -> bool:
-    """Whether the file is absent or empty, so that making it loses nothing."""
-    if path.is_dir():
-        raise DatabaseError(f"{path} is a folder: give the path of a database file")
-    if path.exists() and path.stat().st_size > 0:
-        return False
-    if not path.resolve().parent.is_dir():
-        raise DatabaseError(f"{path}: the folder does not exist: make it first")
-    for suffix in ("-journal", "-wal"):
-        # SQLite would replay such a file into whatever database appears beside it.
-        leftover = path.with_name(path.name + suffix)
-        if leftover.exists():
-            raise DatabaseError(f"{leftover} is left from another database: remove it first")
-    return True
-
-
-@contextlib.contextmanager
-def _connect(path: Path, named: Path | None = None) -> Iterator[sqlite3.Connection]:
-    """Open a file that exists and close it at the end; SQLite's errors become ours.
-
-    Args:
-        path: file to open.
-        named: path that messages name, where it differs.
-    """
-    named = named if named is not None else path
-    try:
-        with contextlib.closing(
-            sqlite3.connect(
-                f"{path.resolve().as_uri()}?mode=rw",
-                uri=True,
-                timeout=_BUSY_TIMEOUT,
-                isolation_level=None,
-            )
-        ) as connection:
-            yield connection
-    except sqlite3.Error as error:
-        raise DatabaseError(_explain(named, error)) from error
-
-
-def _explain(path: Path, error: sqlite3.Error) -> str:
-    text = str(error)
-    causes = {
-        "locked": "it is in use by another process: wait until that is done, or end it",
-        "busy": "it is in use by another process: wait until that is done, or end it",
-        "not a database": "it is not a COLMAP database: give another path",
-        "malformed": "it is damaged: restore it from a copy, or give another path",
-        "full": "the disk is full: free some space",
-        "disk I/O error": "it cannot be read or written (disk full, quota, or a failing disk)",
-        "readonly": "it may not be written: change its permissions, or give another path",
-        "unable to open": "it cannot be opened: check the path and its permissions",
-    }
-    for sign, cause in causes.items():
-        if sign in text:
-            return f"{path}: {cause}"
-    return f"{path}: SQLite refuses: {text}"
-
-
-def _write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
-    """Make a database under another name in the same folder, then give it its own."""
-    target = path.resolve()
-    partial = target.with_name(f".{target.name}.{secrets.token_hex(8)}.partial")
-    try:
-        partial.touch(exist_ok=False)
-        with _connect(partial, named=path) as connection:
-            # The file is thrown away on any failure: nothing needs to be rolled back.
-            connection.execute("PRAGMA journal_mode = OFF")
-            connection.execute("BEGIN EXCLUSIVE")
-            for statement in _SCHEMA:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {_USER_VERSION}")
-            fill(connection)
-            connection.execute("COMMIT")
-        if not _is_new(path):
-            raise DatabaseError(f"{path} was made by another process meanwhile: run again")
-        partial.replace(target)
-    except OSError as error:
-        raise DatabaseError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _write_existing(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
-    """Add to a database in one transaction."""
-    with _connect(path) as connection:
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            _check_layout(connection, path)
-            fill(connection)
-            connection.execute("COMMIT")
-        except BaseException:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
-            raise
-
-
-def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
-    return {row[1] for row in connection.execute(f"PRAGMA table_info({table})")}
-
-
-def _check_layout(connection: sqlite3.Connection, path: Path) -> None:
-    for table, required in _REQUIRED_COLUMNS.items():
-        missing = required - _columns(connection, table)
-        if missing:
-            what = "table" if missing == required else f"{sorted(missing)[0]!r} in table"
-            raise DatabaseError(
-                f"{path}: it is not a COLMAP database (no {what} {table!r}): give another path"
-            )
-
-
-def _find_images(
-    connection: sqlite3.Connection, path: Path, names: Sequence[str]
-) -> list[int] | None:
-    """Ids of the named images; None where the database lists no images at all."""
+def _place_images(
+    connection: sqlite3.Connection,
+    path: Path,
+    names: Sequence[str],
+    cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
+    on_existing: OnExisting,
+) -> list[int]:
+    """Ids of the named images, inserted where the database does not list them and may."""
     listed = dict(connection.execute("SELECT name, image_id FROM images").fetchall())
+    absent = [name for name in names if name not in listed]
+    if listed and absent and (on_existing == "error" or cameras is None):
+        raise DatabaseError(
+            f"{path} lists {len(listed)} images, but not {absent[0]!r}: use images by the names "
+            "it lists, or a new database"
+        )
     if not listed:
-        return None
-    for name in names:
-        if name not in listed:
-            raise DatabaseError(
-                f"{path} lists {len(listed)} images, but not {name!r}: use images by the names "
-                "it lists, or a new database"
-            )
+        for table in ("rigs", "frames"):
+            if columns(connection, table) and _has_rows(connection, table):
+                raise DatabaseError(
+                    f"{path} has {table} but no images: import its images first, or use a new "
+                    "database"
+                )
+    if absent:
+        if cameras is None:
+            raise ValueError("give a camera: the database lists no images")
+        if not isinstance(cameras, pycolmap.Camera):
+            if len(cameras) != len(names):
+                raise ValueError("give one camera, or one for each image")
+            each = dict(zip(names, cameras, strict=True))
+            cameras = [each[name] for name in absent]
+        listed |= _insert_images(connection, absent, cameras)
     return [listed[name] for name in names]
 
 
 def _insert_images(
     connection: sqlite3.Connection,
-    path: Path,
     names: Sequence[str],
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
-) -> list[int]:
-    # COLMAP makes rigs and frames by itself, but only where there are none: images without
-    # a frame beside images with one stop it.
-    for table in ("rigs", "frames"):
-        if _columns(connection, table) and _has_rows(connection, table):
-            raise DatabaseError(
-                f"{path} has {table} but no images: import its images first, or use a new database"
-            )
-    if cameras is None:
-        raise ValueError("give a camera: the database lists no images")
+    cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
+) -> dict[str, int]:
+    """Insert images with a camera for all or one for each; returns the ids of the names."""
     shared = isinstance(cameras, pycolmap.Camera)
     rows: list[Any] = [cameras] if shared else list(cameras)
-    if not shared and len(rows) != len(names):
-        raise ValueError("give one camera, or one for each image")
     (first_id,) = connection.execute(
         "SELECT COALESCE(MAX(camera_id), 0) + 1 FROM cameras"
     ).fetchone()
@@ -440,15 +338,64 @@ def _insert_images(
             for i, camera in enumerate(rows)
         ),
     )
-    image_ids = list(range(1, len(names) + 1))
+    (first_image_id,) = connection.execute(
+        "SELECT COALESCE(MAX(image_id), 0) + 1 FROM images"
+    ).fetchone()
     connection.executemany(
         "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, ?)",
         (
-            (image_id, name, first_id if shared else first_id + image_id - 1)
-            for image_id, name in zip(image_ids, names, strict=True)
+            (first_image_id + i, name, first_id if shared else first_id + i)
+            for i, name in enumerate(names)
         ),
     )
-    return image_ids
+    return {name: first_image_id + i for i, name in enumerate(names)}
+
+
+def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:
+    """Give every image a frame where the file has rigs or frames at all.
+
+    COLMAP makes rigs and frames by itself, but only where there are none.
+    """
+    tables = ("rigs", "rig_sensors", "frames", "frame_data")
+    if not all(columns(connection, table) for table in tables):
+        return
+    if not (_has_rows(connection, "rigs") or _has_rows(connection, "frames")):
+        return
+    rig_of_camera = dict(
+        connection.execute(
+            "SELECT ref_sensor_id, rig_id FROM rigs WHERE ref_sensor_type = ?", (_CAMERA_SENSOR,)
+        ).fetchall()
+    )
+    in_larger_rig = {
+        row[0]
+        for row in connection.execute(
+            "SELECT sensor_id FROM rig_sensors WHERE sensor_type = ?", (_CAMERA_SENSOR,)
+        )
+    }
+    unframed = connection.execute(
+        "SELECT image_id, name, camera_id FROM images WHERE image_id NOT IN "
+        "(SELECT data_id FROM frame_data WHERE sensor_type = ?) ORDER BY image_id",
+        (_CAMERA_SENSOR,),
+    ).fetchall()
+    for image_id, name, camera_id in unframed:
+        if camera_id not in rig_of_camera:
+            if camera_id in in_larger_rig:
+                raise DatabaseError(
+                    f"{path}: image {name!r} has no frame, and its camera is one of several in a "
+                    "rig: run COLMAP's rig_configurator on the database first"
+                )
+            rig_of_camera[camera_id] = connection.execute(
+                "INSERT INTO rigs (ref_sensor_id, ref_sensor_type) VALUES (?, ?)",
+                (camera_id, _CAMERA_SENSOR),
+            ).lastrowid
+        frame_id = connection.execute(
+            "INSERT INTO frames (rig_id) VALUES (?)", (rig_of_camera[camera_id],)
+        ).lastrowid
+        connection.execute(
+            "INSERT INTO frame_data (frame_id, data_id, sensor_id, sensor_type) "
+            "VALUES (?, ?, ?, ?)",
+            (frame_id, image_id, camera_id, _CAMERA_SENSOR),
+        )
 
 
 def _has_rows(connection: sqlite3.Connection, table: str) -> bool:
@@ -459,7 +406,7 @@ def _check_nothing_lost(
     connection: sqlite3.Connection, path: Path, name_of_id: dict[int, str]
 ) -> None:
     """Refuse to replace keypoints, or matches that refer to them."""
-    way_out = "use a database without them, such as a new one"
+    way_out = "use a database without them, or on_existing append or replace"
     for (image_id,) in connection.execute("SELECT image_id FROM keypoints WHERE rows > 0"):
         if image_id in name_of_id:
             raise DatabaseError(
@@ -476,18 +423,94 @@ def _check_nothing_lost(
                 )
 
 
-def _insert_keypoints(
-    connection: sqlite3.Connection, image_ids: Sequence[int], keypoints: Sequence[ImageKeypoints]
-) -> None:
-    connection.executemany(
-        "INSERT OR REPLACE INTO keypoints (image_id, rows, cols, data) VALUES (?, ?, 2, ?)",
-        (
-            (image_id, len(k.xy), k.xy.astype("<f4").tobytes())
-            for image_id, k in sorted(
-                zip(image_ids, keypoints, strict=True), key=lambda row: row[0]
+def _clear_images(connection: sqlite3.Connection, image_ids: set[int]) -> None:
+    """Remove all features and matches of some images, and of no others."""
+    for table in ("keypoints", "descriptors"):
+        if columns(connection, table):
+            connection.executemany(
+                f"DELETE FROM {table} WHERE image_id = ?", ((i,) for i in sorted(image_ids))
             )
-        ),
-    )
+    for table in ("matches", "two_view_geometries"):
+        pair_ids = connection.execute(f"SELECT pair_id FROM {table}").fetchall()
+        connection.executemany(
+            f"DELETE FROM {table} WHERE pair_id = ?",
+            (row for row in pair_ids if not image_ids.isdisjoint(image_ids_from_pair_id(row[0]))),
+        )
+
+
+def _append_keypoints(
+    connection: sqlite3.Connection,
+    path: Path,
+    image_ids: Sequence[int],
+    keypoints: Sequence[ImageKeypoints],
+) -> list[int]:
+    """Put keypoints after those that the images have; returns where each image's begin."""
+    firsts = [0] * len(image_ids)
+    all_present = any(len(k.xy) for k in keypoints)
+    for index in np.argsort(np.asarray(image_ids, dtype=np.int64)):
+        image_id, xy = image_ids[index], keypoints[index].xy.astype("<f4")
+        present = _read_present_keypoints(connection, path, image_id)
+        firsts[index] = len(present)
+        all_present &= np.array_equal(present[len(present) - len(xy) :, :2], xy)
+        shapes = np.tile(np.array(_SHAPES[present.shape[1]], dtype="<f4"), (len(xy), 1))
+        data = np.concatenate([present, np.concatenate([xy, shapes], axis=1)])
+        connection.execute(
+            "INSERT OR REPLACE INTO keypoints (image_id, rows, cols, data) VALUES (?, ?, ?, ?)",
+            (image_id, *data.shape, data.tobytes()),
+        )
+        _append_descriptors(connection, image_id, len(present), len(xy))
+    if all_present:
+        raise DatabaseError(
+            f"{path} has these very keypoints already: they were appended before, so there is "
+            "nothing to do; on_existing replace writes them anew"
+        )
+    return firsts
+
+
+def _read_present_keypoints(
+    connection: sqlite3.Connection, path: Path, image_id: int
+) -> NDArray[np.float32]:
+    """An image's keypoints with all their columns; [0, 2] where it has none."""
+    row = connection.execute(
+        "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
+    ).fetchone()
+    if row is None or row[0] == 0:
+        return np.empty((0, 2), dtype="<f4")
+    return _keypoints_from_row(path, image_id, *row)
+
+
+def _keypoints_from_row(
+    path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
+) -> NDArray[np.float32]:
+    if num_cols not in _SHAPES or len(data or b"") != 4 * num_rows * num_cols:
+        raise DatabaseError(
+            f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "
+            f"{num_cols} columns in {len(data or b'')} bytes): restore the file from a copy"
+        )
+    return np.frombuffer(data or b"", dtype="<f4").reshape(num_rows, num_cols)
+
+
+def _append_descriptors(
+    connection: sqlite3.Connection, image_id: int, num_present: int, num_new: int
+) -> None:
+    """Keep an image's descriptors, where it has any, as many as its keypoints.
+
+    COLMAP's guided matching and vocabulary trees refuse other numbers. A zero descriptor lies
+    at a right angle to every other and as near to one other zero descriptor as to the next,
+    so neither the limit of the distance nor that of its ratio lets it match.
+    """
+    if not columns(connection, "descriptors"):
+        return
+    row = connection.execute(
+        "SELECT cols, data FROM descriptors WHERE image_id = ? AND rows = ? AND cols > 0",
+        (image_id, num_present),
+    ).fetchone()
+    if row is not None:
+        num_cols, data = row
+        connection.execute(
+            "UPDATE descriptors SET rows = ?, data = ? WHERE image_id = ?",
+            (num_present + num_new, (data or b"") + bytes(num_new * num_cols), image_id),
+        )
 
 
 def _order_pairs(image_ids: Sequence[int], pairs: NDArray[np.int32]) -> list[tuple[int, int, bool]]:
@@ -505,40 +528,113 @@ def _order_pairs(image_ids: Sequence[int], pairs: NDArray[np.int32]) -> list[tup
     return rows
 
 
-def _insert_pairs(
+def _append_pairs(
     connection: sqlite3.Connection,
+    path: Path,
     order: Sequence[tuple[int, int, bool]],
+    *,
+    shifts: Sequence[NDArray[np.uint32]],
     matches: Sequence[NDArray[np.uint32]],
     geometries: Sequence[TwoViewGeometry],
 ) -> None:
-    connection.executemany(
-        "INSERT OR REPLACE INTO matches (pair_id, rows, cols, data) VALUES (?, ?, 2, ?)",
-        (
-            (pair_id, len(matches[index]), _matches_blob(matches[index], swap))
-            for pair_id, index, swap in order
-        ),
-    )
-    present = _columns(connection, "two_view_geometries")
-    models = [name for name in ("F", "E", "H", "qvec", "tvec") if name in present]
-    columns = ["pair_id", "rows", "cols", "data", "config", *models]
+    """Write pairs; those that have rows get the new matches and inliers after their own.
 
-    def row(pair_id: int, geometry: TwoViewGeometry, swap: bool) -> tuple[Any, ...]:
-        inliers = _matches_blob(geometry.inlier_matches, swap)
-        if swap:
-            geometry = _swap_images(geometry)
+    Args:
+        connection: the database.
+        path: its path, for messages.
+        order: the pairs' ids and indices, see `_order_pairs`.
+        shifts: for each pair, uint32 [2] number of its images' first new keypoints.
+        matches: for each pair, uint32 [n, 2] matches, counted from these.
+        geometries: for each pair, its geometry, likewise.
+    """
+    present = {
+        row[0]
+        for row in connection.execute(
+            "SELECT pair_id FROM matches WHERE rows > 0 "
+            "UNION SELECT pair_id FROM two_view_geometries WHERE rows > 0"
+        )
+    }
+    there = columns(connection, "two_view_geometries")
+    models = [name for name in ("F", "E", "H", "qvec", "tvec") if name in there]
+    names = ["pair_id", "rows", "cols", "data", "config", *models]
+    insert_geometry = (
+        f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(names)}) "
+        f"VALUES ({', '.join('?' * len(names))})"
+    )
+    for pair_id, index, swap in order:
+        geometry = _swap_images(geometries[index]) if swap else geometries[index]
+        pair_matches = _swapped(matches[index] + shifts[index], swap)
+        inliers = _swapped(geometry.inlier_matches + shifts[index], swap)
+        if geometry.config == TwoViewConfig.DEGENERATE:
+            inliers = inliers[:0]
+        keeps_models = False
+        if pair_id in present:
+            their_matches, their_inliers, their_support = _read_pair(connection, path, pair_id)
+            pair_matches = np.concatenate([their_matches, pair_matches])
+            keeps_models = len(their_inliers) > 0 and their_support >= len(inliers)
+            inliers = np.concatenate([their_inliers, inliers])
+        connection.execute(
+            "INSERT OR REPLACE INTO matches (pair_id, rows, cols, data) VALUES (?, ?, 2, ?)",
+            (pair_id, len(pair_matches), pair_matches.astype("<u4").tobytes()),
+        )
+        if keeps_models:
+            connection.execute(
+                "UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?",
+                (len(inliers), inliers.astype("<u4").tobytes(), pair_id),
+            )
+            continue
         blobs = (_float_blob(getattr(geometry, name)) for name in models)
-        num_inliers = len(geometry.inlier_matches)
-        return (pair_id, num_inliers, 2, inliers, int(geometry.config), *blobs)
+        connection.execute(
+            insert_geometry,
+            (
+                pair_id,
+                len(inliers),
+                2,
+                inliers.astype("<u4").tobytes(),
+                int(geometry.config),
+                *blobs,
+            ),
+        )
 
-    connection.executemany(
-        f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(columns)}) "
-        f"VALUES ({', '.join('?' * len(columns))})",
-        (row(pair_id, geometries[index], swap) for pair_id, index, swap in order),
-    )
+
+def _read_pair(
+    connection: sqlite3.Connection, path: Path, pair_id: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32], int]:
+    """A pair's matches, its inliers, and how many inliers support its models.
+
+    A geometry that was never estimated, as importers write it, and one of several models are
+    supported by nothing. Inliers of a degenerate geometry or a watermark are none.
+    """
+    row = connection.execute(
+        "SELECT rows, data FROM matches WHERE pair_id = ?", (pair_id,)
+    ).fetchone()
+    matches = _matches_from_row(path, pair_id, *(row or (0, None)))
+    row = connection.execute(
+        "SELECT rows, data, config FROM two_view_geometries WHERE pair_id = ?", (pair_id,)
+    ).fetchone()
+    num_rows, data, config = row or (0, None, _UNDEFINED)
+    inliers = _matches_from_row(path, pair_id, num_rows, data)
+    if len(matches) == 0:
+        matches = inliers
+    if config in (TwoViewConfig.DEGENERATE, _WATERMARK):
+        inliers = inliers[:0]
+    return matches, inliers, 0 if config in (_UNDEFINED, _MULTIPLE) else len(inliers)
 
 
-def _matches_blob(matches: NDArray[np.uint32], swap: bool) -> bytes:
-    return np.asarray(matches[:, ::-1] if swap else matches, dtype="<u4").tobytes()
+def _matches_from_row(
+    path: Path, pair_id: int, num_rows: int, data: bytes | None
+) -> NDArray[np.uint32]:
+    if len(data or b"") != 8 * num_rows:
+        i, j = image_ids_from_pair_id(pair_id)
+        raise DatabaseError(
+            f"{path}: the matches of images {i} and {j} are damaged ({num_rows} rows in "
+            f"{len(data or b'')} bytes): restore the file from a copy"
+        )
+    return np.frombuffer(data or b"", dtype="<u4").reshape(num_rows, 2)
+
+
+def _swapped(matches: NDArray[np.uint32], swap: bool) -> NDArray[np.uint32]:
+    return matches[:, ::-1] if swap else matches
 
 
 def _float_blob(values: NDArray[np.float64] | None) -> bytes | None:

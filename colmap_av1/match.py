@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from colmap_av1.images import (
     write_images,
 )
 from colmap_av1.motion import FrameMotion, read_motion
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import MatchOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import Tracks, build_tracks
@@ -207,8 +207,8 @@ def match(
         VideoError: the video cannot be read, or has no motion to match.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images or names do not fit the video.
-        DatabaseError: the database is locked, no COLMAP database, not empty, or does not
-            fit the video.
+        DatabaseError: the database is locked, no COLMAP database, has features of its
+            images and must not (`options.on_existing`), or does not fit the video.
         OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else MatchOptions()
@@ -220,7 +220,7 @@ def match(
     # What can be refused is refused before the long work.
     source = open_source(video)
     stream_size = (source.width, source.height)
-    listed = _read_listed_images(database)
+    listed = _read_listed_images(database, options)
     check_options(options, stream_size)
     if listed:
         _check_listed_sizes(listed, stream_size, source, options)
@@ -265,6 +265,7 @@ def match(
             pairs=matched.pairs,
             matches=matched.matches,
             geometries=matched.geometries,
+            on_existing=options.on_existing,
         )
     lengths = np.diff(tracks.offsets)
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
@@ -417,6 +418,9 @@ def check_options(options: MatchOptions, size: tuple[int, int]) -> None:
     """
     if options.image_step < 1:
         raise OptionError(f"image_step is {options.image_step}: give 1 or more")
+    kinds = get_args(OnExisting)
+    if options.on_existing not in kinds:
+        raise OptionError(f"on_existing is {options.on_existing!r}: give {', '.join(kinds)}")
     image_names(options.image_name, ())
     camera = make_camera(options.camera, *size)
     schedule_pairs((), options.pairs)
@@ -432,14 +436,14 @@ def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
     return bool(along_axis) and float(np.median(along_axis)) >= _INIT_MAX_FORWARD_MOTION
 
 
-def _read_listed_images(database: Path) -> list[DatabaseImage]:
+def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseImage]:
     """The images of the database, after a look at whether it can be written."""
     listed = read_images(database)
     filled = next((i for i in listed if i.num_keypoints or i.num_matches), None)
-    if filled is not None:
+    if filled is not None and options.on_existing == "error":
         raise DatabaseError(
             f"{database}: image '{filled.name}' already has {filled.num_keypoints} keypoints and "
-            f"{filled.num_matches} matches: use a new database, or one that only lists images"
+            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
         )
     if database.exists() and database.stat().st_size:
         # Nothing is written, but the write lock is taken.

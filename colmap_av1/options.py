@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+OnExisting = Literal["error", "append", "replace"]
+
 
 @dataclass(frozen=True)
 class ReadOptions:
@@ -133,6 +135,9 @@ class MatchOptions:
     # number in a listed image's name of the video's first frame; None: only where the
     # names and their count leave no doubt which frame an image is
     first_number: int | None = None
+    # what becomes of keypoints and matches that listed images have already: 'error': refuse
+    # the database; 'append': keep them, add the new ones after them; 'replace': remove them
+    on_existing: OnExisting = "error"
 
 
 @dataclass(frozen=True)

@@ -414,7 +414,7 @@ def test_absent_and_empty_files_list_nothing(tmp_path: Path) -> None:
 
 
 def test_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("colmap_av1.database._BUSY_TIMEOUT", 0.2)
+    monkeypatch.setattr("colmap_av1.database_file._BUSY_TIMEOUT", 0.2)
     path = tmp_path / "locked.db"
     make_empty(path)
     before = dump(path)
@@ -464,7 +464,7 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
         import sys, time
         sys.path.insert(0, sys.argv[2])
         import numpy as np
-        import colmap_av1.database as database
+        from colmap_av1 import database, database_file
         from test_database import CAMERA, NAMES, ROWS
 
         class Waiting(list):
@@ -475,12 +475,12 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
                 return super().__getitem__(index)
 
         # A small cache makes SQLite write pages of the open transaction to the disk.
-        connect = database.sqlite3.connect
+        connect = database_file.sqlite3.connect
         def connect_small(*args, **kwargs):
             connection = connect(*args, **kwargs)
             connection.execute("PRAGMA cache_size = 5")
             return connection
-        database.sqlite3.connect = connect_small
+        database_file.sqlite3.connect = connect_small
         rows = {**ROWS, "geometries": Waiting(ROWS["geometries"])}
         database.write_matches(sys.argv[1], NAMES, CAMERA, **rows)
     """

@@ -21,7 +21,14 @@ from colmap_av1.errors import (
 )
 from colmap_av1.images import image_names, write_images
 from colmap_av1.match import match
-from colmap_av1.options import CameraOptions, MatchOptions, PairOptions, ReadOptions, VerifyOptions
+from colmap_av1.options import (
+    CameraOptions,
+    MatchOptions,
+    PairOptions,
+    ReadOptions,
+    TrackOptions,
+    VerifyOptions,
+)
 
 
 def tables(database: Path) -> dict[str, list[tuple]]:
@@ -179,6 +186,28 @@ def test_locked_database(clip: Path, tmp_path: Path) -> None:
     match(tmp_path / "a.db", clip)
     with pytest.raises(DatabaseError, match="already has"):
         match(tmp_path / "a.db", clip)
+
+
+def test_matches_of_listed_images_are_added_to_or_replaced(clip: Path, tmp_path: Path) -> None:
+    database = tmp_path / "a.db"
+    match(database, clip)
+    first = tables(database)
+    before = database.read_bytes()
+    with pytest.raises(DatabaseError, match="--on_existing append adds to them, replace removes"):
+        match(database, clip)
+    with pytest.raises(OptionError, match="give error, append, replace"):
+        match(database, clip, options=MatchOptions(on_existing="keep"))
+    with pytest.raises(DatabaseError, match="these very keypoints already"):
+        match(database, clip, options=MatchOptions(on_existing="append"))
+    assert database.read_bytes() == before
+    longer = TrackOptions(min_length=6)
+    match(database, clip, options=MatchOptions(on_existing="append", tracks=longer))
+    both = tables(database)
+    for old, new in zip(first["keypoints"], both["keypoints"], strict=True):
+        assert new[1] > old[1]
+        assert new[3].startswith(old[3])
+    match(database, clip, options=MatchOptions(on_existing="replace"))
+    assert tables(database) == first
 
 
 def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path) -> None:
