@@ -1,0 +1,98 @@
+"""Distances between point clouds, after the similarity that brings their cameras together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+
+@dataclass(frozen=True)
+class CloudDistances:
+    """Distances between two point clouds, in the reference's unit.
+
+    Attributes:
+        accuracy: mean distance from a point of the cloud to the nearest of the reference.
+        completeness: mean distance from a point of the reference to the nearest of the cloud.
+        hausdorff: the largest of all these distances; one stray point decides it.
+        robust_hausdorff: the larger of the two 95 % quantiles.
+        extent: diagonal of the box that holds the middle 90 % of the reference on each axis.
+    """
+
+    accuracy: float
+    completeness: float
+    hausdorff: float
+    robust_hausdorff: float
+    extent: float
+
+    @property
+    def chamfer(self) -> float:
+        """Chamfer distance: the mean of `accuracy` and `completeness`."""
+        return (self.accuracy + self.completeness) / 2
+
+
+def cloud_distances(
+    points: NDArray[np.float64], reference: NDArray[np.float64]
+) -> CloudDistances | None:
+    """Compare two clouds in the same coordinates.
+
+    Args:
+        points: float64 [n, 3].
+        reference: float64 [m, 3], such as the cloud of a trusted front-end.
+
+    Returns:
+        The distances; None where a cloud is empty.
+    """
+    if len(points) == 0 or len(reference) == 0:
+        return None
+    to_reference, _ = KDTree(reference).query(points)
+    to_points, _ = KDTree(points).query(reference)
+    middle = np.quantile(reference, [0.05, 0.95], axis=0)
+    return CloudDistances(
+        accuracy=float(to_reference.mean()),
+        completeness=float(to_points.mean()),
+        hausdorff=float(max(to_reference.max(), to_points.max())),
+        robust_hausdorff=float(max(np.quantile(to_reference, 0.95), np.quantile(to_points, 0.95))),
+        extent=float(np.linalg.norm(middle[1] - middle[0])),
+    )
+
+
+def aligned_points(model: Any, reference: Any) -> NDArray[np.float64] | None:
+    """Points of a model, moved by the similarity that fits its camera centres to another's.
+
+    Args:
+        model: pycolmap.Reconstruction.
+        reference: the other; images with the same name are the same.
+
+    Returns:
+        float64 [n, 3] in the reference's coordinates; None where fewer than three images are
+        in both, or where their centres determine no similarity.
+    """
+    centres, wanted = _centres(model), _centres(reference)
+    shared = sorted(centres.keys() & wanted.keys())
+    if len(shared) < 3:
+        return None
+    similarity = pycolmap.estimate_sim3d(
+        np.array([centres[name] for name in shared]), np.array([wanted[name] for name in shared])
+    )
+    if similarity is None:
+        return None
+    turn = np.asarray(similarity.rotation.matrix())
+    return np.asarray(
+        similarity.scale * model_points(model) @ turn.T + np.asarray(similarity.translation)
+    )
+
+
+def model_points(model: Any) -> NDArray[np.float64]:
+    """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
+    points = [model.points3D[i].xyz for i in sorted(model.points3D)]
+    return np.array(points, dtype=np.float64).reshape(-1, 3)
+
+
+def _centres(model: Any) -> dict[str, NDArray[np.float64]]:
+    images = (model.images[i] for i in model.reg_image_ids())
+    return {image.name: np.asarray(image.projection_center()) for image in images}

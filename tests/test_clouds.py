@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_av1.evaluate.clouds import aligned_points, cloud_distances, model_points
+
+
+def test_distances_of_known_clouds() -> None:
+    reference = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    points = np.array([[0.0, 0.1, 0], [1, 0.3, 0]])
+    distances = cloud_distances(points, reference)
+    assert distances is not None
+    assert distances.accuracy == pytest.approx(0.2)
+    far = [0.1, 0.3, np.hypot(1, 0.3), np.hypot(2, 0.3)]
+    assert distances.completeness == pytest.approx(np.mean(far))
+    assert distances.chamfer == pytest.approx((0.2 + np.mean(far)) / 2)
+    assert distances.hausdorff == pytest.approx(far[-1])
+    assert distances.robust_hausdorff < distances.hausdorff
+    assert distances.extent == pytest.approx(0.9 * 3)
+
+
+def test_one_stray_point_moves_the_hausdorff_distance_alone() -> None:
+    cloud = np.random.default_rng(0).random((2000, 3))
+    stray = np.concatenate([cloud, [[50.0, 0, 0]]])
+    distances = cloud_distances(stray, cloud)
+    assert distances is not None
+    assert distances.hausdorff > 49
+    assert distances.robust_hausdorff == 0
+    assert distances.completeness == 0
+
+
+def test_empty_clouds_have_no_distance() -> None:
+    assert cloud_distances(np.empty((0, 3)), np.ones((1, 3))) is None
+
+
+def test_models_are_aligned_by_their_cameras() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 8, 100
+    model = pycolmap.synthesize_dataset(options)
+    moved = copy.deepcopy(model)
+    turn = pycolmap.Rotation3d(np.array([0.1, -0.3, 0.2, 0.9]) / np.sqrt(0.95))
+    moved.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -1, 7])))
+    assert np.abs(model_points(moved) - model_points(model)).max() > 1
+    aligned = aligned_points(moved, model)
+    assert aligned is not None
+    np.testing.assert_allclose(aligned, model_points(model), atol=1e-6)
+    assert aligned_points(moved, pycolmap.Reconstruction()) is None
