@@ -17,9 +17,11 @@ from colmap_av1.match import MatchReport, match
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import (
     CameraOptions,
+    DensityOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
+    RefineOptions,
     TrackOptions,
     VerifyOptions,
 )
@@ -30,6 +32,7 @@ __all__ = [
     "CameraOptions",
     "ColmapAv1Error",
     "DatabaseError",
+    "DensityOptions",
     "FrameMotion",
     "ImageError",
     "LimitError",
@@ -40,6 +43,7 @@ __all__ = [
     "OptionError",
     "PairOptions",
     "ReadOptions",
+    "RefineOptions",
     "StreamReport",
     "TrackOptions",
     "Tracks",

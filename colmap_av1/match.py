@@ -20,7 +20,8 @@ from colmap_av1.database import (
     read_images,
     write_matches,
 )
-from colmap_av1.errors import DatabaseError, ImageError, OptionError, VideoError
+from colmap_av1.density import keep_observations, select_tracks
+from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
 from colmap_av1.images import (
     are_named_by,
     check_image_folder,
@@ -33,9 +34,10 @@ from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import MatchOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
+from colmap_av1.refine import refine_tracks
 from colmap_av1.tracks import Tracks, build_tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
-from colmap_av1.video import display_rotation, open_stream
+from colmap_av1.video import decode_frames, display_rotation, open_stream
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 # The mapper's default limit for the translation along the axis of a first pair.
@@ -240,6 +242,9 @@ def match(
         if folder is not None:
             check_image_folder(folder, chosen.names, size)
 
+    with clock.measure("pairs"):
+        seen = np.isin(tracks.frame, chosen.frames)
+        tracks = select_tracks(keep_observations(tracks, seen), options.density)
     cameras, new_cameras = _cameras(database, listed, chosen.names, size, options)
     matched = match_images(video, tracks, chosen, cameras, options, clock=clock, progress=progress)
 
@@ -311,14 +316,15 @@ def track_video(
     clock: Clock,
     progress: Progress,
 ) -> TrackedVideo:
-    """Chain the motion of a video into tracks, as it is read: no frame's motion is kept.
+    """Chain the motion of a video into tracks as it is read, and refine them.
 
     Args:
         source: the video.
-        options: those of reading and chaining are used.
-        one_size: refuse shown frames of several sizes.
-        clock: gets the stages "motion" and "tracks".
-        progress: told about the stage "motion".
+        options: those of reading, chaining and refinement are used.
+        one_size: refuse shown frames of several sizes, as refinement does.
+        clock: gets the stages "motion" and "tracks", with refinement "decoding" and
+            "refinement".
+        progress: told about the stages "motion" and "refinement".
 
     Raises:
         VideoError: the video shows no frame.
@@ -326,7 +332,7 @@ def track_video(
         ImageError: the frames change their size and must not.
     """
     motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
-    if one_size:
+    if one_size or options.refine.refine != "none":
         motion = _of_one_size(motion)
     num_coded_frames = 0
 
@@ -335,11 +341,24 @@ def track_video(
         num_coded_frames = done
         progress("motion", done, source.num_packets)
 
-    with warnings.catch_warnings(record=True) as caught, clock.measure("tracks"):
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tracks = build_tracks(clock.iterate("motion", motion), options.tracks, count)
-    # Reading happened inside the chaining.
-    clock.seconds["tracks"] -= clock.seconds["motion"]
+        with clock.measure("tracks"):
+            tracks = build_tracks(clock.iterate("motion", motion), options.tracks, count)
+        # Reading happened inside the chaining.
+        clock.seconds["tracks"] -= clock.seconds["motion"]
+        if options.refine.refine != "none":
+            with clock.measure("refinement"):
+                pictures = clock.iterate(
+                    "decoding", _decodable_frames(source.pictures, tracks.num_frames, options)
+                )
+                tracks = refine_tracks(
+                    tracks,
+                    pictures,
+                    options.refine,
+                    lambda done: progress("refinement", done, tracks.num_frames),
+                )
+            clock.seconds["refinement"] -= clock.seconds["decoding"]
     return TrackedVideo(tracks, num_coded_frames, tuple(str(w.message) for w in caught))
 
 
@@ -423,6 +442,12 @@ def check_options(options: MatchOptions, size: tuple[int, int]) -> None:
         raise OptionError(f"on_existing is {options.on_existing!r}: give {', '.join(kinds)}")
     image_names(options.image_name, ())
     camera = make_camera(options.camera, *size)
+    no_tracks = Tracks(
+        *(0, 0, 0, np.zeros(1, np.int64), np.empty(0, np.int32)),
+        *(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty(0, np.bool_)),
+    )
+    refine_tracks(no_tracks, (), options.refine)
+    select_tracks(no_tracks, options.density)
     schedule_pairs((), options.pairs)
     verify_pairs((), _NO_PAIRS, (), camera, options=options.verify)
 
@@ -476,9 +501,33 @@ def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
                 raise ImageError(
                     f"the video changes its size from {size[0]}x{size[1]} to "
                     f"{frame.width}x{frame.height}, so its frames cannot be images of one camera: "
-                    "leave out the image folder, or re-encode the video at one size"
+                    "leave out the image folder and --refine, or re-encode the video at one size"
                 )
         yield frame
+
+
+def _decodable_frames(
+    video: Path, num_frames: int, options: MatchOptions
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """The pictures of the frames that have tracks; those before a damage, with a warning."""
+    decoded = decode_frames(
+        video,
+        operating_point=options.read.operating_point,
+        num_threads=options.verify.num_threads,
+    )
+    count = 0
+    try:
+        for index, image in decoded:
+            if index >= num_frames:
+                return
+            yield index, image
+            count += 1
+    except BitstreamError as error:
+        if options.read.strict:
+            raise
+        warnings.warn(f"{error}; tracks are refined in {count} frames only", stacklevel=2)
+    finally:
+        decoded.close()
 
 
 def _cameras(

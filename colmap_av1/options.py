@@ -52,6 +52,20 @@ class TrackOptions:
 
 
 @dataclass(frozen=True)
+class RefineOptions:
+    """How track positions are corrected on decoded pictures."""
+
+    # 'lk': correct positions by Lucas-Kanade on the decoded pictures; 'none': decode nothing
+    refine: Literal["none", "lk"] = "none"
+    # width in pixels of the window that is matched, odd
+    refine_window: int = 9
+    # pixels along either axis by which a position may be corrected
+    refine_move: float = 1.5
+    # mean difference of two windows that match, as a share of their contrast
+    refine_difference: float = 0.25
+
+
+@dataclass(frozen=True)
 class DensityOptions:
     """How many of the tracks are used; options that are None are set by the preset."""
 
@@ -125,6 +139,8 @@ class MatchOptions:
 
     read: ReadOptions = ReadOptions()
     tracks: TrackOptions = TrackOptions()
+    refine: RefineOptions = RefineOptions()
+    density: DensityOptions = DensityOptions()
     pairs: PairOptions = PairOptions()
     verify: VerifyOptions = VerifyOptions()
     camera: CameraOptions = CameraOptions()

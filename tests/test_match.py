@@ -3,6 +3,7 @@ from __future__ import annotations
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -23,12 +24,16 @@ from colmap_av1.images import image_names, write_images
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
+    DensityOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
+    RefineOptions,
     TrackOptions,
     VerifyOptions,
 )
+
+LK = MatchOptions(refine=RefineOptions(refine="lk"))
 
 
 def tables(database: Path) -> dict[str, list[tuple]]:
@@ -69,13 +74,17 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
     assert report.warnings == ()
 
 
-def test_same_input_gives_the_same_bytes(clip: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("refine", ["none", "lk"])
+def test_same_input_gives_the_same_bytes(
+    clip: Path, tmp_path: Path, refine: Literal["none", "lk"]
+) -> None:
     for name, threads in (("a", 1), ("b", 2)):
-        match(
-            tmp_path / f"{name}.db",
-            clip,
-            options=MatchOptions(verify=VerifyOptions(num_threads=threads)),
+        options = MatchOptions(
+            refine=RefineOptions(refine=refine),
+            density=DensityOptions(preset="default"),
+            verify=VerifyOptions(num_threads=threads),
         )
+        match(tmp_path / f"{name}.db", clip, options=options)
     assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
@@ -133,6 +142,8 @@ def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
         (MatchOptions(image_step=0), OptionError),
         (MatchOptions(image_name="x.png"), OptionError),
         (MatchOptions(camera=CameraOptions(camera_model="NONE")), OptionError),
+        (MatchOptions(refine=RefineOptions(refine_window=4)), OptionError),
+        (MatchOptions(density=DensityOptions(spacing=-1)), OptionError),
         (MatchOptions(pairs=PairOptions(offsets=())), OptionError),
         (MatchOptions(verify=VerifyOptions(max_error=0)), OptionError),
         (MatchOptions(pairs=PairOptions(min_matches=10**6)), VideoError),
@@ -167,6 +178,10 @@ def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     (warning,) = report.warnings
     assert "cut off" in warning
     assert f"the {report.num_frames} frames before" in warning
+    refined = match(tmp_path / "b.db", cut, options=LK)
+    assert refined.num_frames == report.num_frames
+    assert refined.num_observations == report.num_observations
+    assert "refined" not in refined.warnings[0]
 
 
 def test_locked_database(clip: Path, tmp_path: Path) -> None:
@@ -231,6 +246,28 @@ def test_video_that_changes_its_size(encode: Encode, tmp_path: Path) -> None:
     assert not (tmp_path / "frames").exists()
     assert not (tmp_path / "a.db").exists()
     assert match(tmp_path / "a.db", both).num_images == 16
+    with pytest.raises(ImageError, match="from 192x128 to 128x128"):
+        match(tmp_path / "b.db", both, options=LK)
+
+
+def test_refined_and_thinned_tracks(clip: Path, tmp_path: Path) -> None:
+    plain = match(tmp_path / "a.db", clip)
+    options = replace(LK, density=DensityOptions(max_tracks_per_image=100))
+    report = match(tmp_path / "b.db", clip, options=options)
+    assert list(report.seconds)[:5] == ["motion", "tracks", "decoding", "refinement", "pairs"]
+    counts = [row[1] for row in tables(tmp_path / "b.db")["keypoints"]]
+    assert max(counts) == 100
+    assert report.num_tracks < plain.num_tracks / 2
+    assert report.num_inliers / report.num_matches > 0.98
+
+
+def test_density_counts_images_not_frames(clip: Path, tmp_path: Path) -> None:
+    options = MatchOptions(density=DensityOptions(min_length=3), image_step=4)
+    match(tmp_path / "a.db", clip, options=options)
+    keypoints = [row[1] for row in tables(tmp_path / "a.db")["keypoints"]]
+    match(tmp_path / "b.db", clip, options=MatchOptions(image_step=4))
+    all_keypoints = [row[1] for row in tables(tmp_path / "b.db")["keypoints"]]
+    assert sum(keypoints) < sum(all_keypoints)
 
 
 def test_images_that_do_not_fit_the_video(clip: Path, tmp_path: Path) -> None:
