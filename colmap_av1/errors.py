@@ -42,3 +42,7 @@ class ModelError(ColmapAv1Error):
 
 class OptionError(ColmapAv1Error):
     """An option has a value that cannot work."""
+
+
+class EvaluationError(ColmapAv1Error):
+    """A front-end or a mapper that is compared failed; the message says where its log is."""

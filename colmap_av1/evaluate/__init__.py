@@ -1,19 +1,51 @@
 """What tracks, models and front-ends are worth: one module for each family of metrics."""
 
+from colmap_av1.evaluate.database_tracks import database_tracks
+from colmap_av1.evaluate.frontends import (
+    FRONTENDS,
+    Footage,
+    Frontend,
+    FrontendRun,
+    prepare_footage,
+    run_frontend,
+)
+from colmap_av1.evaluate.mapping import (
+    MapperRun,
+    MapperSettings,
+    ModelFigures,
+    map_database,
+    model_figures,
+)
+from colmap_av1.evaluate.measure import Measured, run_measured
 from colmap_av1.evaluate.poses import PoseErrors, model_poses, pose_errors
 from colmap_av1.evaluate.sequence import Sequence, read_sequence
-from colmap_av1.evaluate.track_errors import epipolar_errors, exact_errors, pairs_at_span
+from colmap_av1.evaluate.track_errors import SPANS, epipolar_errors, exact_errors, pairs_at_span
 from colmap_av1.evaluate.track_statistics import TrackStatistics, track_statistics
 
 __all__ = [
+    "FRONTENDS",
+    "SPANS",
+    "Footage",
+    "Frontend",
+    "FrontendRun",
+    "MapperRun",
+    "MapperSettings",
+    "Measured",
+    "ModelFigures",
     "PoseErrors",
     "Sequence",
     "TrackStatistics",
+    "database_tracks",
     "epipolar_errors",
     "exact_errors",
+    "map_database",
+    "model_figures",
     "model_poses",
     "pairs_at_span",
     "pose_errors",
+    "prepare_footage",
     "read_sequence",
+    "run_frontend",
+    "run_measured",
     "track_statistics",
 ]

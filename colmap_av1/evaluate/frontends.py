@@ -1,0 +1,174 @@
+"""Front-ends that fill a COLMAP database, behind one interface: images or video in, rows out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+
+from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.evaluate.measure import run_measured
+from colmap_av1.evaluate.resume import content_of, kept, own_code
+from colmap_av1.images import image_names, write_images
+from colmap_av1.match import match
+from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.progress import Clock
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What every front-end is given.
+
+    Attributes:
+        video: an AV1 video.
+        image_path: folder that holds the images.
+        frames: the video's frames that are images, every `image_step`-th.
+        image_step: distance between the frames that are images.
+        camera: the camera of all images.
+    """
+
+    video: Path
+    image_path: Path
+    frames: tuple[int, ...]
+    image_step: int
+    camera: CameraOptions
+
+    @property
+    def names(self) -> list[str]:
+        """The images' file names, in display order."""
+        return image_names(MatchOptions().image_name, self.frames)
+
+
+@dataclass(frozen=True)
+class FrontendRun:
+    """A database and what it took to fill it.
+
+    Attributes:
+        name: the front-end.
+        database: the COLMAP database.
+        seconds: wall time of each stage.
+        cpu_seconds: CPU time of all stages together.
+        peak_memory: largest resident memory in bytes; None where the system does not tell.
+    """
+
+    name: str
+    database: Path
+    seconds: dict[str, float]
+    cpu_seconds: float
+    peak_memory: int | None
+
+
+@dataclass(frozen=True)
+class Frontend:
+    """One way to fill a database.
+
+    Attributes:
+        run: fills the given database, which does not exist yet, from the footage, and returns
+            the wall time of each stage. Called in a process of its own.
+        depends_on: what a result depends on beside footage and name.
+    """
+
+    run: Callable[[Footage, Path], dict[str, float]]
+    depends_on: Callable[[], tuple[str, ...]]
+
+
+def prepare_footage(
+    video: Path, image_path: Path, *, num_frames: int, image_step: int, camera: CameraOptions
+) -> Footage:
+    """Write the video's frames as the images that every front-end gets.
+
+    Images that are there already are kept.
+
+    Raises:
+        VideoError: the video cannot be read.
+        ImageError: the folder holds other images.
+    """
+    frames = tuple(range(0, num_frames, image_step))
+    footage = Footage(video, image_path, frames, image_step, camera)
+    image_path.mkdir(parents=True, exist_ok=True)
+    write_images(video, image_path, footage.names, frames)
+    return footage
+
+
+def run_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
+    """Fill a database and measure what it takes; a finished run is not repeated.
+
+    Args:
+        name: one of FRONTENDS.
+        footage: video and images.
+        folder: gets `database.db`, `log.txt` and the figures.
+
+    Raises:
+        OptionError: there is no such front-end.
+        ColmapAv1Error: the front-end refuses the footage.
+        EvaluationError: it failed.
+    """
+    if name not in FRONTENDS:
+        raise OptionError(f"front-end '{name}': give one of {', '.join(FRONTENDS)}")
+    frontend = FRONTENDS[name]
+    database = folder / "database.db"
+
+    def work() -> dict[str, Any]:
+        measured = run_measured(frontend.run, footage, database, log=folder / "log.txt")
+        return {
+            "seconds": measured.result,
+            "cpu_seconds": measured.cpu_seconds,
+            "peak_memory": measured.peak_memory,
+        }
+
+    given = (content_of(footage.video), footage.frames, footage.camera)
+    result = kept(folder, (name, *given, *frontend.depends_on()), work)
+    if not database.is_file():
+        raise EvaluationError(f"{folder}: its database is gone: remove the folder, run again")
+    return FrontendRun(name, database, **result)
+
+
+def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
+    options = replace(options, camera=footage.camera, image_step=footage.image_step)
+    return match(database, footage.video, options=options).seconds
+
+
+def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> dict[str, float]:
+    clock = Clock()
+    pycolmap.set_random_seed(0)
+    reader = pycolmap.ImageReaderOptions(camera_model=footage.camera.camera_model)
+    reader.camera_params = footage.camera.camera_params or ""
+    with clock.measure("extraction"):
+        pycolmap.extract_features(
+            database,
+            footage.image_path,
+            image_names=footage.names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+        )
+    with clock.measure("matching"):
+        pairing(database)
+    return clock.seconds
+
+
+def _own_frontend(options: MatchOptions) -> Frontend:
+    return Frontend(partial(_match, options), lambda: (repr(options), own_code()))
+
+
+def _sift_frontend(pairing: Callable[[Path], None]) -> Frontend:
+    return Frontend(partial(_sift, pairing), lambda: (pycolmap.__version__,))
+
+
+def _pair_sequentially(database: Path) -> None:
+    pycolmap.match_sequential(database)
+
+
+def _pair_exhaustively(database: Path) -> None:
+    pycolmap.match_exhaustive(database)
+
+
+FRONTENDS: dict[str, Frontend] = {
+    "av1": _own_frontend(MatchOptions()),
+    "sift-sequential": _sift_frontend(_pair_sequentially),
+    "sift-exhaustive": _sift_frontend(_pair_exhaustively),
+}
