@@ -78,20 +78,30 @@ class Frontend:
 
 
 def prepare_footage(
-    video: Path, image_path: Path, *, num_frames: int, image_step: int, camera: CameraOptions
+    video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
 ) -> Footage:
     """Write the video's frames as the images that every front-end gets.
 
-    Images that are there already are kept.
+    Args:
+        video: an AV1 video.
+        folder: gets `images/`; what is there of the same video is kept.
+        num_frames: number of frames of the video.
+        image_step: distance between the frames that are images.
+        camera: the camera of all images.
 
     Raises:
         VideoError: the video cannot be read.
-        ImageError: the folder holds other images.
+        ImageError: the video has fewer frames.
     """
     frames = tuple(range(0, num_frames, image_step))
-    footage = Footage(video, image_path, frames, image_step, camera)
-    image_path.mkdir(parents=True, exist_ok=True)
-    write_images(video, image_path, footage.names, frames)
+    footage = Footage(video, folder / "images", frames, image_step, camera)
+
+    def work() -> dict[str, Any]:
+        footage.image_path.mkdir()
+        write_images(video, footage.image_path, footage.names, frames)
+        return {}
+
+    kept(folder, (content_of(video), frames), work)
     return footage
 
 
@@ -138,14 +148,14 @@ def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> 
     pycolmap.set_random_seed(0)
     reader = pycolmap.ImageReaderOptions(camera_model=footage.camera.camera_model)
     reader.camera_params = footage.camera.camera_params or ""
+    pycolmap.Database.open(database).close()
+    # Threads of the extraction would number the images in the order in which they finish.
+    mode = pycolmap.CameraMode.SINGLE
+    pycolmap.import_images(
+        database, footage.image_path, mode, image_names=footage.names, options=reader
+    )
     with clock.measure("extraction"):
-        pycolmap.extract_features(
-            database,
-            footage.image_path,
-            image_names=footage.names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-        )
+        pycolmap.extract_features(database, footage.image_path, footage.names)
     with clock.measure("matching"):
         pairing(database)
     return clock.seconds

@@ -174,7 +174,7 @@ def measure_case(
         intrinsics = CameraOptions(camera_model=camera.model.name, camera_params=params)
     footage = prepare_footage(
         material.video,
-        folder / "images",
+        folder / "footage",
         num_frames=material.num_frames,
         image_step=case.image_step,
         camera=intrinsics,
