@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -16,8 +16,10 @@ from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.images import image_names, write_images
 from colmap_av1.match import match
-from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, RefineOptions
 from colmap_av1.progress import Clock
+
+Preset = Literal["sparse", "default", "dense"]
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,10 @@ def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> 
     return clock.seconds
 
 
-def _own_frontend(options: MatchOptions) -> Frontend:
+def _own_frontend(refine: Literal["none", "lk"], preset: Preset) -> Frontend:
+    options = MatchOptions(
+        refine=RefineOptions(refine=refine), density=DensityOptions(preset=preset)
+    )
     return Frontend(partial(_match, options), lambda: (repr(options), own_code()))
 
 
@@ -178,7 +183,13 @@ def _pair_exhaustively(database: Path) -> None:
 
 
 FRONTENDS: dict[str, Frontend] = {
-    "av1": _own_frontend(MatchOptions()),
+    # What a mapper gets from the bitstream alone; with `-refined` after a look at the pictures.
+    "av1": _own_frontend("none", "default"),
+    "av1-sparse": _own_frontend("none", "sparse"),
+    "av1-dense": _own_frontend("none", "dense"),
+    "av1-refined": _own_frontend("lk", "default"),
+    "av1-refined-sparse": _own_frontend("lk", "sparse"),
+    "av1-refined-dense": _own_frontend("lk", "dense"),
     "sift-sequential": _sift_frontend(_pair_sequentially),
     "sift-exhaustive": _sift_frontend(_pair_exhaustively),
 }

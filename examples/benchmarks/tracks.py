@@ -128,9 +128,21 @@ def main() -> int:
     parser.add_argument(
         "--cache", type=Path, help="folder that keeps all results; without, a temporary one"
     )
-    parser.add_argument("--sequences", nargs="+", choices=names, default=names, metavar="NAME")
     parser.add_argument(
-        "--frontends", nargs="+", choices=list(FRONTENDS), default=list(FRONTENDS), metavar="NAME"
+        "--sequences",
+        nargs="+",
+        choices=names,
+        default=names,
+        metavar="NAME",
+        help=f"of {', '.join(names)}",
+    )
+    parser.add_argument(
+        "--frontends",
+        nargs="+",
+        choices=list(FRONTENDS),
+        default=[name for name in FRONTENDS if not name.endswith("-dense")],
+        metavar="NAME",
+        help=f"of {', '.join(FRONTENDS)}",
     )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
     arguments = parser.parse_args()
