@@ -150,7 +150,7 @@ def scene_footage(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["av1", "sift-sequential"])
+@pytest.mark.parametrize("name", ["av1-dense", "sift-sequential"])
 def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     run = run_frontend(name, scene_footage, tmp_path / name)
     again = run_frontend(name, scene_footage, tmp_path / name)
