@@ -1,5 +1,6 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
+from colmap_av1.check import CheckReport, check
 from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
@@ -30,6 +31,7 @@ from colmap_av1.tracks import Tracks, build_tracks
 __all__ = [
     "BitstreamError",
     "CameraOptions",
+    "CheckReport",
     "ColmapAv1Error",
     "DatabaseError",
     "DensityOptions",
@@ -50,6 +52,7 @@ __all__ = [
     "VerifyOptions",
     "VideoError",
     "build_tracks",
+    "check",
     "export_motion",
     "inspect",
     "match",

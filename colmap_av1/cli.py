@@ -21,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as ProgressBars
 from rich.table import Table
 
+from colmap_av1.check import CheckReport, check
 from colmap_av1.errors import ColmapAv1Error, OptionError
 from colmap_av1.export import export_motion
 from colmap_av1.info import StreamReport
@@ -42,6 +43,7 @@ from colmap_av1.view import serve_model, view_model, view_video, write_picture
 
 _PROGRAM = "colmap-av1"
 _INTERRUPTED = 130
+_FAILED_CHECK = 1
 _BAD_INPUT = 2
 # Rarer reference distances are summed up.
 _LEAST_LISTED_SHARE = 0.005
@@ -64,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; None: those of this process.
 
     Returns:
-        Exit status: 0, 2 for bad input, 130 when interrupted.
+        Exit status: 0, 1 where a check fails, 2 for bad input, 130 when interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _make_parser()
@@ -72,14 +74,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             # argparse exits by itself, with status 2 and one line, on words it does not know.
             namespace = parser.parse_args([_underscored(word) for word in words])
-            namespace.run(namespace)
+            status: int | None = namespace.run(namespace)
         except ColmapAv1Error as error:
             print(f"{_PROGRAM}: error: {error}", file=sys.stderr)
             return _BAD_INPUT
         except KeyboardInterrupt:
             print(f"{_PROGRAM}: interrupted", file=sys.stderr)
             return _INTERRUPTED
-    return 0
+    return status or 0
 
 
 class _Parser(argparse.ArgumentParser):
@@ -139,6 +141,16 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
 
+    command = _add_command(
+        commands, "check", _run_check, "tell what COLMAP's mappers will make of a database"
+    )
+    _add_database(command)
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with status 1 where something stops the mappers",
+    )
+
     command = _add_command(commands, "motion", _run_motion, "write the motion of every frame")
     _add_video(command)
     command.add_argument(
@@ -178,13 +190,19 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _add_command(
-    commands: Any, name: str, run: Callable[[argparse.Namespace], None], summary: str
+    commands: Any, name: str, run: Callable[[argparse.Namespace], int | None], summary: str
 ) -> argparse.ArgumentParser:
     command: argparse.ArgumentParser = commands.add_parser(
         name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.", allow_abbrev=False
     )
     command.set_defaults(run=run)
     return command
+
+
+def _add_database(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--database", "--database_path", required=True, metavar="PATH", help="a COLMAP database"
+    )
 
 
 def _add_video(command: argparse.ArgumentParser) -> None:
@@ -335,6 +353,12 @@ def _run_info(namespace: argparse.Namespace) -> None:
     _print_summary(_info_rows(result))
 
 
+def _run_check(namespace: argparse.Namespace) -> int:
+    result = check(namespace.database)
+    _print_summary(_check_rows(result))
+    return _FAILED_CHECK if namespace.strict and not result.mappable else 0
+
+
 def _run_motion(namespace: argparse.Namespace) -> None:
     with _progress(namespace.quiet) as report:
         count = export_motion(
@@ -432,6 +456,39 @@ def _info_rows(report: StreamReport) -> _Rows:
         ("bits per pixel", f"{report.bits_per_pixel:.3f}"),
         ("for matching", "; ".join(report.reasons) or "good"),
     ]
+
+
+def _check_rows(report: CheckReport) -> _Rows:
+    sizes = [f"{w}x{h} {n}" for (w, h), n in report.image_sizes.items()]
+    shapes = [f"{n} with {c} columns" for c, n in report.keypoint_columns.items()]
+    share = report.num_matched_keypoints / max(report.num_keypoints, 1)
+    rows = [
+        ("database", str(report.database)),
+        ("layout", f"COLMAP {report.layout} (version {report.user_version})"),
+        ("opened by", f"COLMAP {report.readers}"),
+        ("images", f"{report.num_images}, {report.num_connected_images} connected"),
+        ("sizes", ", ".join(sizes) or "none"),
+        ("cameras", f"{report.num_cameras}, {report.num_priors} with a known focal length"),
+        ("keypoints", f"{report.num_keypoints}, {share:.1%} matched"),
+        ("keypoint rows", ", ".join(shapes) or "none"),
+        ("descriptors", f"of {report.num_described_images} images"),
+        (
+            "pairs",
+            f"{report.num_pairs} with inliers, {report.num_used_pairs} used, "
+            f"{report.num_empty_pairs} empty",
+        ),
+        ("inliers", str(report.num_inliers)),
+        ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items()) or "none"),
+    ]
+    if report.parallax is not None:
+        wide = report.parallax
+        how = "" if wide.focal_known else " for a guessed focal length"
+        angle = "unknown" if wide.angle is None else f"{wide.angle:.1f} degrees{how}"
+        pair = f"widest pair {wide.displacement:.0f} px ({' - '.join(wide.names)})"
+        rows.append(("parallax", f"{angle}, {pair}"))
+    rows += [(finding.severity, finding.text) for finding in report.findings]
+    rows.append(("for mapping", "good" if report.mappable else "not ready"))
+    return rows
 
 
 def _print_summary(rows: _Rows) -> None:

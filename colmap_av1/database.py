@@ -170,10 +170,15 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
         return {}
     with open_database(path) as connection:
         check_layout(connection, path)
-        rows = connection.execute(
-            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras "
-            "ORDER BY camera_id"
-        ).fetchall()
+        return cameras_of(connection, path)
+
+
+def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap.Camera]:
+    """Cameras of an open database, by id; see `read_cameras`."""
+    rows = connection.execute(
+        "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras "
+        "ORDER BY camera_id"
+    ).fetchall()
     models = {int(model.value): model for model in pycolmap.CameraModelId.__members__.values()}
     cameras = {}
     for camera_id, model, width, height, params, prior in rows:
@@ -476,12 +481,17 @@ def _read_present_keypoints(
     ).fetchone()
     if row is None or row[0] == 0:
         return np.empty((0, 2), dtype="<f4")
-    return _keypoints_from_row(path, image_id, *row)
+    return keypoints_from_row(path, image_id, *row)
 
 
-def _keypoints_from_row(
+def keypoints_from_row(
     path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
 ) -> NDArray[np.float32]:
+    """Decode a row of keypoints: float32 [n, 2, 4 or 6], x and y first.
+
+    Raises:
+        DatabaseError: the row contradicts itself.
+    """
     if num_cols not in _SHAPES or len(data or b"") != 4 * num_rows * num_cols:
         raise DatabaseError(
             f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "
@@ -608,12 +618,12 @@ def _read_pair(
     row = connection.execute(
         "SELECT rows, data FROM matches WHERE pair_id = ?", (pair_id,)
     ).fetchone()
-    matches = _matches_from_row(path, pair_id, *(row or (0, None)))
+    matches = matches_from_row(path, pair_id, *(row or (0, None)))
     row = connection.execute(
         "SELECT rows, data, config FROM two_view_geometries WHERE pair_id = ?", (pair_id,)
     ).fetchone()
     num_rows, data, config = row or (0, None, _UNDEFINED)
-    inliers = _matches_from_row(path, pair_id, num_rows, data)
+    inliers = matches_from_row(path, pair_id, num_rows, data)
     if len(matches) == 0:
         matches = inliers
     if config in (TwoViewConfig.DEGENERATE, _WATERMARK):
@@ -621,9 +631,14 @@ def _read_pair(
     return matches, inliers, 0 if config in (_UNDEFINED, _MULTIPLE) else len(inliers)
 
 
-def _matches_from_row(
+def matches_from_row(
     path: Path, pair_id: int, num_rows: int, data: bytes | None
 ) -> NDArray[np.uint32]:
+    """Decode a row of matches or inliers: uint32 [n, 2], the smaller image id's column first.
+
+    Raises:
+        DatabaseError: the row contradicts itself.
+    """
     if len(data or b"") != 8 * num_rows:
         i, j = image_ids_from_pair_id(pair_id)
         raise DatabaseError(
