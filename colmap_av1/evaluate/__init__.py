@@ -15,6 +15,7 @@ from colmap_av1.evaluate.mapping import (
     ModelFigures,
     map_database,
     model_figures,
+    triangulate_database,
 )
 from colmap_av1.evaluate.measure import Measured, run_measured
 from colmap_av1.evaluate.poses import PoseErrors, model_poses, pose_errors
@@ -48,4 +49,5 @@ __all__ = [
     "run_frontend",
     "run_measured",
     "track_statistics",
+    "triangulate_database",
 ]

@@ -1,4 +1,4 @@
-"""COLMAP's incremental mapper on a database, and the figures of the model it makes."""
+"""COLMAP's incremental mapper and triangulation on a database, and the figures of their models."""
 
 from __future__ import annotations
 
@@ -105,6 +105,42 @@ def map_database(
     return MapperRun(model if result["num_models"] else None, **result)
 
 
+def triangulate_database(
+    database: Path, model: Path, image_path: Path, folder: Path, *, seed: int = 0
+) -> MapperRun:
+    """Triangulate the tracks of a database on the poses of a model, which stay as they are.
+
+    A finished run is not repeated.
+
+    Args:
+        database: COLMAP database with verified matches; a copy of it is used.
+        model: folder of the model; its images are found in the database by their names.
+        image_path: folder of the images, for the points' colours.
+        folder: gets the model, `log.txt` and the figures.
+        seed: the random seed.
+
+    Raises:
+        EvaluationError: the triangulation failed.
+    """
+    output = folder / "model"
+
+    def work() -> dict[str, Any]:
+        copy = folder / "triangulated.db"
+        shutil.copyfile(database, copy)
+        arguments = (copy, model, image_path, output, seed)
+        measured = run_measured(_triangulate, *arguments, log=folder / "log.txt")
+        copy.unlink()
+        return {
+            "num_models": measured.result,
+            "seconds": measured.seconds,
+            "cpu_seconds": measured.cpu_seconds,
+            "peak_memory": measured.peak_memory,
+        }
+
+    inputs = [content_of(path) for path in (database, *sorted(model.glob("*.bin")))]
+    return MapperRun(output, **kept(folder, (inputs, seed, pycolmap.__version__), work))
+
+
 def model_figures(model: Any) -> ModelFigures:
     """Figures of a pycolmap.Reconstruction, or of the model in a folder.
 
@@ -139,3 +175,13 @@ def _map(database: Path, image_path: Path, output: Path, settings: MapperSetting
         # The mapper may leave a bogus model of two images beside the real one.
         max(models.values(), key=lambda m: m.num_reg_images()).write(output)
     return len(models)
+
+
+def _triangulate(database: Path, model: Path, image_path: Path, output: Path, seed: int) -> int:
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
+    output.mkdir()
+    pycolmap.triangulate_points(
+        read_model(model), database, image_path, output, options=options, refine_intrinsics=False
+    )
+    return 1

@@ -18,7 +18,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ from colmap_av1.evaluate import (
     read_sequence,
     run_frontend,
     track_statistics,
+    triangulate_database,
 )
 from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.model import read_model
@@ -57,6 +58,8 @@ from colmap_av1.model import read_model
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
+# Where few and sure tracks give the poses, these are triangulated on them.
+DENSE = {"av1-sparse": "av1-dense", "av1-refined-sparse": "av1-refined-dense"}
 ENCODING = (
     "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
     "-pix_fmt yuv420p -an"
@@ -116,6 +119,7 @@ class Row:
     mapper: MapperRun | None
     model: ModelFigures | None
     pose_errors: PoseErrors | None
+    dense: tuple[FrontendRun, MapperRun, ModelFigures] | None
 
 
 def main() -> int:
@@ -203,14 +207,17 @@ def measure_case(
         console.print(f"{case.name}: {name}", markup=False)
         try:
             run = run_frontend(name, footage, folder / name)
-            mapper = None
+            mapper = dense = None
             if mapping:
                 where = folder / f"{name}-model"
                 mapper = map_database(run.database, footage.image_path, where, settings)
+                if mapper.model is not None and name in DENSE:
+                    dense = triangulate_all(DENSE[name], footage, folder, mapper.model)
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {name}: {error}", markup=False)
             continue
-        rows.append(measure_row(run, mapper, footage, material, truth))
+        row = measure_row(run, mapper, footage, material, truth)
+        rows.append(replace(row, dense=dense))
     scale = "intrinsics known and kept" if material.camera is not None else "intrinsics unknown"
     about = f"{len(footage.frames)} images of {material.num_frames} frames; {scale}; {truth.about}."
     return rows, about
@@ -294,6 +301,17 @@ def reference_model(
     return read_model(mapper.model)
 
 
+def triangulate_all(
+    name: str, footage: Footage, folder: Path, model: Path
+) -> tuple[FrontendRun, MapperRun, ModelFigures]:
+    """Every track of a front-end on the poses of a model."""
+    run = run_frontend(name, footage, folder / name)
+    where = folder / f"{name}-triangulated"
+    mapper = triangulate_database(run.database, model, footage.image_path, where)
+    assert mapper.model is not None
+    return run, mapper, model_figures(mapper.model)
+
+
 def measure_row(
     run: FrontendRun,
     mapper: MapperRun | None,
@@ -321,6 +339,7 @@ def measure_row(
         mapper=mapper,
         model=figures,
         pose_errors=errors,
+        dense=None,
     )
 
 
@@ -374,6 +393,7 @@ def models_table(rows: Sequence[Row]) -> str:
     """Markdown table of the models and of what they take."""
     header = ["models", "images", "ATE (share of extent)", "rotation", "error px mean / median"]
     header += ["points", "front-end s", "its CPU s", "its memory", "mapper s", "its CPU s"]
+    header += ["all tracks: points", "error px", "s", "CPU s"]
     body = []
     for row in rows:
         cells = [row.frontend]
@@ -393,6 +413,14 @@ def models_table(rows: Sequence[Row]) -> str:
         cells += (
             [f"{row.mapper.seconds:.1f}", f"{row.mapper.cpu_seconds:.1f}"] if row.mapper else []
         )
+        if row.dense is not None:
+            run, triangulated, figures = row.dense
+            cells.append(f"{figures.num_points:,}")
+            cells.append(f"{figures.mean_error:.3f} / {figures.median_error:.3f}")
+            cells.append(f"{sum(run.seconds.values()) + triangulated.seconds:.1f}")
+            cells.append(f"{run.cpu_seconds + triangulated.cpu_seconds:.1f}")
+        elif row.mapper:
+            cells += ["", "", "", ""]
         body.append(cells)
     return markdown(header, body)
 
