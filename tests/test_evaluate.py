@@ -1,6 +1,8 @@
 """Front-ends and mapper of the comparison, what they take, and what of it is kept."""
 
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
     track_statistics,
+    triangulate_database,
 )
 from colmap_av1.evaluate.resume import kept
 from colmap_av1.options import CameraOptions, MatchOptions, TrackOptions
@@ -185,6 +188,15 @@ def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     assert errors.ate < 0.01
     assert errors.rotation < 0.2
 
+    folder = tmp_path / "triangulated"
+    given = (run.database, mapper.model, scene_footage.image_path, folder)
+    triangulated = triangulate_database(*given)
+    assert triangulate_database(*given) == triangulated
+    again = pycolmap.Reconstruction(triangulated.model)
+    np.testing.assert_allclose(model_poses(again, 60), model_poses(model, 60), atol=1e-12)
+    assert model_figures(again).num_points > 0.9 * figures.num_points
+    assert model_figures(again).mean_error < 1.1 * figures.mean_error
+
 
 def test_a_database_that_makes_no_model(clip, tmp_path):
     footage = prepare_footage(
@@ -204,3 +216,20 @@ def test_unknown_frontend(clip, tmp_path):
     )
     with pytest.raises(OptionError, match="'surf': give one of av1,"):
         run_frontend("surf", footage, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_benchmark_prints_its_tables(tmp_path):
+    script = EXAMPLES / "benchmarks" / "tracks.py"
+    words = ["--cache", tmp_path, "--sequences", "scene", "--frontends", "av1-sparse"]
+    done = subprocess.run(
+        [sys.executable, script, *words, "--no_mapping"], check=True, capture_output=True, text=True
+    )
+    header, _, row = done.stdout.strip().splitlines()[-3:]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert len(cells) == header.count("|") - 1
+    assert cells[0] == "av1-sparse"
+    tracks = int(cells[1].replace(",", ""))
+    assert sum(int(cell.replace(",", "")) for cell in cells[2:7]) == tracks > 1000
+    exact = [float(value) for value in cells[-2].split("/")]
+    assert all(0 < value < 0.5 for value in exact)
