@@ -117,7 +117,6 @@ def build_tracks(
             y_mode=frame.y_mode,
             ref_size=frame.ref_size,
             force_integer_mv=bool(frame.header["force_integer_mv"]),
-            base_q_idx=int(frame.header["base_q_idx"]),
         )
         if progress is not None:
             progress(count)

@@ -101,7 +101,6 @@ def frame(
             "frame_width": width,
             "show_frame": int(shown),
             "force_integer_mv": 0,
-            "base_q_idx": 100,
             "gm_type": np.zeros(7, np.int32),
             "gm_params": np.tile(np.array([0, 0, ONE, 0, 0, ONE], np.int32), (7, 1)),
         },

@@ -125,8 +125,7 @@ void add_frame(TrackBuilder& builder, int decode_index, int display_index, bool 
                const Units<uint8_t>& interintra, const Units<uint8_t>& mi_size,
                const Units<uint8_t>& skip, const Units<int32_t>& warp_index,
                const Warps& local_warp_params, const GmTypes& gm_type, const GmParams& gm_params,
-               const Units<uint8_t>& y_mode, const RefSizes& ref_size, bool force_integer_mv,
-               int base_q_idx) {
+               const Units<uint8_t>& y_mode, const RefSizes& ref_size, bool force_integer_mv) {
   if (width <= 0) throw std::invalid_argument("the picture has no size");
   CodedFrame frame;
   frame.field = make_field(mv, ref_frame, is_inter, use_intrabc, motion_mode, interintra, mi_size,
@@ -134,7 +133,6 @@ void add_frame(TrackBuilder& builder, int decode_index, int display_index, bool 
                            coded_width, height, force_integer_mv);
   check_units(skip, frame.field, "skip");
   frame.skip = skip.data();
-  frame.base_q_idx = base_q_idx;
   frame.decode_index = decode_index;
   frame.display_index = display_index;
   frame.show_frame = show_frame;
@@ -220,7 +218,7 @@ void bind_tracks(nb::module_& m) {
            "slot_decode_index"_a, "mv"_a, "ref_frame"_a, "is_inter"_a, "use_intrabc"_a,
            "motion_mode"_a, "interintra"_a, "mi_size"_a, "skip"_a, "warp_index"_a,
            "local_warp_params"_a, "gm_type"_a, "gm_params"_a, "y_mode"_a, "ref_size"_a,
-           "force_integer_mv"_a, "base_q_idx"_a, "Adds one coded frame, in bitstream order.")
+           "force_integer_mv"_a, "Adds one coded frame, in bitstream order.")
       .def("finish", &finish,
            "Ends all tracks: (num_frames, width, height, offsets, frame, xy, sigma).");
 

@@ -182,7 +182,6 @@ void run_parsed(Input input, TrackBuilder& builder) {
     frame.coded.decode_index = event->decode_index;
     frame.coded.display_index = displayed(event->decode_index);
     frame.coded.show_frame = header.show_frame;
-    frame.coded.base_q_idx = header.base_q_idx;
     frame.coded.width = header.upscaled_width;
     frame.coded.height = header.frame_height;
     frame.ref_frame = units.ref_frame;

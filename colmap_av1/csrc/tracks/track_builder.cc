@@ -199,7 +199,6 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
         traits.coded = coded.skip[unit] == 0;
         traits.warped = motion.warp >= 0;
         traits.overlapped = coded.field.motion_mode[unit] == av1::OBMC;
-        traits.base_q_idx = coded.base_q_idx;
         traits.length = std::hypot(motion.dx, motion.dy);
         if (around.judged > 0) {
           traits.disagreement = static_cast<float>(around.distance / around.judged);

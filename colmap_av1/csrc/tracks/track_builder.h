@@ -31,7 +31,6 @@ struct TrackBuilderOptions {
 struct CodedFrame {
   MotionField field;
   const uint8_t* skip = nullptr;
-  int base_q_idx = 0;
   int decode_index = 0;
   int display_index = -1;
   bool show_frame = true;

@@ -8,16 +8,37 @@
 namespace colmap_av1::tracks {
 namespace {
 
-constexpr float kFloor = 0.12F;
+// Logarithm of the variance in px^2, linear in these traits; fitted by
+// examples/benchmarks/fit_trust.py.
+constexpr float kConstant = -2.58F;
+constexpr float kDisagreement = 0.85F;  // times log(0.1 px + disagreement)
+constexpr float kLength = 0.68F;        // times log(1 px + length)
+constexpr float kSize = 0.24F;          // times log2 of the area over that of 8x8
+constexpr float kUncoded = 0.45F;
+constexpr float kOverlapped = 0.17F;
+constexpr float kWarped = -0.44F;
+constexpr float kNewVector = -1.23F;
+
+// A block that nothing around it speaks for or against.
+constexpr float kUnknownDisagreement = 0.5F;
+constexpr float kMaxSigma = 4.F;
+
+// The encoder searched for the vector rather than take a neighbour's.
+bool has_new_vector(int y_mode) { return y_mode == av1::NEWMV || y_mode == av1::NEW_NEWMV; }
 
 }  // namespace
 
 float step_sigma(const StepTraits& traits) {
-  const float size = std::log2(static_cast<float>(traits.block_area)) - 6.F;
-  float log_sigma = -1.6F + 0.12F * std::max(0.F, size);
-  if (!traits.coded) log_sigma += 0.5F;
-  if (traits.disagreement > 0) log_sigma += 0.3F * std::log1p(traits.disagreement);
-  return std::max(kFloor, std::exp(log_sigma));
+  const float disagreement =
+      traits.disagreement >= 0.F ? traits.disagreement : kUnknownDisagreement;
+  float log_variance = kConstant + kDisagreement * std::log(0.1F + disagreement) +
+                       kLength * std::log1p(traits.length) +
+                       kSize * (std::log2(static_cast<float>(traits.block_area)) - 6.F);
+  if (!traits.coded) log_variance += kUncoded;
+  if (traits.overlapped) log_variance += kOverlapped;
+  if (traits.warped) log_variance += kWarped;
+  if (has_new_vector(traits.y_mode)) log_variance += kNewVector;
+  return std::min(kMaxSigma, std::exp(0.5F * log_variance));
 }
 
 }  // namespace colmap_av1::tracks

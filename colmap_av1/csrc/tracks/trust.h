@@ -12,7 +12,6 @@ struct StepTraits {
   bool coded = false;  // has a residual
   bool warped = false;
   bool overlapped = false;  // OBMC
-  int base_q_idx = 0;
   float length = 0.F;  // of the displacement, px
   // Mean distance in px to the displacements of the units around the block; negative where there
   // are none.
