@@ -5,6 +5,7 @@ from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
     DatabaseError,
+    HlocError,
     ImageError,
     LimitError,
     ModelError,
@@ -12,13 +13,15 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.export import export_motion
+from colmap_av1.export import HlocMatches, export_hloc, read_hloc
 from colmap_av1.info import StreamReport, inspect
 from colmap_av1.match import MatchReport, match
 from colmap_av1.motion import FrameMotion, read_motion
+from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
+    ExportOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -35,7 +38,10 @@ __all__ = [
     "ColmapAv1Error",
     "DatabaseError",
     "DensityOptions",
+    "ExportOptions",
     "FrameMotion",
+    "HlocError",
+    "HlocMatches",
     "ImageError",
     "LimitError",
     "MatchOptions",
@@ -53,8 +59,10 @@ __all__ = [
     "VideoError",
     "build_tracks",
     "check",
+    "export_hloc",
     "export_motion",
     "inspect",
     "match",
+    "read_hloc",
     "read_motion",
 ]

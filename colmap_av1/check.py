@@ -45,6 +45,8 @@ _MIN_INLIERS = 15
 _MIN_INITIAL_INLIERS = 100
 _INITIAL_ANGLE, _LEAST_INITIAL_ANGLE = 16.0, 4.0
 _MAX_FORWARD_MOTION = 0.95
+# Share of keypoints without a match that is worth a line.
+_NOTED_SHARE = 0.01
 # Pairs whose geometry is computed for the parallax, and the quantile of their angles that is
 # taken for the largest: a wrong model may give any angle.
 _NUM_DEEPEST = 24
@@ -510,7 +512,7 @@ def _keypoint_findings(images: _Images, pairs: _Pairs) -> Iterator[Finding]:
             "guided matching and vocabulary trees stop, mappers do not mind",
         )
     total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)
-    if matched < total:
+    if total - matched > _NOTED_SHARE * total:
         yield Finding("note", f"{(total - matched) / total:.1%} of the keypoints have no match")
 
 

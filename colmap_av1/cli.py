@@ -23,13 +23,15 @@ from rich.table import Table
 
 from colmap_av1.check import CheckReport, check
 from colmap_av1.errors import ColmapAv1Error, OptionError
-from colmap_av1.export import export_motion
+from colmap_av1.export import export_hloc
 from colmap_av1.info import StreamReport
 from colmap_av1.info import inspect as inspect_stream
 from colmap_av1.match import MatchReport, match
+from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
+    ExportOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -157,6 +159,16 @@ def _make_parser() -> argparse.ArgumentParser:
         "--output", "--output_path", required=True, metavar="PATH", help="a .npz or .h5 file"
     )
     _add_options(command, {ReadOptions: "bitstream"})
+    _add_quiet(command)
+
+    command = _add_command(
+        commands, "export", _run_export, "write a database's features and matches for hloc"
+    )
+    _add_database(command)
+    command.add_argument(
+        "--output", "--output_path", required=True, metavar="PATH", help="folder for the files"
+    )
+    _add_options(command, {ExportOptions: "files"})
     _add_quiet(command)
 
     command = _add_command(commands, "view", _run_view, "draw motion, tracks, matches or a model")
@@ -369,6 +381,21 @@ def _run_motion(namespace: argparse.Namespace) -> None:
         )
     if not namespace.quiet:
         _print_summary([("coded frames", str(count)), ("output", namespace.output)])
+
+
+def _run_export(namespace: argparse.Namespace) -> None:
+    with _progress(namespace.quiet) as report:
+        num_images, num_pairs = export_hloc(
+            namespace.database, namespace.output, _given(namespace, ExportOptions), report
+        )
+    if not namespace.quiet:
+        _print_summary(
+            [
+                ("images", str(num_images)),
+                ("pairs", str(num_pairs)),
+                ("output", namespace.output),
+            ]
+        )
 
 
 def _run_view(namespace: argparse.Namespace) -> None:

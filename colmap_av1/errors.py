@@ -36,6 +36,10 @@ class DatabaseError(ColmapAv1Error):
     """The database is locked, not a COLMAP database, or does not fit the video."""
 
 
+class HlocError(ColmapAv1Error):
+    """A file of hloc's features or matches is missing, unreadable, or contradicts itself."""
+
+
 class ModelError(ColmapAv1Error):
     """The COLMAP model is missing, unreadable, without poses, or not of this video."""
 

@@ -157,6 +157,16 @@ class MatchOptions:
 
 
 @dataclass(frozen=True)
+class ExportOptions:
+    """What is written of a database for other programs."""
+
+    # whose layout the files have
+    format: Literal["hloc"] = "hloc"
+    # only matches that agree with their pair's two-view geometry
+    verified: bool = True
+
+
+@dataclass(frozen=True)
 class ViewOptions:
     """How motion and tracks are drawn over the frames of a video."""
 
