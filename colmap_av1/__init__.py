@@ -1,10 +1,12 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
 from colmap_av1.check import CheckReport, check
+from colmap_av1.encode import EncodeReport, encode
 from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
     DatabaseError,
+    EncodeError,
     HlocError,
     ImageError,
     LimitError,
@@ -21,6 +23,7 @@ from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
+    EncodeOptions,
     ExportOptions,
     MatchOptions,
     PairOptions,
@@ -38,6 +41,9 @@ __all__ = [
     "ColmapAv1Error",
     "DatabaseError",
     "DensityOptions",
+    "EncodeError",
+    "EncodeOptions",
+    "EncodeReport",
     "ExportOptions",
     "FrameMotion",
     "HlocError",
@@ -59,6 +65,7 @@ __all__ = [
     "VideoError",
     "build_tracks",
     "check",
+    "encode",
     "export_hloc",
     "export_motion",
     "inspect",

@@ -22,6 +22,7 @@ from rich.progress import Progress as ProgressBars
 from rich.table import Table
 
 from colmap_av1.check import CheckReport, check
+from colmap_av1.encode import encode
 from colmap_av1.errors import ColmapAv1Error, OptionError
 from colmap_av1.export import export_hloc
 from colmap_av1.info import StreamReport
@@ -31,6 +32,7 @@ from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
+    EncodeOptions,
     ExportOptions,
     MatchOptions,
     PairOptions,
@@ -115,7 +117,7 @@ def _make_parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="COLMAP database; made where it is missing, else its images are used",
     )
-    _add_video(command)
+    _add_video(command, "a video; one that is not AV1 is converted first")
     command.add_argument(
         "--image_path",
         metavar="PATH",
@@ -132,8 +134,22 @@ def _make_parser() -> argparse.ArgumentParser:
             PairOptions: "pairs",
             VerifyOptions: "two-view geometry",
             ReadOptions: "bitstream",
+            EncodeOptions: "encoding of a video that is not AV1",
         },
     )
+    _add_quiet(command)
+
+    command = _add_command(commands, "encode", _run_encode, "convert a video to a good AV1 stream")
+    _add_video(command, "a video that ffmpeg decodes")
+    command.add_argument(
+        "--output",
+        "--output_path",
+        required=True,
+        metavar="PATH",
+        help="the stream: .mp4, .mkv, .webm or .ivf",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
+    _add_options(command, {EncodeOptions: "encoding"})
     _add_quiet(command)
 
     command = _add_command(
@@ -217,10 +233,8 @@ def _add_database(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_video(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--video", "--video_path", required=True, metavar="PATH", help="an AV1 video"
-    )
+def _add_video(command: argparse.ArgumentParser, what: str = "an AV1 video") -> None:
+    command.add_argument("--video", "--video_path", required=True, metavar="PATH", help=what)
 
 
 def _add_quiet(command: argparse.ArgumentParser) -> None:
@@ -332,6 +346,7 @@ def _run_match(namespace: argparse.Namespace) -> None:
     options = _given(
         namespace,
         MatchOptions,
+        encode=_given(namespace, EncodeOptions),
         read=_given(namespace, ReadOptions),
         tracks=_given(namespace, TrackOptions),
         refine=_given(namespace, RefineOptions),
@@ -353,6 +368,20 @@ def _run_match(namespace: argparse.Namespace) -> None:
     if not namespace.quiet:
         _print_summary(_match_rows(result))
         _print_next(result)
+
+
+def _run_encode(namespace: argparse.Namespace) -> None:
+    with _progress(namespace.quiet) as report:
+        result = encode(
+            namespace.video,
+            namespace.output,
+            overwrite=namespace.overwrite,
+            options=_given(namespace, EncodeOptions),
+            progress=report,
+        )
+    if not namespace.quiet:
+        rows = [("frames", str(result.num_frames)), ("encoder", result.encoder)]
+        _print_summary([*rows, ("output", str(result.output))])
 
 
 def _run_info(namespace: argparse.Namespace) -> None:
@@ -435,6 +464,7 @@ def _match_rows(report: MatchReport) -> _Rows:
     inlier_share = report.num_inliers / max(report.num_matches, 1)
     rows = [
         ("database", str(report.database)),
+        ("stream", str(report.stream)),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
         ("tracks", str(report.num_tracks)),

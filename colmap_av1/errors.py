@@ -40,6 +40,10 @@ class HlocError(ColmapAv1Error):
     """A file of hloc's features or matches is missing, unreadable, or contradicts itself."""
 
 
+class EncodeError(ColmapAv1Error):
+    """No AV1 encoder works, it fails, or the stream cannot be written."""
+
+
 class ModelError(ColmapAv1Error):
     """The COLMAP model is missing, unreadable, without poses, or not of this video."""
 

@@ -40,12 +40,6 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
     return [pattern % frame for frame in frames]
 
 
-def are_named_by(pattern: str, names: Sequence[str]) -> bool:
-    """Whether all names could come from `image_names` with this pattern."""
-    regex = _pattern_regex(pattern)
-    return all(regex.fullmatch(name) for name in names)
-
-
 def frames_of_images(
     names: Sequence[str], num_frames: int, first_number: int | None = None
 ) -> NDArray[np.int32]:
@@ -103,33 +97,24 @@ def check_image_sizes(
     names: Sequence[str],
     sizes: Sequence[tuple[int, int]],
     video_size: tuple[int, int],
-    rotation: int = 0,
 ) -> None:
-    """Check that the images a database lists have the size and orientation of the video.
+    """Check that the images a database lists have the size of the video's pictures.
 
     Args:
         names: names of the images.
         sizes: (width, height) of the images' cameras.
-        video_size: (width, height) of the video, unrotated.
-        rotation: degrees players turn the video by, where the images may have been cut by
-            such a player; 0 otherwise.
+        video_size: (width, height) of the pictures, turned as players do.
 
     Raises:
-        ImageError: an image has another size, or the images are rotated.
+        ImageError: an image has another size.
     """
-    width, height = video_size
     for name, size in zip(names, sizes, strict=True):
-        # A half turn, and any turn of a square, leaves the size as it is.
-        turned = (height, width) if rotation in (90, 270) else video_size
-        if rotation and size == turned:
-            raise ImageError(
-                f"the video is marked to be turned by {rotation} degrees, so the database's "
-                "images are turned against its bitstream: use a new database"
-            )
         if size != video_size:
+            turned = size == video_size[::-1]
             raise ImageError(
-                f"image '{name}' of the database is {size[0]}x{size[1]}, the video "
-                f"{width}x{height}: use images of the video's size or a new database"
+                f"image '{name}' of the database is {size[0]}x{size[1]}, the video's pictures are "
+                f"{video_size[0]}x{video_size[1]}{' as players turn them' if turned else ''}: use "
+                "images of the video's size or a new database"
             )
 
 

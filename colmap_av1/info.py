@@ -93,14 +93,20 @@ def inspect(
         BitstreamError: the stream is damaged and `options.strict` is set.
     """
     counts = _count(read_motion(video, options), progress)
-    if counts.num_shown == 0:
+    structure = counts.structure
+    if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frame: give a video with pictures")
     with open_stream(video) as stream:
-        bytes_per_frame = _num_bytes(stream) / counts.num_shown
+        bytes_per_frame = _num_bytes(stream) / structure.num_shown
         bits_per_pixel = 8 * bytes_per_frame / max(1, stream.width * stream.height)
-        inter_share = counts.inter_units / counts.later_units if counts.later_units else 0.0
         references = sum(counts.references.values()) + counts.hidden_references
         median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
+        reasons = structure.reasons(bits_per_pixel)
+        if median_motion < _LEAST_MOTION:
+            reasons += (
+                f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
+                "there is no parallax",
+            )
         return StreamReport(
             path=Path(video),
             container=stream.container,
@@ -108,11 +114,11 @@ def inspect(
             height=stream.height,
             rotation=display_rotation(video),
             frame_rate=stream.frame_rate,
-            num_coded=counts.num_coded,
-            num_shown=counts.num_shown,
+            num_coded=structure.num_coded,
+            num_shown=structure.num_shown,
             num_hidden=counts.num_hidden,
-            num_key_frames=counts.num_key_frames,
-            inter_share=inter_share,
+            num_key_frames=structure.num_key_frames,
+            inter_share=structure.inter_share,
             reference_distances={
                 distance: units / references
                 for distance, units in sorted(counts.references.items())
@@ -121,18 +127,72 @@ def inspect(
             median_motion=median_motion,
             bytes_per_frame=bytes_per_frame,
             bits_per_pixel=bits_per_pixel,
-            reasons=_reasons(counts, inter_share, bits_per_pixel, median_motion),
+            reasons=reasons,
         )
 
 
 @dataclass
-class _Counts:
+class Structure:
+    """Counts that tell how a stream is coded, as far as matching cares.
+
+    Attributes:
+        num_coded: frames with block data.
+        num_shown: frames that are shown.
+        num_key_frames: key frames and intra-only frames among the coded ones.
+        later_units: units of all frames but the first.
+        inter_units: those of them that are inter coded.
+    """
+
     num_coded: int = 0
     num_shown: int = 0
-    num_hidden: int = 0
     num_key_frames: int = 0
     later_units: int = 0
     inter_units: int = 0
+
+    @property
+    def inter_share(self) -> float:
+        """Share of inter units in all frames but the first."""
+        return self.inter_units / self.later_units if self.later_units else 0.0
+
+    def add(self, frame: FrameMotion) -> None:
+        """Count a frame; frames come in bitstream order."""
+        self.num_coded += 1
+        self.num_shown = max(self.num_shown, frame.display_index + 1)
+        self.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
+        if self.num_coded > 1:
+            self.later_units += frame.is_inter.size
+            inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
+            self.inter_units += int(np.count_nonzero(inter))
+
+    def reasons(self, bits_per_pixel: float) -> tuple[str, ...]:
+        """Why streams of such a structure and rate are poor for matching; empty if they are not."""
+        if self.num_shown < 3:
+            return (f"only {self.num_shown} frames are shown: a track needs more",)
+        if self.inter_units == 0:
+            return ("every frame is intra coded, so there is no motion: encode it with -g 9999",)
+        reasons = []
+        if self.inter_share < _LEAST_INTER_SHARE:
+            reasons.append(
+                f"only {self.inter_share:.0%} of the units after the first frame are inter coded: "
+                "the camera moves too far between frames, or the scene itself moves"
+            )
+        if self.num_shown < _LEAST_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
+            reasons.append(
+                f"a key frame every {self.num_coded / self.num_key_frames:.1f} frames cuts "
+                "every track: encode it with -g 9999"
+            )
+        if bits_per_pixel < _LEAST_BITS_PER_PIXEL:
+            reasons.append(
+                f"{bits_per_pixel:.3f} bits per pixel is a low rate, vectors are coarse: encode "
+                "the source with a lower -crf"
+            )
+        return tuple(reasons)
+
+
+@dataclass
+class _Counts:
+    structure: Structure = field(default_factory=Structure)
+    num_hidden: int = 0
     references: Counter[int] = field(default_factory=Counter)
     hidden_references: int = 0
     motion: list[float] = field(default_factory=list)
@@ -141,17 +201,11 @@ class _Counts:
 def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None) -> _Counts:
     counts = _Counts()
     for frame in motion:
-        counts.num_coded += 1
-        counts.num_shown = max(counts.num_shown, frame.display_index + 1)
+        counts.structure.add(frame)
         counts.num_hidden += frame.display_index < 0
-        counts.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
-        inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
-        if counts.num_coded > 1:
-            counts.later_units += inter.size
-            counts.inter_units += int(np.count_nonzero(inter))
         _count_references(frame, counts)
         if progress is not None:
-            progress(counts.num_coded)
+            progress(counts.structure.num_coded)
     return counts
 
 
@@ -187,34 +241,3 @@ def _num_bytes(stream: VideoStream) -> int:
         for packet in stream.packets():
             total += len(packet.data)
     return total
-
-
-def _reasons(
-    counts: _Counts, inter_share: float, bits_per_pixel: float, median_motion: float
-) -> tuple[str, ...]:
-    if counts.num_shown < 3:
-        return (f"only {counts.num_shown} frames are shown: a track needs more",)
-    if counts.inter_units == 0:
-        return ("every frame is intra coded, so there is no motion: encode it with -g 9999",)
-    reasons = []
-    if inter_share < _LEAST_INTER_SHARE:
-        reasons.append(
-            f"only {inter_share:.0%} of the units after the first frame are inter coded: "
-            "the camera moves too far between frames, or the scene itself moves"
-        )
-    if counts.num_shown < _LEAST_KEY_FRAME_DISTANCE * (counts.num_key_frames - 1):
-        reasons.append(
-            f"a key frame every {counts.num_coded / counts.num_key_frames:.1f} frames cuts "
-            "every track: encode it with -g 9999"
-        )
-    if bits_per_pixel < _LEAST_BITS_PER_PIXEL:
-        reasons.append(
-            f"{bits_per_pixel:.3f} bits per pixel is a low rate, vectors are coarse: encode "
-            "the source with a lower -crf"
-        )
-    if median_motion < _LEAST_MOTION:
-        reasons.append(
-            f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
-            "there is no parallax"
-        )
-    return tuple(reasons)

@@ -21,23 +21,30 @@ from colmap_av1.database import (
     write_matches,
 )
 from colmap_av1.density import keep_observations, select_tracks
+from colmap_av1.encode import stream_of
 from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
 from colmap_av1.images import (
-    are_named_by,
     check_image_folder,
     check_image_sizes,
     frames_of_images,
     image_names,
     write_images,
 )
+from colmap_av1.info import Structure, inspect
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import MatchOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.refine import refine_tracks
-from colmap_av1.tracks import Tracks, build_tracks
+from colmap_av1.tracks import Tracks, build_tracks, turn_tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
-from colmap_av1.video import decode_frames, display_rotation, open_stream
+from colmap_av1.video import (
+    decode_frames,
+    display_rotation,
+    is_av1,
+    open_stream,
+    picture_size,
+)
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 # The mapper's default limit for the translation along the axis of a first pair.
@@ -52,6 +59,7 @@ class MatchReport:
     Attributes:
         database: the database file.
         video: the video file.
+        stream: the AV1 file whose motion was read: the video, or what it was converted to.
         image_path: folder of the images; None where none was given.
         num_frames: shown frames of the video.
         num_coded_frames: frames with block data, hidden ones included.
@@ -74,6 +82,7 @@ class MatchReport:
 
     database: Path
     video: Path
+    stream: Path
     image_path: Path | None
     num_frames: int
     num_coded_frames: int
@@ -124,15 +133,13 @@ class VideoSource:
     Attributes:
         stream: the AV1 file whose motion is read.
         pictures: the file whose pictures become images.
-        width: picture width in pixels as the stream's container says, unrotated.
-        height: picture height likewise.
+        rotation: degrees counter-clockwise by which players turn the stream's pictures.
         num_packets: number of packets of the stream; None where unknown.
     """
 
     stream: Path
     pictures: Path
-    width: int
-    height: int
+    rotation: int
     num_packets: int | None
 
 
@@ -199,7 +206,7 @@ def match(
 
     Args:
         database: the database file; made where it is missing.
-        video: an AV1 video.
+        video: a video; one that is not AV1 is converted first, see `encode.stream_of`.
         image_path: folder to write the images to, for the mapper's colours and for
             training; existing images of the right size are kept. None: none are written.
         options: options of every stage.
@@ -220,25 +227,23 @@ def match(
     clock = Clock()
 
     # What can be refused is refused before the long work.
-    source = open_source(video)
-    stream_size = (source.width, source.height)
+    video_size = picture_size(video)
     listed = _read_listed_images(database, options)
-    check_options(options, stream_size)
-    if listed:
-        _check_listed_sizes(listed, stream_size, source, options)
+    check_options(options, video_size)
+    _check_listed_sizes(listed, video_size)
     if folder is not None:
         names_or_pattern = [i.name for i in listed] if listed else options.image_name
-        check_image_folder(folder, names_or_pattern, stream_size)
+        check_image_folder(folder, names_or_pattern, video_size)
 
+    source = open_source(video, options, clock=clock, progress=progress)
     tracked = track_video(
         source, options, one_size=folder is not None, clock=clock, progress=progress
     )
     tracks = tracked.tracks
     chosen = choose_images(listed, tracks, options)
     size = (tracks.width, tracks.height)
-    if size != stream_size:
-        if listed:
-            _check_listed_sizes(listed, size, source, options)
+    if size != video_size:
+        _check_listed_sizes(listed, size)
         if folder is not None:
             check_image_folder(folder, chosen.names, size)
 
@@ -279,6 +284,7 @@ def match(
     return MatchReport(
         database=database,
         video=video,
+        stream=source.stream,
         image_path=folder,
         num_frames=tracks.num_frames,
         num_coded_frames=tracked.num_coded_frames,
@@ -298,14 +304,35 @@ def match(
     )
 
 
-def open_source(video: Path) -> VideoSource:
-    """Find out where the motion and the pictures of a video come from.
+def open_source(
+    video: Path, options: MatchOptions, *, clock: Clock, progress: Progress
+) -> VideoSource:
+    """Find the AV1 stream of a video, or make it: its motion is read, not its pictures.
+
+    Args:
+        video: a video of any codec.
+        options: those of encoding and reading are used.
+        clock: gets the stage "encoding" where a stream is made.
+        progress: told about the stage "encoding".
 
     Raises:
         VideoError: the file is missing or no video that can be read.
+        EncodeError: no AV1 encoder works, or the stream cannot be written.
+        OptionError: an option has a value that cannot work.
     """
-    with open_stream(video) as stream:
-        return VideoSource(video, video, stream.width, stream.height, stream.num_frames)
+    stream = video
+    if not is_av1(video) or (options.reencode and inspect(video, options.read).reasons):
+        with clock.measure("encoding"):
+            encoded = stream_of(
+                video,
+                options=options.encode,
+                keep_stream=options.keep_stream,
+                progress=progress,
+            )
+        stream = encoded.output
+    with open_stream(stream) as opened:
+        num_packets = opened.num_frames
+    return VideoSource(stream, video, display_rotation(stream), num_packets)
 
 
 def track_video(
@@ -334,17 +361,17 @@ def track_video(
     motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
     if one_size or options.refine.refine != "none":
         motion = _of_one_size(motion)
-    num_coded_frames = 0
+    structure = Structure()
+    motion = _counted(clock.iterate("motion", motion), structure)
 
     def count(done: int) -> None:
-        nonlocal num_coded_frames
-        num_coded_frames = done
         progress("motion", done, source.num_packets)
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with clock.measure("tracks"):
-            tracks = build_tracks(clock.iterate("motion", motion), options.tracks, count)
+            tracks = build_tracks(motion, options.tracks, count)
+            tracks = turn_tracks(tracks, source.rotation)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
@@ -359,7 +386,13 @@ def track_video(
                     lambda done: progress("refinement", done, tracks.num_frames),
                 )
             clock.seconds["refinement"] -= clock.seconds["decoding"]
-    return TrackedVideo(tracks, num_coded_frames, tuple(str(w.message) for w in caught))
+    notes = [str(w.message) for w in caught]
+    # Of the whole file, so a rate that is found low is even lower.
+    bits = 8 * source.stream.stat().st_size
+    reasons = structure.reasons(bits / (tracks.num_frames * tracks.width * tracks.height))
+    if reasons and source.stream == source.pictures:
+        notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
+    return TrackedVideo(tracks, structure.num_coded, tuple(notes))
 
 
 def choose_images(
@@ -410,7 +443,8 @@ def match_images(
         if len(pairs) == 0:
             raise VideoError(
                 f"{video}: no two images share {options.pairs.min_matches} tracks, so there is "
-                "nothing to match: 'colmap-av1 info --video' says what the stream lacks"
+                "nothing to match: 'colmap-av1 info --video' says what the stream lacks, "
+                "--reencode 1 converts it first"
             )
         matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
     with clock.measure("verification"):
@@ -478,17 +512,16 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     return listed
 
 
-def _check_listed_sizes(
-    listed: Sequence[DatabaseImage],
-    size: tuple[int, int],
-    source: VideoSource,
-    options: MatchOptions,
-) -> None:
-    names = [image.name for image in listed]
-    # Images of this package are never turned; those of other programs usually are.
-    own = are_named_by(options.image_name, names)
+def _check_listed_sizes(listed: Sequence[DatabaseImage], size: tuple[int, int]) -> None:
     sizes = [(image.width, image.height) for image in listed]
-    check_image_sizes(names, sizes, size, 0 if own else display_rotation(source.pictures))
+    check_image_sizes([image.name for image in listed], sizes, size)
+
+
+def _counted(motion: Iterable[FrameMotion], structure: Structure) -> Iterator[FrameMotion]:
+    """The same frames; counts them."""
+    for frame in motion:
+        structure.add(frame)
+        yield frame
 
 
 def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:

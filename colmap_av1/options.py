@@ -23,6 +23,18 @@ class ReadOptions:
 
 
 @dataclass(frozen=True)
+class EncodeOptions:
+    """How a video that is not AV1 is converted."""
+
+    # the encoder; 'auto': the first that works, hardware before software
+    encoder: Literal["auto", "nvenc", "qsv", "amf", "vaapi", "libaom", "svt"] = "auto"
+    # constant quantiser, 0 (best) to 63; None: the encoder's default
+    quality: int | None = None
+    # preset on the encoder's own scale: -cpu-used of libaom, -preset of others; None: its default
+    speed: int | None = None
+
+
+@dataclass(frozen=True)
 class TrackOptions:
     """How displacements are chained into tracks."""
 
@@ -137,6 +149,7 @@ class CameraOptions:
 class MatchOptions:
     """Everything `match` can be told; seed and threads are those of `verify`."""
 
+    encode: EncodeOptions = EncodeOptions()
     read: ReadOptions = ReadOptions()
     tracks: TrackOptions = TrackOptions()
     refine: RefineOptions = RefineOptions()
@@ -154,6 +167,10 @@ class MatchOptions:
     # what becomes of keypoints and matches that listed images have already: 'error': refuse
     # the database; 'append': keep them, add the new ones after them; 'replace': remove them
     on_existing: OnExisting = "error"
+    # file that keeps the AV1 stream of a video that is not AV1; None: beside the video
+    keep_stream: str | None = None
+    # convert an AV1 video, too, where its structure is poor for matching
+    reencode: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -125,6 +125,23 @@ def build_tracks(
         raise VideoError("the video shows no frame: give a video with at least one picture")
     confirmed = np.zeros(len(frame_index), dtype=np.bool_)
     return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
+
+
+def turn_tracks(tracks: Tracks, rotation: int) -> Tracks:
+    """The tracks in pictures that are turned, as players do by the container's display matrix.
+
+    Args:
+        tracks: tracks in the pictures of the bitstream.
+        rotation: degrees counter-clockwise: 0, 90, 180 or 270.
+    """
+    x, y = tracks.xy[:, 0], tracks.xy[:, 1]
+    width, height = tracks.width, tracks.height
+    if rotation == 0:
+        return tracks
+    if rotation == 180:
+        return replace(tracks, xy=np.stack([width - x, height - y], axis=1))
+    turned = [y, width - x] if rotation == 90 else [height - y, x]
+    return replace(tracks, width=height, height=width, xy=np.stack(turned, axis=1))
 
 
 _Limit = TypeVar("_Limit", int, float)

@@ -16,6 +16,7 @@ from typing import Any
 import av
 import av.error
 import numpy as np
+from av.stream import Disposition
 from numpy.typing import NDArray
 
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
@@ -189,10 +190,10 @@ def decode_frames(
     operating_point: int = 0,
     num_threads: int | None = None,
 ) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
-    """Decode the shown frames in output order, without film grain and without rotation.
+    """Decode the shown frames in output order, without film grain, turned as players do.
 
     Args:
-        video: the file.
+        video: a file of any codec that FFmpeg decodes.
         operating_point: operating point of a scalable stream.
         num_threads: threads of the decoder; None: as many as it likes.
 
@@ -201,12 +202,12 @@ def decode_frames(
 
     Raises:
         BitstreamError: the stream is damaged; the frames before have been given.
-        VideoError: as `open_stream`.
+        VideoError: the file is missing, empty, not a video, or holds no video stream.
     """
     count = 0
     try:
         for frame in _decode(video, operating_point, num_threads):
-            yield count, frame.to_ndarray(format="bgr24")
+            yield count, _upright(frame)
             count += 1
     except BitstreamError:
         if num_threads == 1:
@@ -214,22 +215,61 @@ def decode_frames(
         # Threads lose the frames in flight at the damage; one thread has none in flight.
         for index, frame in enumerate(_decode(video, operating_point, 1)):
             if index >= count:
-                yield index, frame.to_ndarray(format="bgr24")
+                yield index, _upright(frame)
 
 
 def display_rotation(video: str | os.PathLike[str]) -> int:
     """Find the rotation players apply to the pictures, from the container's display matrix.
+
+    Args:
+        video: a file of any codec that FFmpeg decodes.
 
     Returns:
         Degrees counter-clockwise: 0, 90, 180 or 270. The bitstream itself is unrotated.
 
     Raises:
         BitstreamError: no frame can be decoded.
-        VideoError: as `open_stream`.
+        VideoError: as `decode_frames`.
     """
+    return _rotation(_first_frame(video))
+
+
+def picture_size(video: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height in pixels of the pictures that `decode_frames` gives.
+
+    Raises:
+        BitstreamError: no frame can be decoded.
+        VideoError: as `decode_frames`.
+    """
+    frame = _first_frame(video)
+    size = (frame.width, frame.height)
+    return size[::-1] if _rotation(frame) in (90, 270) else size
+
+
+def is_av1(video: str | os.PathLike[str]) -> bool:
+    """Whether a video has an AV1 stream.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    path = Path(video)
+    with _open_container(path) as container:
+        return _codec_name(_find_video_stream(container, path)) == "av1"
+
+
+def _first_frame(video: str | os.PathLike[str]) -> Any:
     for frame in _decode(video, 0, 1):
-        return int(round(frame.rotation / 90) * 90 % 360)
+        return frame
     raise BitstreamError(f"{video}: no frame can be decoded: the file is damaged")
+
+
+def _rotation(frame: Any) -> int:
+    return int(round(frame.rotation / 90) * 90 % 360)
+
+
+def _upright(frame: Any) -> NDArray[np.uint8]:
+    turned = np.rot90(frame.to_ndarray(format="bgr24"), _rotation(frame) // 90)
+    return np.ascontiguousarray(turned)
 
 
 def _decode(
@@ -237,8 +277,10 @@ def _decode(
 ) -> Iterator[Any]:
     path = Path(video)
     with _open_container(path) as container:
-        stream = _find_av1_stream(container, path)
+        stream = _find_video_stream(container, path)
         context = stream.codec_context
+        if context is None:
+            raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
         context.thread_type = "AUTO"
         context.thread_count = num_threads or 0
         options = {"oppoint": str(operating_point)} if operating_point else {}
@@ -325,20 +367,25 @@ def _open_container(path: Path) -> Iterator[Any]:
 
 
 def _find_av1_stream(container: Any, path: Path) -> Any:
+    stream = _find_video_stream(container, path)
+    if _codec_name(stream) == "av1":
+        return stream
+    target = path.with_name(f"{path.stem}_av1.mp4").name
+    raise NotAv1Error(
+        f"{path}: is {_codec_name(stream)}, not AV1; convert it: colmap-av1 encode --video "
+        f"{shlex.quote(str(path))} --output {shlex.quote(target)}"
+    )
+
+
+def _find_video_stream(container: Any, path: Path) -> Any:
+    """The AV1 stream, in a file without one the first that is no cover picture."""
     streams = container.streams.video
     if not streams:
         kinds = sorted({stream.type for stream in container.streams})
         found = f"only {', '.join(kinds)}" if kinds else "nothing"
         raise VideoError(f"{path}: holds no video stream, {found}: give a video")
-    for stream in streams:
-        if _codec_name(stream) == "av1":
-            return stream
-    target = path.with_name(f"{path.stem}_av1.mp4").name
-    raise NotAv1Error(
-        f"{path}: is {_codec_name(streams[0])}, not AV1; convert it: ffmpeg -i "
-        f"{shlex.quote(str(path))} -c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 "
-        f"-row-mt 1 -crf 20 -b:v 0 -g 9999 -an {shlex.quote(target)}"
-    )
+    moving = [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
+    return next((s for s in moving if _codec_name(s) == "av1"), moving[0])
 
 
 def _codec_name(stream: Any) -> str:

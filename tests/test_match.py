@@ -129,6 +129,40 @@ def test_tracks_match_the_pictures(clip: Path, tmp_path: Path) -> None:
     assert checked == 15
 
 
+@pytest.mark.parametrize("angle", [90, 180, 270])
+def test_rotated_clips(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -> None:
+    turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
+    match(tmp_path / "plain.db", clip, image_path=tmp_path / "plain")
+    match(tmp_path / "turned.db", turned, image_path=tmp_path / "turned")
+    plain, rows = tables(tmp_path / "plain.db"), tables(tmp_path / "turned.db")
+    size = (128, 192) if angle in (90, 270) else (192, 128)
+    assert rows["cameras"][0][2:4] == size
+    # Keypoint by keypoint, at the place to which its pixel was turned.
+    for before, after in zip(plain["keypoints"], rows["keypoints"], strict=True):
+        x, y = np.frombuffer(before[3], "<f4").reshape(-1, 2).T
+        wanted = {90: (y, 192 - x), 180: (192 - x, 128 - y), 270: (128 - y, x)}[angle]
+        got = np.frombuffer(after[3], "<f4").reshape(-1, 2)
+        np.testing.assert_allclose(got, np.stack(wanted, axis=1), atol=1e-4)
+    for path in (tmp_path / "plain").iterdir():
+        image = cv2.imread(str(tmp_path / "turned" / path.name))
+        np.testing.assert_array_equal(image, np.rot90(cv2.imread(str(path)), angle // 90))
+
+
+def test_images_that_ffmpeg_cut_of_a_rotated_clip(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    turned = ffmpeg("-display_rotation", "90", "-i", clip, "-c", "copy", tmp_path / "t.mp4")
+    (tmp_path / "cut").mkdir()
+    ffmpeg("-i", turned, tmp_path / "cut" / "%04d.png")
+    database = listing_database(tmp_path / "cut", tmp_path / "cut.db")
+    match(database, turned)
+    match(tmp_path / "new.db", turned)
+    for ours, listed in zip(
+        tables(tmp_path / "new.db")["keypoints"], tables(database)["keypoints"], strict=True
+    ):
+        assert ours == listed
+
+
 def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", clip, options=MatchOptions(image_step=2))
     assert report.num_images == 8

@@ -1,0 +1,433 @@
+"""Conversion of any video to an AV1 stream whose motion is worth reading; ffmpeg does it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import av.error
+import imageio_ffmpeg
+
+from colmap_av1.errors import EncodeError, NotAv1Error, OptionError, VideoError
+from colmap_av1.options import EncodeOptions
+from colmap_av1.progress import Progress, no_progress
+from colmap_av1.video import open_stream
+
+# Whether an encoder works is found out by encoding so many frames.
+_PROBE_FRAMES = 8
+_PROBE_TIMEOUT = 30.0
+_NUM_QUALITIES = 64
+# A frame further than any video is long: the first is the only intra frame.
+_KEY_FRAME_DISTANCE = "9999"
+_FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
+# Marks a stream with what it was made with, so that it is not taken for another.
+_MARK = "colmap-av1"
+
+
+@dataclass(frozen=True)
+class EncodeReport:
+    """A conversion.
+
+    Attributes:
+        output: the AV1 stream.
+        encoder: ffmpeg's name of the encoder.
+        num_frames: frames of the stream, as many as the video has.
+        reused: the stream was there already.
+    """
+
+    output: Path
+    encoder: str
+    num_frames: int
+    reused: bool = False
+
+
+@dataclass(frozen=True)
+class _Encoder:
+    """An encoder of ffmpeg.
+
+    Attributes:
+        ffmpeg_name: ffmpeg's name of it.
+        quality: default on the scale of EncodeOptions.
+        speed: default on the encoder's own scale.
+        words: ffmpeg's words for a quality and a speed.
+        before_input: words before the input.
+        upload: filter that hands the pictures to the device, and the pixel format.
+    """
+
+    ffmpeg_name: str
+    quality: int
+    speed: int
+    words: Callable[[int, int], list[str]]
+    before_input: tuple[str, ...] = ()
+    upload: str = "format=yuv420p"
+
+
+def _nvenc(quality: int, speed: int) -> list[str]:
+    # The published method's flags.
+    rate = ["-rc", "constqp", "-qp", str(_q_index(quality))]
+    return ["-tune", "hq", "-preset", f"p{speed}", *rate, "-b_ref_mode", "0", "-bf", "0"]
+
+
+def _qsv(quality: int, speed: int) -> list[str]:
+    return [
+        "-preset",
+        str(speed),
+        "-q:v",
+        str(_q_index(quality)),
+        "-bf",
+        "0",
+        "-low_delay_brc",
+        "1",
+    ]
+
+
+def _amf(quality: int, speed: int) -> list[str]:
+    q_index = str(_q_index(quality))
+    how = ["-usage", "lowlatency", "-quality", str(speed), "-bf", "0"]
+    return [*how, "-rc", "cqp", "-qp_i", q_index, "-qp_p", q_index]
+
+
+def _vaapi(quality: int, speed: int) -> list[str]:
+    rate = ["-rc_mode", "CQP", "-global_quality", str(_q_index(quality))]
+    return ["-compression_level", str(speed), *rate, "-bf", "0"]
+
+
+def _libaom(quality: int, speed: int) -> list[str]:
+    how = ["-usage", "realtime", "-cpu-used", str(speed), "-lag-in-frames", "0", "-row-mt", "1"]
+    return [*how, "-crf", str(quality), "-b:v", "0"]
+
+
+def _svt(quality: int, speed: int) -> list[str]:
+    # pred-struct 1 is low delay: frames refer to earlier ones only.
+    return ["-preset", str(speed), "-crf", str(quality), "-svtav1-params", "pred-struct=1"]
+
+
+# In the order in which they are tried.
+_ENCODERS = {
+    "nvenc": _Encoder("av1_nvenc", 20, 1, _nvenc),
+    "qsv": _Encoder("av1_qsv", 20, 7, _qsv, upload="format=nv12"),
+    "amf": _Encoder("av1_amf", 20, 100, _amf, upload="format=nv12"),
+    "vaapi": _Encoder(
+        "av1_vaapi",
+        20,
+        7,
+        _vaapi,
+        before_input=("-vaapi_device", "/dev/dri/renderD128"),
+        upload="format=nv12,hwupload",
+    ),
+    "libaom": _Encoder("libaom-av1", 20, 6, _libaom),
+    "svt": _Encoder("libsvtav1", 20, 8, _svt),
+}
+
+
+def encode(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+) -> EncodeReport:
+    """Convert a video to AV1 with backward references only, and one intra frame.
+
+    Every frame of the video becomes one of the stream, none is dropped or doubled, and time
+    stamps are kept. Pictures are turned as players turn them; sound is left out. The stream
+    appears under its name only when whole.
+
+    Args:
+        video: a video that ffmpeg decodes.
+        output: the stream; its extension .mp4, .mkv, .webm or .ivf says the container.
+        overwrite: replace an output that exists.
+        options: which encoder and how.
+        progress: called with the stage "encoding", the frames done, and of how many where known.
+
+    Raises:
+        VideoError: the video is missing or cannot be decoded.
+        EncodeError: no encoder works, or the output cannot be written.
+        OptionError: an option has a value that cannot work, or the output exists.
+    """
+    options = options if options is not None else EncodeOptions()
+    progress = progress if progress is not None else no_progress
+    video, output = Path(video), Path(output)
+    if output.suffix.lower() not in _FORMATS:
+        raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
+    if output.exists():
+        if video.exists() and output.samefile(video):
+            raise OptionError(f"{output}: is the video itself: give another output")
+        if not overwrite:
+            raise OptionError(f"{output}: exists: give another output, or --overwrite")
+    if not output.parent.is_dir():
+        raise EncodeError(f"{output}: the folder does not exist: make it first")
+    if not os.access(output.parent, os.W_OK | os.X_OK):
+        raise EncodeError(f"{output.parent}: no permission to write there: give another output")
+    num_frames, is_mov = _look_at(video)
+    name, ffmpeg = find_encoder(options)
+    encoder = _ENCODERS[name]
+    quality, speed = _settings(encoder, options)
+
+    partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
+    command = [
+        *(ffmpeg, "-v", "error", "-nostdin", "-y", *encoder.before_input),
+        # Frames that an edit list hides are frames all the same, and good ones.
+        *(("-ignore_editlist", "1") if is_mov else ()),
+        *("-i", f"file:{video}", "-map", "0:V:0", "-an", "-sn", "-dn", "-vf", encoder.upload),
+        *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
+        *("-c:v", encoder.ffmpeg_name, "-g", _KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
+        *("-metadata", f"comment={_mark(name, quality, speed)}"),
+        *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()], f"file:{partial}"),
+    ]
+    try:
+        progress("encoding", 0, num_frames)
+        count = _run(command, video, lambda done: progress("encoding", done, num_frames))
+        if count == 0:
+            raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
+        partial.replace(output)
+    except OSError as error:
+        raise EncodeError(f"{output}: cannot be written: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return EncodeReport(output, encoder.ffmpeg_name, count)
+
+
+def stream_of(
+    video: str | os.PathLike[str],
+    *,
+    options: EncodeOptions | None = None,
+    keep_stream: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> EncodeReport:
+    """The AV1 stream of a video that is not AV1: the one kept from before, or a new one.
+
+    It is kept beside the video, as 'phone.av1.mp4' for 'phone.mov', or where `keep_stream`
+    says, and used again while it is newer than the video, whole, and made with the settings
+    that `options` ask for.
+
+    Args:
+        video: a video that ffmpeg decodes.
+        options: which encoder and how.
+        keep_stream: where the stream is kept; its extension says the container.
+        progress: as in `encode`.
+
+    Raises:
+        VideoError: the video is missing or cannot be decoded.
+        EncodeError: no encoder works, or the stream cannot be written.
+        OptionError: an option has a value that cannot work, or `keep_stream` names a file
+            that is no kept stream.
+    """
+    options = options if options is not None else EncodeOptions()
+    video = Path(video)
+    output = Path(keep_stream) if keep_stream is not None else video.with_suffix(".av1.mp4")
+    num_frames, _ = _look_at(video)
+    if output.exists():
+        mark = _mark_of(output)
+        if mark is None:
+            raise OptionError(
+                f"{output}: exists and is no stream that was kept of {video.name}: give another "
+                "--keep_stream, or remove it"
+            )
+        if _fits(mark, options) and output.stat().st_mtime_ns >= video.stat().st_mtime_ns:
+            kept = _count_frames(output)
+            if kept and (num_frames is None or kept == num_frames):
+                return EncodeReport(output, mark["encoder"], kept, reused=True)
+    elif not os.access(output.resolve().parent, os.W_OK | os.X_OK):
+        raise EncodeError(
+            f"{output.resolve().parent}: the AV1 stream of {video.name} cannot be written there: "
+            "say where with --keep_stream"
+        )
+    return encode(video, output, overwrite=True, options=options, progress=progress)
+
+
+def find_encoder(options: EncodeOptions) -> tuple[str, str]:
+    """Find an encoder that works, by letting it encode a few frames.
+
+    Hardware encoders are tried first, unless the options name one. The ffmpeg of
+    imageio-ffmpeg ($IMAGEIO_FFMPEG_EXE where that is set) is preferred to the one on the PATH.
+
+    Returns:
+        The encoder's name in EncodeOptions, and the ffmpeg program that has it.
+
+    Raises:
+        EncodeError: none works.
+        OptionError: there is no encoder of that name, or an option cannot work.
+    """
+    if options.encoder != "auto" and options.encoder not in _ENCODERS:
+        known = ", ".join(["auto", *_ENCODERS])
+        raise OptionError(f"encoder is {options.encoder!r}: give one of {known}")
+    names = list(_ENCODERS) if options.encoder == "auto" else [str(options.encoder)]
+    programs = _ffmpeg_programs()
+    reasons = []
+    for name in names:
+        quality, speed = _settings(_ENCODERS[name], options)
+        for program in programs:
+            reason = _probe(program, _ENCODERS[name], quality, speed)
+            if reason is None:
+                return name, program
+            reasons.append(f"{name}: {reason}")
+    if options.encoder == "auto":
+        tried = f"none of {', '.join(names)} works"
+        raise EncodeError(
+            f"no AV1 encoder: {tried} with {' or '.join(programs) or 'any ffmpeg'} "
+            f"({reasons[-1] if reasons else 'there is none'}): pip install imageio-ffmpeg"
+        )
+    raise EncodeError(
+        f"the encoder does not work here ({'; '.join(reasons) or 'there is no ffmpeg'}): give "
+        "another --encoder, such as auto"
+    )
+
+
+def _q_index(quality: int) -> int:
+    """Quantiser index (0 to 255) of a quality; libaom's own scale is nearly linear, too."""
+    return round(quality * 255 / (_NUM_QUALITIES - 1))
+
+
+def _settings(encoder: _Encoder, options: EncodeOptions) -> tuple[int, int]:
+    quality = encoder.quality if options.quality is None else options.quality
+    speed = encoder.speed if options.speed is None else options.speed
+    if not 0 <= quality < _NUM_QUALITIES:
+        raise OptionError(f"quality is {quality}: give 0 (best) to {_NUM_QUALITIES - 1}")
+    return quality, speed
+
+
+def _ffmpeg_programs() -> list[str]:
+    programs = []
+    with contextlib.suppress(RuntimeError):  # it has none for this system
+        programs.append(imageio_ffmpeg.get_ffmpeg_exe())
+    on_path = shutil.which("ffmpeg")
+    if on_path is not None and on_path not in programs:
+        programs.append(on_path)
+    return programs
+
+
+def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:
+    """Why an encoder does not work; None where it does."""
+    command = [
+        *(program, "-v", "error", "-nostdin", *encoder.before_input),
+        *("-f", "lavfi", "-i", "testsrc2=size=320x192:rate=25", "-frames:v", str(_PROBE_FRAMES)),
+        *("-vf", encoder.upload, "-c:v", encoder.ffmpeg_name, "-g", _KEY_FRAME_DISTANCE),
+        *(*encoder.words(quality, speed), "-f", "null", "-"),
+    ]
+    try:
+        run = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"no frame within {_PROBE_TIMEOUT:.0f} s"
+    except OSError as error:
+        return f"{program}: {error.strerror}"
+    return None if run.returncode == 0 else _last_words(run.stderr)
+
+
+def _run(command: Sequence[str], video: Path, report: Callable[[int], None]) -> int:
+    """Run ffmpeg and return the number of frames it wrote."""
+    count = dropped = doubled = 0
+    with tempfile.TemporaryFile() as words, _process(command, words) as process:
+        for line in process.stdout or ():
+            key, _, value = line.strip().partition("=")
+            if key == "frame":
+                count = int(value)
+                report(count)
+            elif key == "drop_frames":
+                dropped = int(value)
+            elif key == "dup_frames":
+                doubled = int(value)
+        status = process.wait()
+        words.seek(0)
+        reason = _last_words(words.read().decode(errors="replace"))
+    if status != 0:
+        if "No space left" in reason:
+            raise EncodeError(
+                f"{video}: the disk is full: free some space, or say where the stream goes"
+            )
+        if "Invalid data" in reason or "does not contain any stream" in reason:
+            raise VideoError(f"{video}: cannot be decoded: {reason}")
+        raise EncodeError(f"{video}: the encoder failed after {count} frames: {reason}")
+    if dropped or doubled:
+        raise EncodeError(
+            f"{video}: ffmpeg dropped {dropped} and doubled {doubled} frames, so frames of the "
+            "stream would not be those of the video: convert it with another program first"
+        )
+    return count
+
+
+@contextmanager
+def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen[str]]:
+    """A running ffmpeg that does not outlive what waits for it."""
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=words,  # type: ignore[call-overload]
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _last_words(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    # Later lines say that the conversion failed, the first says why.
+    return lines[0] if lines else "it ended without a word"
+
+
+def _look_at(video: Path) -> tuple[int | None, bool]:
+    """The number of frames, None where unknown, and whether FFmpeg's mov demuxer reads it."""
+    if not video.is_file():
+        raise VideoError(
+            f"{video}: {'is a folder' if video.is_dir() else 'no such file'}: give a video file"
+        )
+    try:
+        with av.open(os.path.abspath(video), container_options={"ignore_editlist": "1"}) as opened:
+            if not opened.streams.video:
+                raise VideoError(f"{video}: holds no video stream: give a video")
+            stream = opened.streams.video[0]
+            return stream.frames or None, "mov" in opened.format.name
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise VideoError(f"{video}: not a video, or damaged: {reason}") from error
+
+
+def _count_frames(stream: Path) -> int:
+    """Frames of a kept stream; 0 where it is damaged or no AV1."""
+    try:
+        with open_stream(stream) as opened:
+            return opened.num_frames or 0
+    except (VideoError, NotAv1Error):
+        return 0
+
+
+def _mark(encoder: str, quality: int, speed: int) -> str:
+    return f"{_MARK} encoder={encoder} quality={quality} speed={speed}"
+
+
+def _mark_of(stream: Path) -> dict[str, str] | None:
+    """What a kept stream was made with; None where it is none."""
+    try:
+        with av.open(os.path.abspath(stream)) as opened:
+            tags = {key.lower(): value for key, value in opened.metadata.items()}
+    except (av.error.FFmpegError, OSError, ValueError):
+        return None
+    name, *words = tags.get("comment", "").split(" ")
+    if name != _MARK:
+        return None
+    return dict(word.split("=", 1) for word in words)
+
+
+def _fits(mark: dict[str, str], options: EncodeOptions) -> bool:
+    """Whether a kept stream was made with what is asked for now."""
+    encoder = None if options.encoder == "auto" else options.encoder
+    wanted = {"encoder": encoder, "quality": options.quality, "speed": options.speed}
+    return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)
