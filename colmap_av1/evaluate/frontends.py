@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +29,7 @@ class Footage:
 
     Attributes:
         video: an AV1 video.
-        image_path: folder that holds the images.
+        image_path: folder that holds the images, decoded from the video or what it was made of.
         frames: the video's frames that are images, every `image_step`-th.
         image_step: distance between the frames that are images.
         camera: the camera of all images.
@@ -72,11 +73,11 @@ class Frontend:
     Attributes:
         run: fills the given database, which does not exist yet, from the footage, and returns
             the wall time of each stage. Called in a process of its own.
-        depends_on: what a result depends on beside footage and name.
+        depends_on: what a result depends on beside name, video, frames and camera.
     """
 
     run: Callable[[Footage, Path], dict[str, float]]
-    depends_on: Callable[[], tuple[str, ...]]
+    depends_on: Callable[[Footage], tuple[str, ...]]
 
 
 def prepare_footage(
@@ -134,7 +135,7 @@ def run_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
         }
 
     given = (content_of(footage.video), footage.frames, footage.camera)
-    result = kept(folder, (name, *given, *frontend.depends_on()), work)
+    result = kept(folder, (name, *given, *frontend.depends_on(footage)), work)
     if not database.is_file():
         raise EvaluationError(f"{folder}: its database is gone: remove the folder, run again")
     return FrontendRun(name, database, **result)
@@ -167,11 +168,18 @@ def _own_frontend(refine: Literal["none", "lk"], preset: Preset) -> Frontend:
     options = MatchOptions(
         refine=RefineOptions(refine=refine), density=DensityOptions(preset=preset)
     )
-    return Frontend(partial(_match, options), lambda: (repr(options), own_code()))
+    return Frontend(partial(_match, options), lambda _: (repr(options), own_code()))
 
 
 def _sift_frontend(pairing: Callable[[Path], None]) -> Frontend:
-    return Frontend(partial(_sift, pairing), lambda: (pycolmap.__version__,))
+    return Frontend(
+        partial(_sift, pairing), lambda footage: (pycolmap.__version__, _content_of_images(footage))
+    )
+
+
+def _content_of_images(footage: Footage) -> str:
+    digests = [content_of(footage.image_path / name) for name in footage.names]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def _pair_sequentially(database: Path) -> None:

@@ -58,6 +58,11 @@ from colmap_av1.model import read_model
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
+# Given the pictures the video was made of, not those decoded from it.
+FROM_SOURCE = {
+    "sift-sequential-source": "sift-sequential",
+    "sift-exhaustive-source": "sift-exhaustive",
+}
 # Where few and sure tracks give the poses, these are triangulated on them.
 DENSE = {"av1-sparse": "av1-dense", "av1-refined-sparse": "av1-refined-dense"}
 ENCODING = (
@@ -89,13 +94,18 @@ CASES = (
 
 @dataclass(frozen=True)
 class Material:
-    """What a case is measured on; `transfer` is the rendered clip's exact truth."""
+    """What a case is measured on.
+
+    `transfer` is the rendered clip's exact truth; `source` are ffmpeg's words for the pictures the
+    video was made of, where these are not rendered.
+    """
 
     video: Path
     num_frames: int
     camera: Any | None
     poses: Poses | None
     transfer: Callable[..., Any] | None = None
+    source: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,10 +153,10 @@ def main() -> int:
     parser.add_argument(
         "--frontends",
         nargs="+",
-        choices=list(FRONTENDS),
+        choices=[*FRONTENDS, *FROM_SOURCE],
         default=[name for name in FRONTENDS if not name.endswith("-dense")],
         metavar="NAME",
-        help=f"of {', '.join(FRONTENDS)}",
+        help=f"of {', '.join([*FRONTENDS, *FROM_SOURCE])}",
     )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
     arguments = parser.parse_args()
@@ -205,12 +215,18 @@ def measure_case(
     rows = []
     for name in frontends:
         console.print(f"{case.name}: {name}", markup=False)
+        if name in FROM_SOURCE and material.source is None:
+            continue
         try:
-            run = run_frontend(name, footage, folder / name)
+            given = (
+                footage if name not in FROM_SOURCE else source_footage(footage, material, folder)
+            )
+            run = run_frontend(FROM_SOURCE.get(name, name), given, folder / name)
+            run = replace(run, name=name)
             mapper = dense = None
             if mapping:
                 where = folder / f"{name}-model"
-                mapper = map_database(run.database, footage.image_path, where, settings)
+                mapper = map_database(run.database, given.image_path, where, settings)
                 if mapper.model is not None and name in DENSE:
                     dense = triangulate_all(DENSE[name], footage, folder, mapper.model)
         except ColmapAv1Error as error:
@@ -251,23 +267,43 @@ def real_sequence(case: Case, folder: Path, console: Console) -> Material:
     """A sequence of ../shared, encoded as AV1."""
     sequence = read_sequence(SEQUENCES / case.name)
     source = sequence.source
-    words = ["-i", str(source)]
+    words: tuple[str, ...] = ("-i", str(source))
     if source.is_dir():
         first = min(source.iterdir())
         pattern = source / f"%0{len(first.stem)}d{first.suffix}"
-        words = ["-framerate", str(sequence.fps), "-i", str(pattern)]
-    words += ENCODING.split()
+        words = ("-framerate", str(sequence.fps), "-i", str(pattern))
     video = folder / "video" / "video.mp4"
 
     def encode() -> dict[str, Any]:
         console.print(f"{case.name}: encoding", markup=False)
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words, str(video)]
-        subprocess.run(command, check=True)
+        ffmpeg(*words, *ENCODING.split(), str(video))
         return {"bytes": video.stat().st_size}
 
     pictures = sorted(source.iterdir()) if source.is_dir() else [source]
-    kept(video.parent, (words, [content_of(p) for p in pictures]), encode)
-    return Material(video, sequence.num_frames, sequence.camera, sequence.cam_from_world)
+    kept(video.parent, (words, ENCODING, [content_of(p) for p in pictures]), encode)
+    return Material(
+        video, sequence.num_frames, sequence.camera, sequence.cam_from_world, source=words
+    )
+
+
+def source_footage(footage: Footage, material: Material, folder: Path) -> Footage:
+    """The same footage with the pictures the video was made of."""
+    assert material.source is not None
+    words = material.source
+    images = folder / "source" / "images"
+
+    def work() -> dict[str, Any]:
+        images.mkdir()
+        ffmpeg(*words, "-start_number", "0", str(images / "frame_%06d.png"))
+        return {}
+
+    kept(images.parent, (words, content_of(footage.video)), work)
+    return replace(footage, image_path=images)
+
+
+def ffmpeg(*words: str) -> None:
+    """Run ffmpeg."""
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words], check=True)
 
 
 def known_truth(material: Material) -> Truth:
