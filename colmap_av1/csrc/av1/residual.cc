@@ -2,6 +2,8 @@
 // then dropped (specification sections 5.11.15 to 5.11.17, 5.11.34, 5.11.37 to 5.11.41, 5.11.47,
 // 5.11.48; contexts as in 8.3.2).
 #include <algorithm>
+#include <bit>
+#include <cstring>
 #include <vector>
 
 #include "av1/error.h"
@@ -11,28 +13,60 @@
 namespace colmap_av1::av1 {
 namespace {
 
-constexpr int kMargin = 4;  // of TileParser::levels_
+// TileParser::levels_ has room for 32x32 levels with a margin of 4 behind each row and below, so
+// that neighbours need no checks. All sizes share the stride: then it is a constant.
+constexpr int kLevelStride = 36;
 
-// find_tx_size( )
-int find_tx_size(int w, int h) {
-  for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) {
-    if (kTxWidth[tx_size] == w && kTxHeight[tx_size] == h) return tx_size;
+// By the logarithms of width and height less 2, TX_SIZES_ALL where there is none
+const auto kTxSizes = [] {
+  std::array<std::array<std::uint8_t, 5>, 5> sizes{};
+  for (auto& row : sizes) row.fill(TX_SIZES_ALL);
+  for (std::size_t i = 0; i < TX_SIZES_ALL; ++i) {
+    sizes[kTxWidthLog2[i] - 2][kTxHeightLog2[i] - 2] = static_cast<std::uint8_t>(i);
   }
-  throw BitstreamError("transform tree gives no transform size");
+  return sizes;
+}();
+
+// find_tx_size( ) of powers of two from 4 to 64
+int find_tx_size(int w, int h) {
+  const int log2_w = std::bit_width(static_cast<unsigned>(w)) - 3;
+  const int log2_h = std::bit_width(static_cast<unsigned>(h)) - 3;
+  const int tx_size = kTxSizes[log2_w][log2_h];
+  if (tx_size == TX_SIZES_ALL) throw BitstreamError("transform tree gives no transform size");
+  return tx_size;
 }
 
-int tx_class(int tx_type) {
-  switch (tx_type) {
-    case V_DCT:
-    case V_ADST:
-    case V_FLIPADST:
-      return TX_CLASS_VERT;
-    case H_DCT:
-    case H_ADST:
-    case H_FLIPADST:
-      return TX_CLASS_HORIZ;
-    default:
-      return TX_CLASS_2D;
+constexpr auto kTxClasses = [] {
+  std::array<std::uint8_t, TX_TYPES> classes{};
+  classes.fill(TX_CLASS_2D);
+  for (const int type : {V_DCT, V_ADST, V_FLIPADST}) classes[type] = TX_CLASS_VERT;
+  for (const int type : {H_DCT, H_ADST, H_FLIPADST}) classes[type] = TX_CLASS_HORIZ;
+  return classes;
+}();
+
+// Contexts of neighbours are handled eight at a time, in words.
+constexpr std::uint64_t kOnes = 0x0101010101010101;
+
+constexpr std::uint64_t first_bytes(int count) {
+  if (count >= 8) return ~std::uint64_t{0};
+  if constexpr (std::endian::native == std::endian::little) {
+    return (std::uint64_t{1} << (8 * count)) - 1;
+  }
+  return ~(~std::uint64_t{0} >> (8 * count));
+}
+
+std::uint64_t load_word(const std::uint8_t* p) {
+  std::uint64_t word;
+  std::memcpy(&word, p, sizeof word);
+  return word;
+}
+
+// The first `count` entries, 1 to 16, become `value` up to `visible` and 0 behind.
+void set_contexts(std::uint8_t* p, int count, int visible, std::uint8_t value) {
+  for (; count > 0; p += 8, count -= 8, visible -= 8) {
+    const std::uint64_t word = (load_word(p) & ~first_bytes(count)) |
+                               (kOnes * value & first_bytes(std::clamp(visible, 0, count)));
+    std::memcpy(p, &word, sizeof word);
   }
 }
 
@@ -102,7 +136,7 @@ class ScanTables {
         const int row = pos >> bwl;
         const int col = pos - (row << bwl);
         ScanEntry entry;
-        entry.index = static_cast<std::uint16_t>(pos + row * kMargin);
+        entry.index = static_cast<std::uint16_t>(row * kLevelStride + col);
         bool near;
         if (c == TX_CLASS_2D) {
           entry.base_offset = kCoeffBaseCtxOffset[tx_size][std::min(row, 4)][std::min(col, 4)];
@@ -128,6 +162,7 @@ const ScanTables kScanTables;
 // up to 3 in the high two, for coeff_base: one sum over the neighbours serves both contexts.
 constexpr int kLevelMask = 63;
 constexpr int kClippedShift = 6;
+constexpr int kMaxLevel = NUM_BASE_LEVELS + 1 + COEFF_BASE_RANGE;  // from it on a Golomb code
 
 }  // namespace
 
@@ -381,37 +416,23 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
   std::uint8_t* above = above_coef_context_[plane].data() + x4;
   std::uint8_t* left = left_coef_context_[plane].data() + (y4 & kSbMask);
 
-  // Contexts of all_zero and dc_sign. Entries behind the frame's edge are kept at 0.
-  int top_level = 0, left_level = 0, any_above = 0, any_left = 0, dc_sum = 0;
-  const auto dc_value = [](int context) { return (context >> 7) - ((context >> 6) & 1); };
-  for (int k = 0; k < w4; ++k) {
-    top_level = std::max(top_level, above[k] & 63);
-    any_above |= above[k];
-    dc_sum += dc_value(above[k]);
-  }
-  for (int k = 0; k < h4; ++k) {
-    left_level = std::max(left_level, left[k] & 63);
-    any_left |= left[k];
-    dc_sum += dc_value(left[k]);
-  }
+  // Context of all_zero. Entries behind the frame's edge are kept at 0.
+  std::uint64_t any_above = load_word(above) & first_bytes(w4);
+  if (w4 > 8) any_above |= load_word(above + 8);
+  std::uint64_t any_left = load_word(left) & first_bytes(h4);
+  if (h4 > 8) any_left |= load_word(left + 8);
   const int plane_size = kSubsampledSize[b_->mi_size][sub_x][sub_y];
   const int bw = kBlockWidth[plane_size];
   const int bh = kBlockHeight[plane_size];
   int ctx;
   if (plane == 0) {
-    const int max_level = std::max(top_level, left_level);
-    const int min_level = std::min(top_level, left_level);
-    if (bw == kTxWidth[tx_size] && bh == kTxHeight[tx_size]) {
-      ctx = 0;
-    } else if (max_level == 0) {
-      ctx = 1;
-    } else if (min_level == 0) {
-      ctx = 2 + (max_level > 3);
-    } else if (max_level <= 3) {
-      ctx = 4;
-    } else {
-      ctx = min_level <= 3 ? 5 : 6;
-    }
+    // Whether the greatest level is 0, at most 3, or above
+    const auto grade = [](std::uint64_t any) {
+      return ((any & kOnes * 63) != 0) + ((any & kOnes * 60) != 0);
+    };
+    constexpr std::uint8_t kContexts[3][3] = {{1, 2, 3}, {2, 4, 5}, {3, 5, 6}};
+    const bool whole = bw == kTxWidth[tx_size] && bh == kTxHeight[tx_size];
+    ctx = whole ? 0 : kContexts[grade(any_above)][grade(any_left)];
   } else {
     ctx = 7 + (any_above != 0) + (any_left != 0);
     if (bw * bh > kTxWidth[tx_size] * kTxHeight[tx_size]) ctx += 3;
@@ -419,47 +440,29 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
   const bool all_zero = read_flag(cdf_.txb_skip[tx_size_ctx][ctx]);
 
   int tx_type = DCT_DCT;
-  int cul_level = 0;
-  int dc_category = 0;
+  std::uint8_t context = 0;
   if (!all_zero) {
     tx_type = plane == 0 ? read_transform_type(tx_size) : plane_tx_type(plane, tx_size, x4, y4);
     // TxTypes keeps what was read; a lossless or 64 wide block is DCT_DCT either way.
-    const int c = tx_class(tx_type);
+    const int c = kTxClasses[tx_type];
     const int eob = read_eob(tx_size, tx_size_ctx, ptype, c);
     b_->num_coefficients += eob;
-    const int num_levels =
-        c == TX_CLASS_2D      ? read_levels<TX_CLASS_2D>(tx_size, tx_size_ctx, ptype, eob)
-        : c == TX_CLASS_HORIZ ? read_levels<TX_CLASS_HORIZ>(tx_size, tx_size_ctx, ptype, eob)
-                              : read_levels<TX_CLASS_VERT>(tx_size, tx_size_ctx, ptype, eob);
-    SymbolDecoder symbols = symbols_;  // in registers, as in read_levels
-    for (int i = num_levels - 1; i >= 0; --i) {
-      const int index = nonzero_[i];
-      int level = levels_[index] & kLevelMask;
-      levels_[index] = 0;  // the array is all 0 between transform blocks
-      bool sign;
-      if (index == 0) {
-        const int sign_ctx = dc_sum < 0 ? 1 : dc_sum > 0 ? 2 : 0;
-        sign = symbols.flag(cdf_.dc_sign[ptype][sign_ctx]);
-      } else {
-        sign = symbols.bit();
+    // Context of dc_sign: positive less negative neighbours
+    int dc_sum = 0;
+    const auto add_signs = [&](const std::uint8_t* p, int count) {
+      for (; count > 0; p += 8, count -= 8) {
+        const std::uint64_t word = load_word(p) & first_bytes(count);
+        dc_sum += static_cast<int>(((word >> 7 & kOnes) * kOnes) >> 56) -
+                  static_cast<int>(((word >> 6 & kOnes) * kOnes) >> 56);
       }
-      if (level > NUM_BASE_LEVELS + COEFF_BASE_RANGE) {
-        int length = 1;
-        while (!symbols.bit()) {
-          if (++length > 20) {
-            levels_.fill(0);
-            throw BitstreamError("coefficient is too large");
-          }
-        }
-        int x = 1;
-        for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols.bit();
-        level = (x + COEFF_BASE_RANGE + NUM_BASE_LEVELS) & 0xFFFFF;
-      }
-      if (index == 0 && level > 0) dc_category = sign ? 1 : 2;
-      cul_level += level;
-    }
-    cul_level = std::min(63, cul_level);
-    symbols_ = symbols;
+    };
+    add_signs(above, w4);
+    add_signs(left, h4);
+    const int dc_sign_ctx = dc_sum < 0 ? 1 : dc_sum > 0 ? 2 : 0;
+    const auto read_levels = c == TX_CLASS_2D      ? &TileParser::read_levels<TX_CLASS_2D>
+                             : c == TX_CLASS_HORIZ ? &TileParser::read_levels<TX_CLASS_HORIZ>
+                                                   : &TileParser::read_levels<TX_CLASS_VERT>;
+    context = (this->*read_levels)(tx_size, tx_size_ctx, ptype, eob, dc_sign_ctx);
   }
   if (plane == 0 && b_->is_inter) {
     for (int i = 0; i < h4; ++i) {
@@ -467,13 +470,8 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
                   static_cast<std::uint8_t>(tx_type));
     }
   }
-  const auto value = static_cast<std::uint8_t>(cul_level | (dc_category << 6));
-  const int visible_w = std::min(w4, (header_->mi_cols >> sub_x) - x4);
-  const int visible_h = std::min(h4, (header_->mi_rows >> sub_y) - y4);
-  std::fill_n(above, visible_w, value);
-  std::fill_n(above + visible_w, w4 - visible_w, std::uint8_t{0});
-  std::fill_n(left, visible_h, value);
-  std::fill_n(left + visible_h, h4 - visible_h, std::uint8_t{0});
+  set_contexts(above, w4, (header_->mi_cols >> sub_x) - x4, context);
+  set_contexts(left, h4, (header_->mi_rows >> sub_y) - y4, context);
 }
 
 int TileParser::read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class) {
@@ -500,70 +498,114 @@ int TileParser::read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class) 
   return eob;
 }
 
-// The levels of coeffs( ) up to the Golomb codes, from the last position to the first, into
-// levels_ (row after row with a margin, so that neighbours need no checks). Returns how many are
-// not 0; nonzero_ holds their places.
+// The levels and signs of coeffs( ). Returns the context that the block leaves behind.
 template <int kTxClass>
-int TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob) {
-  const int adjusted = kAdjustedTxSize[tx_size];
-  const int stride = kTxWidth[adjusted] + kMargin;
+std::uint8_t TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob,
+                                     int dc_sign_ctx) {
+  constexpr int kStride = kLevelStride;
   const ScanEntry* scan = kScanTables.get(tx_size, kTxClass);
   auto& base_cdfs = cdf_.coeff_base[tx_size_ctx][ptype];
   auto& br_cdfs = cdf_.coeff_br[std::min(tx_size_ctx, TX_32X32)][ptype];
-  int num_levels = 0;
+  int num_nonzero = 0;
+  int num_large = 0;
+  int sum = 0;
   // A copy, so that its state stays in registers: writes to levels_ and to the CDFs could change a
   // member for all the compiler knows.
   SymbolDecoder symbols = symbols_;
-  for (int c = eob - 1; c >= 0; --c) {
-    const ScanEntry entry = scan[c];
-    std::uint8_t* at = &levels_[entry.index];
-    // Neighbours that both contexts use
-    int mag = at[1] + at[stride];
-    if constexpr (kTxClass == TX_CLASS_2D) {
-      mag += at[stride + 1];
-    } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
-      mag += at[2];
-    } else {
-      mag += at[2 * stride];
-    }
-    int level;
-    if (c == eob - 1) {
-      const int size = kTxWidth[adjusted] * kTxHeight[adjusted];
-      const int ctx = c == 0 ? 0 : c <= size / 8 ? 1 : c <= size / 4 ? 2 : 3;
-      level = symbols.symbol<3>(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
-    } else {
-      int sum = mag;
-      if constexpr (kTxClass == TX_CLASS_2D) {
-        sum += at[2] + at[2 * stride];
-      } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
-        sum += at[3] + at[4];
-      } else {
-        sum += at[3 * stride] + at[4 * stride];
-      }
-      // Min( ( sum of clipped levels + 1 ) >> 1, 4 ). The low bits of five levels carry into
-      // the clipped sum only where that is 15.
-      int ctx = std::min((sum + (1 << kClippedShift)) >> (kClippedShift + 1), 4);
-      if (kTxClass == TX_CLASS_2D && c == 0) {
-        ctx = 0;
-      } else {
-        ctx += entry.base_offset;
-      }
-      level = symbols.symbol<4>(base_cdfs[ctx]);
-    }
+
+  // Reads coeff_br where `level` asks for it, and stores the level. `near` sums up the neighbours
+  // that its context looks at.
+  const auto complete = [&](std::uint8_t* at, int level, int near, int br_offset) {
+    int stored = level * ((1 << kClippedShift) + 1);
     if (level > NUM_BASE_LEVELS) {
-      const int ctx = std::min(((mag & kLevelMask) + 1) >> 1, 6) + entry.br_offset;
+      auto& cdf = br_cdfs[std::min(((near & kLevelMask) + 1) >> 1, 6) + br_offset];
       for (int idx = 0; idx < COEFF_BASE_RANGE / (BR_CDF_SIZE - 1); ++idx) {
-        const int coeff_br = symbols.symbol<BR_CDF_SIZE>(br_cdfs[ctx]);
+        const int coeff_br = symbols.symbol<BR_CDF_SIZE>(cdf);
         level += coeff_br;
         if (coeff_br < BR_CDF_SIZE - 1) break;
       }
+      if (level == kMaxLevel) large_[num_large++] = static_cast<std::uint16_t>(num_nonzero);
+      stored = level + (3 << kClippedShift);
     }
-    *at = static_cast<std::uint8_t>(level | (std::min(level, 3) << kClippedShift));
-    nonzero_[num_levels] = entry.index;
-    num_levels += level != 0;
+    *at = static_cast<std::uint8_t>(stored);
+    num_nonzero += level != 0;
+    sum += level;
+  };
+
+  // The last coefficient: it is not 0, and none of its neighbours is read yet.
+  const int last = eob - 1;
+  {
+    const int adjusted = kAdjustedTxSize[tx_size];
+    const int size = kTxWidth[adjusted] * kTxHeight[adjusted];
+    const int ctx = last == 0 ? 0 : last <= size / 8 ? 1 : last <= size / 4 ? 2 : 3;
+    const int level = symbols.symbol<3>(cdf_.coeff_base_eob[tx_size_ctx][ptype][ctx]) + 1;
+    complete(&levels_[scan[last].index], level, 0, scan[last].br_offset);
   }
+  const auto read_level = [&](ScanEntry entry, bool is_dc) {
+    std::uint8_t* at = &levels_[entry.index];
+    // Neighbours that both contexts look at
+    int near = at[1] + at[kStride];
+    int far;
+    if constexpr (kTxClass == TX_CLASS_2D) {
+      near += at[kStride + 1];
+      far = at[2] + at[2 * kStride];
+    } else if constexpr (kTxClass == TX_CLASS_HORIZ) {
+      near += at[2];
+      far = at[3] + at[4];
+    } else {
+      near += at[2 * kStride];
+      far = at[3 * kStride] + at[4 * kStride];
+    }
+    // Min( ( sum of clipped levels + 1 ) >> 1, 4 ). The low bits of five levels carry into the
+    // clipped sum only where that is 15.
+    int ctx = std::min((near + far + (1 << kClippedShift)) >> (kClippedShift + 1), 4);
+    ctx = kTxClass == TX_CLASS_2D && is_dc ? 0 : ctx + entry.base_offset;
+    complete(at, symbols.symbol<4>(base_cdfs[ctx]), near, entry.br_offset);
+  };
+  for (int c = last - 1; c > 0; --c) read_level(scan[c], false);
+  if (last > 0) read_level(scan[0], true);
+
+  // Signs and Golomb codes, from the first coefficient to the last: nothing is kept of them but
+  // what contexts need.
+  const int dc = levels_[0] & kLevelMask;
+  // levels_ is all 0 between transform blocks.
+  const int end = scan[last].index;
+  const int num_rows = kTxClass == TX_CLASS_2D
+                           ? std::min<int>(kTxHeight[kAdjustedTxSize[tx_size]],
+                                           end / kStride + end % kStride + 1)
+                           : kTxHeight[tx_size];
+  std::memset(levels_.data(), 0, static_cast<std::size_t>(num_rows * kStride));
+  const auto golomb = [&] {
+    int length = 1;
+    while (!symbols.bit()) {
+      if (++length > 20) throw BitstreamError("coefficient is too large");
+    }
+    int x = 1;
+    for (int k = length - 2; k >= 0; --k) x = (x << 1) | symbols.bit();
+    return (x + COEFF_BASE_RANGE + NUM_BASE_LEVELS) & 0xFFFFF;
+  };
+  int num_signs = num_nonzero;
+  int dc_category = 0;
+  if (dc != 0) {
+    const bool sign = symbols.flag(cdf_.dc_sign[ptype][dc_sign_ctx]);
+    --num_signs;
+    int level = dc;
+    if (level == kMaxLevel) {
+      level = golomb();
+      sum += level - kMaxLevel;
+      --num_large;
+    }
+    if (level > 0) dc_category = sign ? 1 : 2;
+  }
+  while (num_large > 0) {
+    const int before = large_[--num_large];  // nonzero coefficients that come later
+    symbols.skip_bits(num_signs - before);
+    num_signs = before;
+    sum += golomb() - kMaxLevel;
+  }
+  symbols.skip_bits(num_signs);
   symbols_ = symbols;
-  return num_levels;
+  return static_cast<std::uint8_t>(std::min(63, sum) | (dc_category << 6));
 }
 
 }  // namespace colmap_av1::av1

@@ -56,12 +56,12 @@ class SymbolDecoder {
     const bool result = flag_without_update(v);
     if (update_) {
       const std::uint32_t count = icdf[2];
-      const int rate = 4 + (count > 15) + (count > 31);
+      const std::uint32_t rate = 4 + (count >> 4);
       const std::uint32_t target = result ? 32768 : 0;
       const std::uint32_t up = (target - v) >> rate;  // of a symbol 1: the bound rises
       const std::uint32_t down = v >> rate;
       icdf[0] = static_cast<std::uint16_t>(result ? v + up : v - down);
-      icdf[2] = static_cast<std::uint16_t>(count + (count < 32));
+      icdf[2] = static_cast<std::uint16_t>(count + 1 - (count >> 5));
     }
     return result;
   }
@@ -84,6 +84,23 @@ class SymbolDecoder {
     int x = 0;
     for (int i = 0; i < n; ++i) x = 2 * x + bit();
     return x;
+  }
+
+  // Reads n bits and drops them.
+  void skip_bits(int n) {
+    for (; n > 0; --n) {
+      const std::uint32_t half = ((range_ >> 8) << 7) + 4;
+      const std::uint64_t subtrahend = static_cast<std::uint64_t>(half) << 48;
+      // All ones for a bit 0, all zeros for a 1
+      const std::uint64_t mask = static_cast<std::uint64_t>(window_ < subtrahend) - 1;
+      const std::uint32_t range = half + ((range_ - 2 * half) & static_cast<std::uint32_t>(mask));
+      // Halves of a range lie between 16380 and 32895, so two bits tell the shift.
+      const int bits = 2 - static_cast<int>(range >> 14);
+      range_ = range << bits;
+      window_ = (window_ - (subtrahend & mask)) << bits;
+      available_ -= bits;
+      if (available_ < 0) refill();
+    }
   }
 
   // NS(n)
@@ -121,8 +138,12 @@ class SymbolDecoder {
   template <int N>
   static constexpr int kLanes = N <= 4 ? 4 : N <= 8 ? 8 : 16;
 
+  // The counter stops at 32.
   static int adaptation_rate(int count, int n) {
-    return 3 + (count > 15) + (count > 31) + (n >= 4 ? 2 : 1);  // Min( FloorLog2( N ), 2 )
+    return 3 + (count >> 4) + (n >= 4 ? 2 : 1);  // Min( FloorLog2( N ), 2 )
+  }
+  static std::uint16_t next_count(int count) {
+    return static_cast<std::uint16_t>(count + 1 - (count >> 5));
   }
 
 #if defined(__SSE2__)
@@ -133,11 +154,11 @@ class SymbolDecoder {
   int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
     constexpr int kVectors = N <= 8 ? 1 : 2;
     // (((r >> 8) * (f >> 6)) >> 1) as the upper half of ((r >> 8) << 8) * ((f >> 6) << 7)
-    const __m128i r = _mm_set1_epi16(static_cast<short>(range_ & 0xFF00));
-    const __m128i value = _mm_set1_epi16(static_cast<short>(window_ >> 48));
+    const __m128i r = broadcast<N>(_mm_cvtsi32_si128(static_cast<int>(range_ & 0xFF00)));
+    const __m128i value = broadcast<N>(_mm_cvtsi32_si128(static_cast<int>(window_ >> 48)));
     const __m128i lane = _mm_set_epi16(7, 6, 5, 4, 3, 2, 1, 0);
     __m128i f[kVectors];
-    __m128i below[kVectors];
+    __m128i from_symbol[kVectors];  // all ones in the lanes of the symbol and behind
     unsigned mask = 0;
     for (int k = 0; k < kVectors; ++k) {
       f[k] = load<N>(icdf + 8 * k);
@@ -146,33 +167,38 @@ class SymbolDecoder {
           _mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
       const __m128i bound = _mm_add_epi16(_mm_mulhi_epu16(scaled, r), least);
       store<N>(bounds + 8 * k, bound);
-      // value < bound, unsigned
-      const __m128i not_below = _mm_cmpeq_epi16(_mm_subs_epu16(bound, value), _mm_setzero_si128());
-      below[k] = _mm_xor_si128(not_below, _mm_set1_epi16(-1));
-      mask |= static_cast<unsigned>(_mm_movemask_epi8(below[k])) << (16 * k);
+      // bound <= value, unsigned. It holds in the last lane, where the bound is 0.
+      from_symbol[k] = _mm_cmpeq_epi16(_mm_subs_epu16(bound, value), _mm_setzero_si128());
+      mask |= static_cast<unsigned>(_mm_movemask_epi8(from_symbol[k])) << (16 * k);
     }
-    constexpr unsigned kMask =
-        N == 16 ? 0x3FFFFFFFU : static_cast<unsigned>((std::uint64_t{1} << (2 * (N - 1))) - 1);
-    const int symbol = std::countr_one(mask & kMask) >> 1;
+    const int symbol = std::countr_zero(mask | 1U << (2 * N - 1)) >> 1;
     if (update_) {
       const int count = icdf[N];
       const __m128i rate = _mm_cvtsi32_si128(adaptation_rate(count, N));
       for (int k = 0; k < kVectors; ++k) {
-        // v + ((32768 - v) >> rate) before the symbol, v - (v >> rate) from it on
-        const __m128i one = _mm_set1_epi16(static_cast<short>(0x8000));
-        const __m128i flipped = _mm_sub_epi16(_mm_and_si128(below[k], one), f[k]);
-        const __m128i magnitude = _mm_or_si128(_mm_and_si128(below[k], flipped),
-                                               _mm_andnot_si128(below[k], f[k]));
-        const __m128i step = _mm_srl_epi16(magnitude, rate);
-        const __m128i negative = _mm_xor_si128(below[k], _mm_set1_epi16(-1));
-        const __m128i delta = _mm_sub_epi16(_mm_xor_si128(step, negative), negative);
-        const __m128i used =
-            _mm_cmplt_epi16(lane, _mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)));
-        store<N>(icdf + 8 * k, _mm_add_epi16(f[k], _mm_and_si128(delta, used)));
+        // v + ((32768 - v) >> rate) before the symbol; from it on v - (v >> rate), which is
+        // v + 1 + ((-1 - v) >> rate). Entries stay between 1 and 32767.
+        const __m128i target =
+            _mm_or_si128(from_symbol[k], _mm_set1_epi16(static_cast<short>(0x8000)));
+        __m128i step = _mm_sub_epi16(_mm_sra_epi16(_mm_sub_epi16(target, f[k]), rate),
+                                     from_symbol[k]);
+        if constexpr (N != 4 && N != 8 && N != 16) {
+          const __m128i used =
+              _mm_cmplt_epi16(lane, _mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)));
+          step = _mm_and_si128(step, used);
+        }
+        store<N>(icdf + 8 * k, _mm_add_epi16(f[k], step));
       }
-      icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
+      icdf[N] = next_count(count);
     }
     return symbol;
+  }
+
+  // The low 16 bits in the lanes that arrays of N symbols use.
+  template <int N>
+  static __m128i broadcast(__m128i v) {
+    const __m128i low = _mm_shufflelo_epi16(v, 0);
+    return N <= 4 ? low : _mm_unpacklo_epi64(low, low);
   }
 
   // Arrays of up to 4 symbols take half a register.
@@ -211,7 +237,7 @@ class SymbolDecoder {
         icdf[i] =
             static_cast<std::uint16_t>(i < symbol ? v + ((32768 - v) >> rate) : v - (v >> rate));
       }
-      icdf[N] = static_cast<std::uint16_t>(count + (count < 32));
+      icdf[N] = next_count(count);
     }
     return symbol;
   }

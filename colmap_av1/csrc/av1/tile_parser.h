@@ -127,7 +127,7 @@ class TileParser {
   void coeffs(int plane, int x4, int y4, int tx_size);
   int read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class);
   template <int kTxClass>
-  int read_levels(int tx_size, int tx_size_ctx, int ptype, int eob);
+  std::uint8_t read_levels(int tx_size, int tx_size_ctx, int ptype, int eob, int dc_sign_ctx);
 
   // A symbol of a CDF array with M - 1 values.
   template <std::size_t M>
@@ -196,10 +196,10 @@ class TileParser {
   WarpSamples warp_samples_{};
   int num_samples_ = 0, num_samples_scanned_ = 0;
 
-  // Coefficient levels of a transform block with a margin of 4 behind each row and below, and
-  // where they are not 0
+  // Coefficient levels of a transform block with a margin of 4 behind each row and below, and for
+  // each that a Golomb code follows how many that are not 0 were read before
   std::array<std::uint8_t, 36 * 36> levels_{};
-  std::array<std::uint16_t, 32 * 32> nonzero_{};
+  std::array<std::uint16_t, 32 * 32> large_{};
 };
 
 }  // namespace colmap_av1::av1
