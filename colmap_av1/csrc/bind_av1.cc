@@ -26,18 +26,19 @@ using av1::ParserOptions;
 using av1::SequenceHeader;
 
 // Hands a vector's memory to NumPy without a copy.
-template <typename T, typename U>
-nb::object adopt(std::vector<U>&& data, std::initializer_list<std::size_t> shape) {
+template <typename T, typename U, typename A>
+nb::object adopt(std::vector<U, A>&& data, std::initializer_list<std::size_t> shape) {
   static_assert(sizeof(U) % sizeof(T) == 0);
-  auto* owner = new std::vector<U>(std::move(data));
-  nb::capsule capsule(owner, [](void* p) noexcept { delete static_cast<std::vector<U>*>(p); });
+  using Vector = std::vector<U, A>;
+  auto* owner = new Vector(std::move(data));
+  nb::capsule capsule(owner, [](void* p) noexcept { delete static_cast<Vector*>(p); });
   return nb::cast(nb::ndarray<nb::numpy, T>(reinterpret_cast<T*>(owner->data()), shape, capsule));
 }
 
 template <typename T>
 nb::object adopt(std::vector<T>&& data) {
   const std::size_t size = data.size();
-  return adopt<T, T>(std::move(data), {size});
+  return adopt<T>(std::move(data), {size});
 }
 
 template <typename Array>
@@ -172,7 +173,7 @@ nb::dict take_units(Event& event) {
   nb::dict d;
   d["mv"] = adopt<std::int16_t>(std::move(u.mv), {rows, cols, 2, 2});
   d["ref_frame"] = adopt<std::int8_t>(std::move(u.ref_frame), {rows, cols, 2});
-  const auto bytes = [&](const char* name, std::vector<std::uint8_t>& data) {
+  const auto bytes = [&](const char* name, av1::UnitVector<std::uint8_t>& data) {
     d[name] = adopt<std::uint8_t>(std::move(data), {rows, cols});
   };
   bytes("mi_size", u.mi_size);

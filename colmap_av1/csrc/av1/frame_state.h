@@ -94,6 +94,7 @@ struct FrameState {
 struct MotionFieldEntry {
   Mv mv;
   std::int8_t ref_offset = 0;
+  friend bool operator==(const MotionFieldEntry&, const MotionFieldEntry&) = default;
 };
 
 // Room for blocks that touches no memory before a block is written: most frames have far fewer
@@ -119,6 +120,7 @@ struct FrameContext {
   const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0
   std::array<bool, TOTAL_REFS_PER_FRAME> ref_present{};
   std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};  // is_scaled( )
+  std::array<int, TOTAL_REFS_PER_FRAME> ref_distance{};  // this frame's OrderHint less theirs
 
   BlockInfo*& at(int row, int col) {
     return grid[static_cast<std::size_t>(row) * static_cast<std::size_t>(header->mi_cols) +

@@ -3,8 +3,6 @@
 #include <algorithm>
 #include <cstdlib>
 
-#include "av1/spec_tables.h"
-
 namespace colmap_av1::av1 {
 namespace {
 
@@ -32,9 +30,13 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
   const int ref_to_cur = seq.relative_dist(src_hint, header.order_hint);
   if (std::abs(ref_to_cur) > MAX_FRAME_DISTANCE) return true;
   std::array<int, TOTAL_REFS_PER_FRAME> ref_offsets{};
+  std::array<int, TOTAL_REFS_PER_FRAME> factors{};
   for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
     const int offset = seq.relative_dist(src_hint, source->header.order_hints[ref]);
     ref_offsets[ref] = offset > 0 && offset <= MAX_FRAME_DISTANCE ? offset : 0;
+    if (ref_offsets[ref] > 0) {
+      factors[ref] = projection_factor(ref_to_cur * dst_sign, ref_offsets[ref]);
+    }
   }
   const SavedMotion* saved = source->saved_motion.data();
   for (int y8 = 0; y8 < h8; ++y8) {
@@ -42,7 +44,7 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
       if (saved->ref_frame <= INTRA_FRAME) continue;
       const int ref_offset = ref_offsets[saved->ref_frame];
       if (ref_offset == 0) continue;
-      const Mv projected = project_mv(saved->mv, ref_to_cur * dst_sign, ref_offset);
+      const Mv projected = project_mv(saved->mv, factors[saved->ref_frame]);
       int pos_y8, pos_x8;
       if (!project_position(y8, projected.row, dst_sign, h8, MAX_OFFSET_HEIGHT, pos_y8) ||
           !project_position(x8, projected.col, dst_sign, w8, MAX_OFFSET_WIDTH, pos_x8)) {
@@ -57,19 +59,6 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
 }
 
 }  // namespace
-
-Mv project_mv(Mv mv, int numerator, int denominator) {
-  const int clipped_denominator = std::min(MAX_FRAME_DISTANCE, denominator);
-  const int clipped_numerator = std::clamp(numerator, -MAX_FRAME_DISTANCE, MAX_FRAME_DISTANCE);
-  const int factor = clipped_numerator * kDivMult[clipped_denominator];
-  const auto scale = [factor](int v) {
-    const int product = v * factor;
-    const int scaled =
-        product >= 0 ? (product + (1 << 13)) >> 14 : -((-product + (1 << 13)) >> 14);
-    return static_cast<std::int16_t>(std::clamp(scaled, -(1 << 14) + 1, (1 << 14) - 1));
-  };
-  return {scale(mv.row), scale(mv.col)};
-}
 
 void estimate_motion_field(const SequenceHeader& seq, const FrameHeader& header,
                            const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references,

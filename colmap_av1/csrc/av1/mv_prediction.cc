@@ -167,6 +167,7 @@ void TileParser::scan_point(int delta_row, int delta_col, bool is_compound) {
 
 // 7.10.2.5 Temporal scan process
 void TileParser::temporal_scan(bool is_compound) {
+  temporal_index_ = -1;
   const int step_w4 = bw4_ >= 16 ? 4 : 2;
   const int step_h4 = bh4_ >= 16 ? 4 : 2;
   for (int delta_row = 0; delta_row < std::min(bh4_, 16); delta_row += step_h4) {
@@ -198,27 +199,33 @@ void TileParser::temporal_sample(int delta_row, int delta_col, bool is_compound)
                                static_cast<std::size_t>(header_->mi_cols >> 1) +
                            static_cast<std::size_t>(col >> 1)];
   if (entry.ref_offset == 0) return;
+  // Neighbours often hold the same motion: it projects to the same vectors.
+  if (temporal_index_ >= 0 && !first && entry == temporal_entry_) {
+    stack_[temporal_index_].weight += 2;
+    return;
+  }
   std::array<Mv, 2> candidate{};
   bool far = false;
   for (int list = 0; list < 1 + is_compound; ++list) {
-    const int distance = seq_->relative_dist(header_->order_hint,
-                                             header_->order_hints[b_->ref_frame[list]]);
-    candidate[list] = project_mv(entry.mv, distance, entry.ref_offset);
+    const int distance = frame_->ref_distance[b_->ref_frame[list]];
+    candidate[list] = project_mv(entry.mv, projection_factor(distance, entry.ref_offset));
     lower_mv_precision(candidate[list]);
     far |= differs_by_16(candidate[list], global_mvs_[list]);
   }
   if (first) zero_mv_context_ = far;
-  add_to_stack(candidate[0], candidate[1], is_compound, 2);
+  temporal_entry_ = entry;
+  temporal_index_ = add_to_stack(candidate[0], candidate[1], is_compound, 2);
 }
 
 // 7.10.2.7 Add reference motion vector process with 7.10.2.8 and 7.10.2.9, the search stack
 // processes
 void TileParser::add_ref_mv_candidate(const BlockInfo& candidate, bool is_compound, int weight) {
   if (!candidate.is_inter) return;
-  const bool large =
-      std::min(kBlockWidth[candidate.mi_size], kBlockHeight[candidate.mi_size]) >= 8;
+  const auto is_large = [&] {
+    return std::min(kBlockWidth[candidate.mi_size], kBlockHeight[candidate.mi_size]) >= 8;
+  };
   const auto candidate_mv = [&](int cand_list, int list, bool global) {
-    Mv mv = global && header_->gm_type[b_->ref_frame[list]] > TRANSLATION && large
+    Mv mv = global && header_->gm_type[b_->ref_frame[list]] > TRANSLATION && is_large()
                 ? global_mvs_[list]
                 : candidate.mv[cand_list];
     lower_mv_precision(mv);
@@ -241,14 +248,16 @@ void TileParser::add_ref_mv_candidate(const BlockInfo& candidate, bool is_compou
   }
 }
 
-void TileParser::add_to_stack(Mv mv0, Mv mv1, bool is_compound, int weight) {
+int TileParser::add_to_stack(Mv mv0, Mv mv1, bool is_compound, int weight) {
   for (int idx = 0; idx < num_mv_found_; ++idx) {
     if (stack_[idx].mv[0] == mv0 && (!is_compound || stack_[idx].mv[1] == mv1)) {
       stack_[idx].weight += weight;
-      return;
+      return idx;
     }
   }
-  if (num_mv_found_ < MAX_REF_MV_STACK_SIZE) stack_[num_mv_found_++] = {{mv0, mv1}, weight};
+  if (num_mv_found_ == MAX_REF_MV_STACK_SIZE) return -1;
+  stack_[num_mv_found_] = {{mv0, mv1}, weight};
+  return num_mv_found_++;
 }
 
 // 7.10.2.10 Lower precision process
@@ -259,8 +268,7 @@ void TileParser::lower_mv_precision(Mv& mv) const {
       const int a = ((std::abs(v) + 3) >> 3) << 3;
       return static_cast<std::int16_t>(v > 0 ? a : -a);
     }
-    if (v & 1) return static_cast<std::int16_t>(v > 0 ? v - 1 : v + 1);
-    return v;
+    return static_cast<std::int16_t>((v + (v < 0)) & ~1);  // odd ones towards 0
   };
   mv = {lower(mv.row), lower(mv.col)};
 }

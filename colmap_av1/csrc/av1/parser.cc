@@ -6,9 +6,11 @@
 #include <atomic>
 #include <exception>
 #include <thread>
+#include <type_traits>
 
 #include "av1/error.h"
 #include "av1/motion_field.h"
+#include "av1/spec_tables.h"
 
 namespace colmap_av1::av1 {
 namespace {
@@ -26,6 +28,37 @@ std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t&
     }
   }
   throw BitstreamError("OBU size is longer than the specification allows");
+}
+
+// Writes a block's values to the units it covers. A width known to the compiler makes single
+// stores of the small blocks' rows.
+template <typename Cols>
+void export_block(const BlockInfo& b, Cols cols, Event& event) {
+  const int stride = event.header.mi_cols;
+  const int rows = std::min<int>(kNum4x4BlocksHigh[b.mi_size], event.header.mi_rows - b.mi_row);
+  const std::ptrdiff_t first = std::ptrdiff_t{b.mi_row} * stride + b.mi_col;
+  const auto fill = [&](auto& units, auto value) {
+    auto* at = units.data() + first;
+    for (int row = 0; row < rows; ++row, at += stride) {
+      for (int col = 0; col < cols; ++col) at[col] = value;
+    }
+  };
+  Units& u = event.units;
+  fill(u.mv, b.mv);
+  fill(u.ref_frame, b.ref_frame);
+  fill(u.mi_size, b.mi_size);
+  fill(u.y_mode, b.y_mode);
+  fill(u.is_inter, std::uint8_t{b.is_inter});
+  fill(u.skip, std::uint8_t{b.skip});
+  fill(u.skip_mode, std::uint8_t{b.skip_mode});
+  fill(u.segment_id, b.segment_id);
+  fill(u.motion_mode, b.motion_mode);
+  fill(u.compound_type, b.compound_type);
+  fill(u.interintra, std::uint8_t{b.interintra});
+  fill(u.use_intrabc, std::uint8_t{b.use_intrabc});
+  const bool warped =
+      b.local_warp >= 0 && event.local_warps[static_cast<std::size_t>(b.local_warp)].valid;
+  fill(u.warp_index, warped ? b.local_warp : -1);
 }
 
 }  // namespace
@@ -182,6 +215,7 @@ void Parser::start_frame() {
   context_.prev_segment_ids = nullptr;
   context_.ref_present.fill(false);
   context_.ref_scaled.fill(false);
+  context_.ref_distance.fill(0);
   for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
     if (refs[ref] == nullptr) continue;
     const FrameHeader& reference = refs[ref]->header;
@@ -198,6 +232,8 @@ void Parser::start_frame() {
                                 2 * header_.frame_height >= reference.frame_height &&
                                 header_.frame_width <= 16 * reference.upscaled_width &&
                                 header_.frame_height <= 16 * reference.frame_height;
+    context_.ref_distance[ref] =
+        seq_->relative_dist(header_.order_hint, header_.order_hints[ref]);
     event_->ref_decode_index[ref] = refs[ref]->decode_index;
     event_->ref_size[ref] = {reference.upscaled_width, reference.frame_height};
   }
@@ -394,35 +430,28 @@ void Parser::update_references(const std::shared_ptr<const FrameState>& state,
   }
 }
 
-void Parser::export_units(Event& event) {
+void Parser::export_units(Event& event) const {
   const std::size_t n = context_.grid.size();
   Units& u = event.units;
-  u.mv.resize(2 * n);
-  u.ref_frame.resize(2 * n);
+  u.mv.resize(n);
+  u.ref_frame.resize(n);
   for (auto* field : {&u.mi_size, &u.y_mode, &u.is_inter, &u.skip, &u.skip_mode, &u.segment_id,
                       &u.motion_mode, &u.compound_type, &u.interintra, &u.use_intrabc}) {
     field->resize(n);
   }
   u.warp_index.resize(n);
-  for (std::size_t i = 0; i < n; ++i) {
-    const BlockInfo& b = *context_.grid[i];
-    u.mv[2 * i] = b.mv[0];
-    u.mv[2 * i + 1] = b.mv[1];
-    u.ref_frame[2 * i] = b.ref_frame[0];
-    u.ref_frame[2 * i + 1] = b.ref_frame[1];
-    u.mi_size[i] = b.mi_size;
-    u.y_mode[i] = b.y_mode;
-    u.is_inter[i] = b.is_inter;
-    u.skip[i] = b.skip;
-    u.skip_mode[i] = b.skip_mode;
-    u.segment_id[i] = b.segment_id;
-    u.motion_mode[i] = b.motion_mode;
-    u.compound_type[i] = b.compound_type;
-    u.interintra[i] = b.interintra;
-    u.use_intrabc[i] = b.use_intrabc;
-    const bool warped =
-        b.local_warp >= 0 && event.local_warps[static_cast<std::size_t>(b.local_warp)].valid;
-    u.warp_index[i] = warped ? b.local_warp : -1;
+  for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {
+    const BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
+    for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i, ++block) {
+      const int cols = std::min<int>(kNum4x4BlocksWide[block->mi_size],
+                                     header_.mi_cols - block->mi_col);
+      switch (cols) {
+        case 1: export_block(*block, std::integral_constant<int, 1>{}, event); break;
+        case 2: export_block(*block, std::integral_constant<int, 2>{}, event); break;
+        case 4: export_block(*block, std::integral_constant<int, 4>{}, event); break;
+        default: export_block(*block, cols, event); break;
+      }
+    }
   }
   if (!options_.keep_blocks) return;
   for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {

@@ -96,7 +96,8 @@ class TileParser {
   void temporal_scan(bool is_compound);
   void temporal_sample(int delta_row, int delta_col, bool is_compound);
   void add_ref_mv_candidate(const BlockInfo& candidate, bool is_compound, int weight);
-  void add_to_stack(Mv mv0, Mv mv1, bool is_compound, int weight);
+  // Returns the entry's index, -1 where the stack is full.
+  int add_to_stack(Mv mv0, Mv mv1, bool is_compound, int weight);
   void lower_mv_precision(Mv& mv) const;
   void sort_stack(int start, int end);
   void extra_search(bool is_compound);
@@ -187,6 +188,8 @@ class TileParser {
   std::array<StackEntry, MAX_REF_MV_STACK_SIZE + 2> stack_{};
   int num_mv_found_ = 0;
   int new_mv_count_ = 0;
+  MotionFieldEntry temporal_entry_;  // the last one projected, and its index in the stack
+  int temporal_index_ = -1;
   bool found_match_ = false;
   int close_matches_ = 0, total_matches_ = 0;
   int new_mv_context_ = 0, ref_mv_context_ = 0, zero_mv_context_ = 0;

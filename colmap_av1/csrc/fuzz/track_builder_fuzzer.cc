@@ -184,19 +184,24 @@ void run_parsed(Input input, TrackBuilder& builder) {
     frame.coded.show_frame = header.show_frame;
     frame.coded.width = header.upscaled_width;
     frame.coded.height = header.frame_height;
-    frame.ref_frame = units.ref_frame;
-    for (const auto& mv : units.mv) {
-      frame.mv.push_back(mv.row);
-      frame.mv.push_back(mv.col);
+    const auto copy = [](auto& to, const auto& from) { to.assign(from.begin(), from.end()); };
+    for (const auto& refs : units.ref_frame) {
+      frame.ref_frame.insert(frame.ref_frame.end(), refs.begin(), refs.end());
     }
-    frame.mi_size = units.mi_size;
-    frame.y_mode = units.y_mode;
-    frame.is_inter = units.is_inter;
-    frame.use_intrabc = units.use_intrabc;
-    frame.motion_mode = units.motion_mode;
-    frame.interintra = units.interintra;
-    frame.skip = units.skip;
-    frame.warp_index = units.warp_index;
+    for (const auto& mvs : units.mv) {
+      for (const auto& mv : mvs) {
+        frame.mv.push_back(mv.row);
+        frame.mv.push_back(mv.col);
+      }
+    }
+    copy(frame.mi_size, units.mi_size);
+    copy(frame.y_mode, units.y_mode);
+    copy(frame.is_inter, units.is_inter);
+    copy(frame.use_intrabc, units.use_intrabc);
+    copy(frame.motion_mode, units.motion_mode);
+    copy(frame.interintra, units.interintra);
+    copy(frame.skip, units.skip);
+    copy(frame.warp_index, units.warp_index);
     for (const auto& warp : event->local_warps) {
       frame.warps.insert(frame.warps.end(), warp.params.begin(), warp.params.end());
     }
