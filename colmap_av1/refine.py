@@ -26,9 +26,13 @@ _GREY_TOLERANCE = 2.0
 _MAX_RETURN = 0.25
 # Flatter windows confirm nothing: a grey level of noise moves them by more.
 _MAX_SOFTNESS = 0.15
-# The matching error: a floor, and grey noise over the gradient. See fit_trust.py.
-_MATCH_FLOOR = 0.06
-_MATCH_NOISE = 1.0
+# Logarithm of a match's variance in px^2: constant, slope with the logarithm of the error that the
+# windows' difference lets expect, slope with that of the variance of the bitstream's motion since
+# the template; fitted by examples/benchmarks/fit_trust.py.
+_MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.67, 1.35, 0.68
+# Standard deviation in pixels that is added where there is texture but nothing like the template:
+# hidden, or followed wrongly.
+_REFUSED_SIGMA = 0.7
 
 
 def refine_tracks(
@@ -109,6 +113,7 @@ class _State:
     is_last: NDArray[np.bool_]
     step: NDArray[np.float32]  # by which the bitstream led to each observation
     step_variance: NDArray[np.float64]
+    bitstream_variance: NDArray[np.float64]
     xy: NDArray[np.float32]
     variance: NDArray[np.float64]
     confirmed: NDArray[np.bool_]
@@ -137,8 +142,9 @@ class _State:
             is_last=is_last,
             step=np.diff(tracks.xy, axis=0, prepend=np.zeros((1, 2), np.float32)),
             step_variance=step_variance,
+            bitstream_variance=variance,
             xy=tracks.xy.copy(),
-            variance=variance,
+            variance=variance.copy(),
             confirmed=np.zeros(num_observations, dtype=np.bool_),
             templates=_Templates.empty(tracks, options, int(np.cumsum(alive).max(initial=0))),
         )
@@ -164,7 +170,8 @@ class _State:
         found = _match(
             templates.atlas, canvas, templates.point[track], self.xy[tracked], self.options
         )
-        sure = self._accept(tracked, found, templates.variance[track])
+        prior = np.maximum(self.bitstream_variance[tracked] - templates.prior[track], 0.0)
+        sure = self._accept(tracked, found, templates.variance[track], prior)
         templates.misses[track[sure]] = 0
         templates.misses[track[~sure]] += 1
 
@@ -177,14 +184,18 @@ class _State:
             found = _match(
                 self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
             )
-            sure = self._accept(lost, found, self.variance[lost - 1])
+            prior = self.step_variance[lost]
+            sure = self._accept(lost, found, self.variance[lost - 1], prior)
             fresh = lost[sure]
+            self.variance[lost[~sure]] += _REFUSED_SIGMA**2
 
         given_up = tracked[templates.misses[self.track[tracked]] > _MAX_MISSES]
         renewed = np.concatenate([seen[self.is_first[seen]], np.union1d(fresh, given_up)])
         renewed = renewed[~self.is_last[renewed]]
         templates.drop(self.track[seen[self.is_last[seen]]])
-        templates.take(image, self.track[renewed], self.xy[renewed], self.variance[renewed])
+        templates.take(image, self.track[renewed], self.xy[renewed])
+        templates.variance[self.track[renewed]] = self.variance[renewed]
+        templates.prior[self.track[renewed]] = self.bitstream_variance[renewed]
         self.last_image, self.last_frame = image, frame
 
     def _follow(self, later: NDArray[np.int64]) -> None:
@@ -198,6 +209,7 @@ class _State:
         observations: NDArray[np.int64],
         found: _Matches,
         variance: NDArray[np.float64],
+        prior: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         """Take over the matches that are good enough; tells which are.
 
@@ -205,6 +217,7 @@ class _State:
             observations: int64 [n].
             found: their matches.
             variance: float64 [n] of the positions they were matched with.
+            prior: float64 [n] variance of the bitstream's motion since then.
         """
         track = self.track[observations]
         contrast = self.templates.contrast[track]
@@ -213,7 +226,7 @@ class _State:
         taken = observations[sure]
         noise = found.difference[sure] * self.templates.softness[track[sure]]
         self.xy[taken] = found.position[sure]
-        self.variance[taken] = variance[sure] + _MATCH_FLOOR**2 + (_MATCH_NOISE * noise) ** 2
+        self.variance[taken] = variance[sure] + _match_variance(noise, prior[sure])
         self.confirmed[taken] = True
         return sure
 
@@ -234,6 +247,7 @@ class _Templates:
     slot: NDArray[np.int64]  # of each track, -1: none
     point: NDArray[np.float32]  # of each track in the atlas, first pixel's centre (0, 0)
     variance: NDArray[np.float64]  # of the templates' positions
+    prior: NDArray[np.float64]  # of the bitstream's motion up to there
     contrast: NDArray[np.float32]  # mean absolute deviation, in grey levels
     softness: NDArray[np.float32]  # pixels of matching error for a grey level of noise
     misses: NDArray[np.int32]  # frames without a confirmation
@@ -253,6 +267,7 @@ class _Templates:
             slot=np.full(num_tracks, -1),
             point=np.zeros((num_tracks, 2), dtype=np.float32),
             variance=np.zeros(num_tracks),
+            prior=np.zeros(num_tracks),
             contrast=np.zeros(num_tracks, dtype=np.float32),
             softness=np.zeros(num_tracks, dtype=np.float32),
             misses=np.zeros(num_tracks, dtype=np.int32),
@@ -277,7 +292,6 @@ class _Templates:
         image: NDArray[np.uint8],
         track: NDArray[np.int64],
         xy: NDArray[np.float32],
-        variance: NDArray[np.float64],
     ) -> None:
         """Make the picture around positions the tracks' templates, where there is texture."""
         self.drop(track)
@@ -288,8 +302,7 @@ class _Templates:
         centre = np.clip(corner + half, 0, np.array(image.shape[::-1]) - 1)
         soft = softness[centre[:, 1], centre[:, 0]]
         usable = ((corner >= 0) & (corner <= last)).all(axis=1) & (soft <= _MAX_SOFTNESS)
-        track, xy, corner = track[usable], xy[usable], corner[usable]
-        centre, variance = centre[usable], variance[usable]
+        track, xy, corner, centre = track[usable], xy[usable], corner[usable], centre[usable]
         self.num_free -= len(track)
         slot = self.free[self.num_free : self.num_free + len(track)]
         left = self.tile * (slot % self.columns)
@@ -300,7 +313,6 @@ class _Templates:
         )
         self.slot[track] = slot
         self.point[track] = np.stack([left, top], axis=1) + (xy - corner) - 0.5
-        self.variance[track] = variance
         self.softness[track] = softness[centre[:, 1], centre[:, 0]]
         self.contrast[track] = contrast[centre[:, 1], centre[:, 0]]
         self.misses[track] = 0
@@ -371,6 +383,17 @@ def _match(
     ok &= np.abs(found - start).max(axis=1) <= options.refine_move
     ok &= ((found >= 0) & (found < target.shape[::-1])).all(axis=1)
     return _Matches(ok, found + np.float32(0.5), np.where(ok, difference.ravel(), np.inf))
+
+
+def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected variance in px^2 of matches.
+
+    Args:
+        noise: error in pixels that the difference of the windows would make if it were noise.
+        prior: variance in px^2 of the bitstream's motion over the same frames.
+    """
+    exponent = _MATCH_CONSTANT + _MATCH_NOISE * np.log(0.02 + noise)
+    return np.asarray(np.exp(exponent + _MATCH_PRIOR * np.log(0.01 + prior)), np.float64)
 
 
 def _check_options(options: RefineOptions) -> None:
