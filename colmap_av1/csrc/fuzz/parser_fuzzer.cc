@@ -49,7 +49,7 @@ void check_event(const Event& event, const ParserOptions& options) {
   const std::size_t n = options.headers_only ? 0
                                              : static_cast<std::size_t>(header.mi_rows) *
                                                    static_cast<std::size_t>(header.mi_cols);
-  check(units.mv.size() == 2 * n && units.ref_frame.size() == 2 * n, "two lists for each unit");
+  check(units.mv.size() == n && units.ref_frame.size() == n, "every unit has its lists");
   for (const auto* field : {&units.mi_size, &units.y_mode, &units.is_inter, &units.skip,
                             &units.skip_mode, &units.segment_id, &units.motion_mode,
                             &units.compound_type, &units.interintra, &units.use_intrabc}) {
@@ -61,8 +61,7 @@ void check_event(const Event& event, const ParserOptions& options) {
     check(units.mi_size[i] < colmap_av1::av1::BLOCK_SIZES, "mi_size is a block size");
     check(units.y_mode[i] <= colmap_av1::av1::NEW_NEWMV, "y_mode is a mode");
     check(units.segment_id[i] < colmap_av1::av1::MAX_SEGMENTS, "segment_id is a segment");
-    for (std::size_t list = 2 * i; list < 2 * i + 2; ++list) {
-      const int ref = units.ref_frame[list];
+    for (const int ref : units.ref_frame[i]) {
       check(ref >= -1 && ref <= colmap_av1::av1::ALTREF_FRAME, "ref_frame is a reference");
       check(ref <= 0 || event.ref_decode_index[static_cast<std::size_t>(ref)] >= 0,
             "blocks refer to frames that are there");
