@@ -34,6 +34,7 @@ from colmap_av1.options import (
     DensityOptions,
     EncodeOptions,
     ExportOptions,
+    ImageOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -126,7 +127,8 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_options(
         command,
         {
-            MatchOptions: "images",
+            ImageOptions: "images",
+            MatchOptions: "database and stream",
             CameraOptions: "camera",
             TrackOptions: "tracks",
             RefineOptions: "refinement",
@@ -346,6 +348,7 @@ def _run_match(namespace: argparse.Namespace) -> None:
     options = _given(
         namespace,
         MatchOptions,
+        images=_given(namespace, ImageOptions),
         encode=_given(namespace, EncodeOptions),
         read=_given(namespace, ReadOptions),
         tracks=_given(namespace, TrackOptions),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
@@ -63,14 +63,14 @@ def frames_of_images(
     Raises:
         ImageError: count or names do not say which frame an image is.
     """
-    numbers = [_last_number(name) for name in names]
+    numbers = [last_number(name) for name in names]
     if first_number is None and len(names) == num_frames:
-        order = sorted(range(len(names)), key=lambda i: _natural_key(names[i]))
+        order = natural_order(names)
         frames = np.empty(len(names), dtype=np.int32)
         frames[order] = np.arange(len(names), dtype=np.int32)
         return frames
 
-    counts = f"the database lists {len(names)} images, the video has {num_frames} frames"
+    counts = f"there are {len(names)} images, the video has {num_frames} frames"
     found = [number for number in numbers if number is not None]
     if len(found) < len(numbers):
         unnumbered = names[numbers.index(None)]
@@ -89,33 +89,79 @@ def frames_of_images(
         )
     if len(set(found)) < len(found):
         twice = next(number for number in found if found.count(number) > 1)
-        raise ImageError(f"two images of the database have the frame number {twice}")
+        raise ImageError(f"two images have the frame number {twice}")
     return np.array([number - first_number for number in found], dtype=np.int32)
 
 
-def check_image_sizes(
-    names: Sequence[str],
-    sizes: Sequence[tuple[int, int]],
-    video_size: tuple[int, int],
-) -> None:
-    """Check that the images a database lists have the size of the video's pictures.
+def size_of_images(
+    sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int]
+) -> tuple[int, int]:
+    """The one size of images that exist: that of the video's pictures, or these scaled.
 
     Args:
-        names: names of the images.
-        sizes: (width, height) of the images' cameras.
+        sizes: (width, height) of each image, by name; empty where none exist.
         video_size: (width, height) of the pictures, turned as players do.
 
     Raises:
-        ImageError: an image has another size.
+        ImageError: the images differ in size, or in shape from the video's pictures.
     """
-    for name, size in zip(names, sizes, strict=True):
-        if size != video_size:
-            turned = size == video_size[::-1]
+    if not sizes:
+        return video_size
+    first_name, first = next(iter(sizes.items()))
+    for name, size in sizes.items():
+        if size != first:
             raise ImageError(
-                f"image '{name}' of the database is {size[0]}x{size[1]}, the video's pictures are "
-                f"{video_size[0]}x{video_size[1]}{' as players turn them' if turned else ''}: use "
-                "images of the video's size or a new database"
+                f"image '{name}' is {size[0]}x{size[1]}, '{first_name}' {first[0]}x{first[1]}: "
+                "images of one video have one size; match those of other cameras apart"
             )
+    width, height = video_size
+    if abs(first[0] * height - first[1] * width) > max(width, height, *first):
+        turned = first == video_size[::-1]
+        raise ImageError(
+            f"image '{first_name}' is {first[0]}x{first[1]}, the video's pictures are "
+            f"{width}x{height}{' as players turn them' if turned else ''}: use images of the "
+            "video's shape, or a new database and folder"
+        )
+    return first
+
+
+def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> None:
+    """Check that images, which are scaled and so cannot be written, are in a folder.
+
+    Raises:
+        ImageError: one is missing.
+    """
+    missing = next((n for n in names if not image_file(Path(folder), n).exists()), None)
+    if missing is not None:
+        raise ImageError(
+            f"{Path(folder) / missing}: is missing, and the images have another size than the "
+            "video, so it cannot be written: give the folder that holds all images"
+        )
+
+
+def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
+    """Images that a folder holds already, where none is named as this package names them.
+
+    Args:
+        folder: the folder; it need not exist.
+        pattern: pattern of the names of new images, see `image_names`.
+
+    Returns:
+        File names in their natural order; none where one of them follows the pattern: then
+        they are this package's own, of a run before.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        return []
+    names = [
+        p.name
+        for p in root.iterdir()
+        if p.suffix.lower() in _WRITE_PARAMETERS and not p.name.startswith(".")
+    ]
+    regex = _pattern_regex(pattern)
+    if any(regex.fullmatch(name) for name in names):
+        return []
+    return sorted(names, key=_natural_key)
 
 
 def check_image_folder(
@@ -148,9 +194,9 @@ def check_image_folder(
         present = [p.name for p in root.iterdir()] if root.is_dir() else []
         names = sorted(name for name in present if regex.fullmatch(name))
     for name in names:
-        path = _image_file(root, name)
+        path = image_file(root, name)
         if path.exists():
-            size = _image_size(path)
+            size = image_size(path)
             if size != video_size:
                 raise ImageError(
                     f"{path}: is {size[0]}x{size[1]}, the video {video_size[0]}x{video_size[1]}: "
@@ -192,9 +238,9 @@ def write_images(
     """
     root = Path(folder)
     wanted = {
-        int(frame): _image_file(root, name)
+        int(frame): image_file(root, name)
         for frame, name in zip(frames, names, strict=True)
-        if not _image_file(root, name).exists()
+        if not image_file(root, name).exists()
     }
     num_kept = len(names) - len(wanted)
     done = num_kept
@@ -260,7 +306,13 @@ def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) ->
     )
 
 
-def _last_number(name: str) -> int | None:
+def natural_order(names: Sequence[str]) -> list[int]:
+    """Indices of names in the order in which 'f9' comes before 'f10'."""
+    return sorted(range(len(names)), key=lambda i: _natural_key(names[i]))
+
+
+def last_number(name: str) -> int | None:
+    """The last number in an image's name, its extension left out; None where there is none."""
     digits = re.findall(r"\d+", PurePosixPath(name).stem)
     return int(digits[-1]) if digits else None
 
@@ -290,15 +342,24 @@ def _check_extension(name: str) -> None:
         raise OptionError(f"image name '{name}' must end in .png, .jpg or .jpeg")
 
 
-def _image_file(root: Path, name: str) -> Path:
+def image_file(root: Path, name: str) -> Path:
+    """The file of an image in a folder.
+
+    Raises:
+        ImageError: the name leads out of the folder.
+    """
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
         raise ImageError(f"image '{name}' of the database lies outside the image folder")
     return root / name
 
 
-def _image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, without decoding it in full."""
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, without decoding it in full.
+
+    Raises:
+        ImageError: it is none that can be read.
+    """
     size = (0, 0)
     try:
         with av.open(os.path.abspath(path)) as container:

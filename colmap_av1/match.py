@@ -13,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.choice import ChosenImages, check_image_options, choose_images
 from colmap_av1.database import (
     DatabaseImage,
     make_camera,
@@ -25,9 +26,10 @@ from colmap_av1.encode import stream_of
 from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
 from colmap_av1.images import (
     check_image_folder,
-    check_image_sizes,
-    frames_of_images,
-    image_names,
+    check_images_there,
+    existing_images,
+    image_size,
+    size_of_images,
     write_images,
 )
 from colmap_av1.info import Structure, inspect
@@ -36,11 +38,12 @@ from colmap_av1.options import MatchOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.refine import refine_tracks
-from colmap_av1.tracks import Tracks, build_tracks, turn_tracks
+from colmap_av1.tracks import Tracks, build_tracks, scale_tracks, turn_tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 from colmap_av1.video import (
     decode_frames,
     display_rotation,
+    frame_times,
     is_av1,
     open_stream,
     picture_size,
@@ -159,19 +162,6 @@ class TrackedVideo:
 
 
 @dataclass(frozen=True)
-class ChosenImages:
-    """The frames that are images.
-
-    Attributes:
-        names: name of each image, its path relative to the image folder.
-        frames: int32 [n] display index of each image, strictly ascending.
-    """
-
-    names: list[str]
-    frames: NDArray[np.int32]
-
-
-@dataclass(frozen=True)
 class MatchedImages:
     """Keypoints of the images, and the verified matches between them.
 
@@ -229,23 +219,43 @@ def match(
     # What can be refused is refused before the long work.
     video_size = picture_size(video)
     listed = _read_listed_images(database, options)
-    check_options(options, video_size)
-    _check_listed_sizes(listed, video_size)
+    existing = {image.name: (image.width, image.height) for image in listed}
+    if folder is not None and not listed:
+        names = existing_images(folder, options.images.image_name)
+        existing = {name: image_size(folder / name) for name in names}
+    size = size_of_images(existing, video_size)
+    check_options(options, size)
     if folder is not None:
-        names_or_pattern = [i.name for i in listed] if listed else options.image_name
-        check_image_folder(folder, names_or_pattern, video_size)
+        check_image_folder(folder, list(existing) or options.images.image_name, size)
+        if size != video_size:
+            check_images_there(folder, list(existing))
 
     source = open_source(video, options, clock=clock, progress=progress)
     tracked = track_video(
         source, options, one_size=folder is not None, clock=clock, progress=progress
     )
     tracks = tracked.tracks
-    chosen = choose_images(listed, tracks, options)
-    size = (tracks.width, tracks.height)
-    if size != video_size:
-        _check_listed_sizes(listed, size)
-        if folder is not None:
-            check_image_folder(folder, chosen.names, size)
+    if (tracks.width, tracks.height) != video_size:
+        size = size_of_images(existing, (tracks.width, tracks.height))
+
+    def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        pictures = _decodable_frames(source.pictures, tracks.num_frames, options)
+        for index, picture in pictures:
+            progress("looking", index + 1, tracks.num_frames)
+            yield index, picture
+
+    with clock.measure("choice"):
+        chosen = choose_images(
+            tracks,
+            options.images,
+            existing=list(existing),
+            folder=folder,
+            times=lambda: frame_times(source.stream),
+            decode=decode,
+        )
+    if folder is not None:
+        check_image_folder(folder, chosen.names, size)
+    tracks = scale_tracks(tracks, size)
 
     with clock.measure("pairs"):
         seen = np.isin(tracks.frame, chosen.frames)
@@ -395,24 +405,6 @@ def track_video(
     return TrackedVideo(tracks, structure.num_coded, tuple(notes))
 
 
-def choose_images(
-    listed: Sequence[DatabaseImage], tracks: Tracks, options: MatchOptions
-) -> ChosenImages:
-    """Choose the frames that are images: those a database lists, else as options say.
-
-    Raises:
-        ImageError: count or names of the listed images do not say which frames they are.
-        OptionError: the pattern of the names has no number, or no extension of an image.
-    """
-    if not listed:
-        frames = np.arange(0, tracks.num_frames, options.image_step, dtype=np.int32)
-        return ChosenImages(image_names(options.image_name, frames.tolist()), frames)
-    names = [image.name for image in listed]
-    frames = frames_of_images(names, tracks.num_frames, options.first_number)
-    order = np.argsort(frames)
-    return ChosenImages([names[i] for i in order], frames[order])
-
-
 def match_images(
     video: Path,
     tracks: Tracks,
@@ -469,12 +461,10 @@ def check_options(options: MatchOptions, size: tuple[int, int]) -> None:
     Raises:
         OptionError: an option has a value that cannot work.
     """
-    if options.image_step < 1:
-        raise OptionError(f"image_step is {options.image_step}: give 1 or more")
+    check_image_options(options.images)
     kinds = get_args(OnExisting)
     if options.on_existing not in kinds:
         raise OptionError(f"on_existing is {options.on_existing!r}: give {', '.join(kinds)}")
-    image_names(options.image_name, ())
     camera = make_camera(options.camera, *size)
     no_tracks = Tracks(
         *(0, 0, 0, np.zeros(1, np.int64), np.empty(0, np.int32)),
@@ -510,11 +500,6 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     elif not os.access(database.resolve().parent, os.W_OK | os.X_OK):
         raise DatabaseError(f"{database}: no permission to write a database there")
     return listed
-
-
-def _check_listed_sizes(listed: Sequence[DatabaseImage], size: tuple[int, int]) -> None:
-    sizes = [(image.width, image.height) for image in listed]
-    check_image_sizes([image.name for image in listed], sizes, size)
 
 
 def _counted(motion: Iterable[FrameMotion], structure: Structure) -> Iterator[FrameMotion]:

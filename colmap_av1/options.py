@@ -146,9 +146,35 @@ class CameraOptions:
 
 
 @dataclass(frozen=True)
+class ImageOptions:
+    """Which frames of the video are images; all, unless one of the options chooses."""
+
+    # file name of new images; the number is the frame's display index, from 0
+    image_name: str = "frame_%06d.png"
+    # as many frames, spread over the video
+    num_images: int | None = None
+    # every n-th frame
+    every: int | None = None
+    # so many frames a second, by the time stamps
+    fps: float | None = None
+    # file that lists the frames, a line each: index, and if wanted the image's name
+    frame_list: str | None = None
+    # 'time': num_images at equal distances in time; 'parallax': at equal steps of parallax
+    # along the tracks
+    select: Literal["time", "parallax"] = "time"
+    # take a sharp frame nearby that serves as well in place of a blurred one; only where
+    # num_images or fps choose and images are written
+    skip_blurred: bool = True
+    # number in an existing image's name of the video's first frame; None: only where the
+    # names and their count leave no doubt which frame an image is
+    first_number: int | None = None
+
+
+@dataclass(frozen=True)
 class MatchOptions:
     """Everything `match` can be told; seed and threads are those of `verify`."""
 
+    images: ImageOptions = ImageOptions()
     encode: EncodeOptions = EncodeOptions()
     read: ReadOptions = ReadOptions()
     tracks: TrackOptions = TrackOptions()
@@ -157,13 +183,6 @@ class MatchOptions:
     pairs: PairOptions = PairOptions()
     verify: VerifyOptions = VerifyOptions()
     camera: CameraOptions = CameraOptions()
-    # file name of new images; the number is the frame's display index, from 0
-    image_name: str = "frame_%06d.png"
-    # every n-th frame becomes an image of a new database; tracks use all frames
-    image_step: int = 1
-    # number in a listed image's name of the video's first frame; None: only where the
-    # names and their count leave no doubt which frame an image is
-    first_number: int | None = None
     # what becomes of keypoints and matches that listed images have already: 'error': refuse
     # the database; 'append': keep them, add the new ones after them; 'replace': remove them
     on_existing: OnExisting = "error"

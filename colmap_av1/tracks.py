@@ -144,6 +144,20 @@ def turn_tracks(tracks: Tracks, rotation: int) -> Tracks:
     return replace(tracks, width=height, height=width, xy=np.stack(turned, axis=1))
 
 
+def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
+    """The tracks in pictures that are scaled to another (width, height) in pixels."""
+    if size == (tracks.width, tracks.height):
+        return tracks
+    factor = np.array([size[0] / tracks.width, size[1] / tracks.height])
+    return replace(
+        tracks,
+        width=size[0],
+        height=size[1],
+        xy=(tracks.xy * factor).astype(np.float32),
+        sigma=(tracks.sigma * math.sqrt(float(factor.prod()))).astype(np.float32),
+    )
+
+
 _Limit = TypeVar("_Limit", int, float)
 
 

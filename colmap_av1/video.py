@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import shlex
@@ -244,6 +245,26 @@ def picture_size(video: str | os.PathLike[str]) -> tuple[int, int]:
     frame = _first_frame(video)
     size = (frame.width, frame.height)
     return size[::-1] if _rotation(frame) in (90, 270) else size
+
+
+def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
+    """Presentation times of the packets of an AV1 video, which show a frame each.
+
+    Returns:
+        float64 [num_packets] seconds, strictly ascending; None where the container gives none,
+        or not in that order.
+
+    Raises:
+        VideoError: as `open_stream`.
+    """
+    times: list[float] = []
+    with open_stream(video) as stream, contextlib.suppress(BitstreamError):
+        for packet in stream.packets():
+            if packet.pts is None:
+                return None
+            times.append(packet.pts)
+    found = np.array(times, dtype=np.float64)
+    return found if np.all(np.diff(found) > 0) else None
 
 
 def is_av1(video: str | os.PathLike[str]) -> bool:

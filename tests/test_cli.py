@@ -171,7 +171,7 @@ def test_help_gives_the_comments_of_the_options(capsys: pytest.CaptureFixture[st
         main(["match", "--help"])
     text = " ".join(capsys.readouterr().out.split())
     assert "shown frames a track is seen in at least [4]" in text
-    assert "every n-th frame becomes an image of a new database" in text
+    assert "so many frames a second, by the time stamps" in text
 
 
 def test_interrupt_exits_with_130(encode: Encode, tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from conftest import Encode, make_frames
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images import (
     check_image_folder,
-    check_image_sizes,
     frames_of_images,
     image_names,
+    size_of_images,
     write_images,
 )
 from colmap_av1.video import decode_frames
@@ -85,11 +85,16 @@ def test_first_number_settles_it() -> None:
 
 
 def test_sizes() -> None:
-    check_image_sizes(["a"], [SIZE], SIZE)
-    with pytest.raises(ImageError, match=r"'b' of the database is 96x64, .* are 192x128: use"):
-        check_image_sizes(["a", "b"], [SIZE, (96, 64)], SIZE)
+    assert size_of_images({}, SIZE) == SIZE
+    assert size_of_images({"a": SIZE}, SIZE) == SIZE
+    assert size_of_images({"a": (96, 64), "b": (96, 64)}, SIZE) == (96, 64)
+    assert size_of_images({"a": (683, 384)}, (1366, 769)) == (683, 384)
+    with pytest.raises(ImageError, match="image 'b' is 96x64, 'a' 192x128: images of one video"):
+        size_of_images({"a": SIZE, "b": (96, 64)}, SIZE)
     with pytest.raises(ImageError, match="192x128 as players turn them"):
-        check_image_sizes(["a"], [(128, 192)], SIZE)
+        size_of_images({"a": (128, 192)}, SIZE)
+    with pytest.raises(ImageError, match="use images of the video's shape"):
+        size_of_images({"a": (192, 144)}, SIZE)
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])

@@ -25,6 +25,7 @@ from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
+    ImageOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -69,7 +70,7 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
     assert report.track_lengths[0.0] >= 4
     assert report.track_lengths[1.0] <= 16
     assert list(report.seconds) == [
-        "motion", "tracks", "pairs", "verification", "images", "database"
+        "motion", "tracks", "choice", "pairs", "verification", "images", "database"
     ]  # fmt: skip
     assert report.warnings == ()
 
@@ -164,7 +165,7 @@ def test_images_that_ffmpeg_cut_of_a_rotated_clip(
 
 
 def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
-    report = match(tmp_path / "a.db", clip, options=MatchOptions(image_step=2))
+    report = match(tmp_path / "a.db", clip, options=MatchOptions(images=ImageOptions(every=2)))
     assert report.num_images == 8
     names = [image.name for image in read_images(tmp_path / "a.db")]
     assert names == image_names("frame_%06d.png", range(0, 16, 2))
@@ -173,8 +174,8 @@ def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (MatchOptions(image_step=0), OptionError),
-        (MatchOptions(image_name="x.png"), OptionError),
+        (MatchOptions(images=ImageOptions(every=0)), OptionError),
+        (MatchOptions(images=ImageOptions(image_name="x.png")), OptionError),
         (MatchOptions(camera=CameraOptions(camera_model="NONE")), OptionError),
         (MatchOptions(refine=RefineOptions(refine_window=4)), OptionError),
         (MatchOptions(density=DensityOptions(spacing=-1)), OptionError),
@@ -288,7 +289,7 @@ def test_refined_and_thinned_tracks(clip: Path, tmp_path: Path) -> None:
     plain = match(tmp_path / "a.db", clip)
     options = replace(LK, density=DensityOptions(max_tracks_per_image=100))
     report = match(tmp_path / "b.db", clip, options=options)
-    assert list(report.seconds)[:5] == ["motion", "tracks", "decoding", "refinement", "pairs"]
+    assert list(report.seconds)[:4] == ["motion", "tracks", "decoding", "refinement"]
     counts = [row[1] for row in tables(tmp_path / "b.db")["keypoints"]]
     assert max(counts) == 100
     assert report.num_tracks < plain.num_tracks / 2
@@ -296,10 +297,10 @@ def test_refined_and_thinned_tracks(clip: Path, tmp_path: Path) -> None:
 
 
 def test_density_counts_images_not_frames(clip: Path, tmp_path: Path) -> None:
-    options = MatchOptions(density=DensityOptions(min_length=3), image_step=4)
+    options = MatchOptions(density=DensityOptions(min_length=3), images=ImageOptions(every=4))
     match(tmp_path / "a.db", clip, options=options)
     keypoints = [row[1] for row in tables(tmp_path / "a.db")["keypoints"]]
-    match(tmp_path / "b.db", clip, options=MatchOptions(image_step=4))
+    match(tmp_path / "b.db", clip, options=MatchOptions(images=ImageOptions(every=4)))
     all_keypoints = [row[1] for row in tables(tmp_path / "b.db")["keypoints"]]
     assert sum(keypoints) < sum(all_keypoints)
 
@@ -308,10 +309,10 @@ def test_images_that_do_not_fit_the_video(clip: Path, tmp_path: Path) -> None:
     write_images(clip, tmp_path / "cut", [f"{i:03d}.png" for i in range(10)], range(10))
     database = listing_database(tmp_path / "cut", tmp_path / "a.db")
     before = database.read_bytes()
-    with pytest.raises(ImageError, match="lists 10 images, the video has 16 frames"):
+    with pytest.raises(ImageError, match="there are 10 images, the video has 16 frames"):
         match(database, clip)
     assert database.read_bytes() == before
-    options = MatchOptions(first_number=0)
+    options = MatchOptions(images=ImageOptions(first_number=0))
     assert match(database, clip, options=options).num_images == 10
 
 

@@ -78,7 +78,7 @@ def test_wheel_matches_the_example_without_a_compiler(wheel: Path, tmp_path: Pat
     )
     assert Path(where.strip()).is_relative_to(packages)
 
-    options = ["--database", "demo.db", "--image_path", "demo_frames", "--image_step", "4"]
+    options = ["--database", "demo.db", "--image_path", "demo_frames", "--every", "4"]
     video = str(PROJECT / "examples" / "scene.mp4")
     run(str(scripts / "colmap-av1"), "match", "--video", video, *options)
     assert len(read_images(tmp_path / "demo.db")) == 15

@@ -17,7 +17,13 @@ from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.images import image_names, write_images
 from colmap_av1.match import match
-from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, RefineOptions
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    MatchOptions,
+    RefineOptions,
+)
 from colmap_av1.progress import Clock
 
 Preset = Literal["sparse", "default", "dense"]
@@ -44,7 +50,7 @@ class Footage:
     @property
     def names(self) -> list[str]:
         """The images' file names, in display order."""
-        return image_names(MatchOptions().image_name, self.frames)
+        return image_names(ImageOptions().image_name, self.frames)
 
 
 @dataclass(frozen=True)
@@ -142,7 +148,7 @@ def run_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
 
 
 def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
-    options = replace(options, camera=footage.camera, image_step=footage.image_step)
+    options = replace(options, camera=footage.camera, images=ImageOptions(every=footage.image_step))
     return match(database, footage.video, options=options).seconds
 
 

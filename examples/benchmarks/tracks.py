@@ -75,7 +75,7 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A sequence and how it is used; `image_step` as in MatchOptions."""
+    """A sequence and how it is used; `image_step` as `every` in ImageOptions."""
 
     name: str
     image_step: int = 1
