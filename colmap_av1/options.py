@@ -14,7 +14,8 @@ class ReadOptions:
 
     # operating point of a scalable stream (7.20, choose_operating_point)
     operating_point: int = 0
-    # threads that parse the tiles of a frame; None: one per CPU. The result does not depend on it
+    # threads that parse tiles, and groups of frames that start at a key frame, side by side;
+    # None: one per CPU. The result does not depend on it
     num_threads: int | None = None
     # fail on a damaged stream instead of using the frames before the damage
     strict: bool = False

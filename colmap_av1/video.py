@@ -37,12 +37,12 @@ class Packet:
 
     Attributes:
         data: OBUs in low-overhead format (AV1 specification, section 5), whatever the
-            container; the last one may lack its obu_size.
+            container; the last one may lack its obu_size. A view of the demuxer's memory.
         pts: presentation time in seconds; None where the container gives none.
         index: number of the packet in the stream, from 0.
     """
 
-    data: bytes
+    data: memoryview
     pts: float | None
     index: int
 
@@ -128,7 +128,7 @@ class VideoStream:
             is_timed = self._is_timed and packet.pts is not None
             pts = float(packet.pts * packet.time_base) if is_timed else None
             last = packet
-            yield Packet(bytes(packet), pts, index)
+            yield Packet(memoryview(packet).toreadonly(), pts, index)
             index += 1
         damage = self._missing_end(index, last)
         if damage:

@@ -23,6 +23,7 @@ using av1::Event;
 using av1::FrameHeader;
 using av1::Parser;
 using av1::ParserOptions;
+using av1::RestartPoint;
 using av1::SequenceHeader;
 
 // Hands a vector's memory to NumPy without a copy.
@@ -197,6 +198,23 @@ nb::dict take_units(Event& event) {
   return d;
 }
 
+// The bytes of an object that has the buffer protocol, while it lives.
+class Buffer {
+ public:
+  explicit Buffer(nb::handle object) {
+    if (PyObject_GetBuffer(object.ptr(), &view_, PyBUF_SIMPLE) != 0) throw nb::python_error();
+  }
+  ~Buffer() { PyBuffer_Release(&view_); }
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+
+  const std::uint8_t* data() const { return static_cast<const std::uint8_t*>(view_.buf); }
+  std::size_t size() const { return static_cast<std::size_t>(view_.len); }
+
+ private:
+  Py_buffer view_;
+};
+
 // One array per field of the blocks, in decoding order.
 nb::dict blocks_dict(const Event& event) {
   nb::dict d;
@@ -265,6 +283,19 @@ void bind_av1(nb::module_& m) {
   nb::class_<Event>(m, "Event")
       .def_ro("decode_index", &Event::decode_index)
       .def_ro("shown_decode_index", &Event::shown_decode_index)
+      .def_ro("temporal_unit", &Event::temporal_unit)
+      .def_prop_ro("num_units",
+                   [](const Event& e) { return e.header.mi_rows * e.header.mi_cols; })
+      .def_prop_ro("is_repeated", [](const Event& e) { return e.header.show_existing_frame; })
+      .def_prop_ro("is_shown",
+                   [](const Event& e) {
+                     return e.header.show_frame || e.header.show_existing_frame;
+                   })
+      .def_prop_ro("is_shown_key_frame",
+                   [](const Event& e) {
+                     return e.header.frame_type == av1::KEY_FRAME && e.header.show_frame &&
+                            !e.header.show_existing_frame;
+                   })
       .def("header", &header_dict)
       .def("take_units", &take_units)
       .def("blocks", &blocks_dict)
@@ -276,6 +307,8 @@ void bind_av1(nb::module_& m) {
              return adopt<std::int32_t>(std::move(sizes), {8, 2});
            })
       .def("slot_decode_index", [](const Event& e) { return int32_array(e.slot_decode_index); });
+
+  nb::class_<RestartPoint>(m, "RestartPoint");
 
   nb::class_<Parser>(m, "Parser")
       .def(
@@ -289,14 +322,15 @@ void bind_av1(nb::module_& m) {
           "num_threads"_a = 1, "max_frame_size"_a = std::int64_t{1} << 28)
       .def(
           "parse",
-          [](Parser& self, nb::bytes data) {
-            const auto* bytes = static_cast<const std::uint8_t*>(data.data());
-            const std::size_t size = data.size();
+          [](Parser& self, nb::object data) {
+            const Buffer bytes(data);
             nb::gil_scoped_release release;
-            self.parse(bytes, size);
+            self.parse(bytes.data(), bytes.size());
           },
           "data"_a)
       .def("finish", &Parser::finish)
+      .def("restart_point", &Parser::restart_point)
+      .def("restart", &Parser::restart, "point"_a)
       .def("take_events",
            [](Parser& self) {
              nb::list list;

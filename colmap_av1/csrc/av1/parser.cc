@@ -77,6 +77,22 @@ void Parser::finish() const {
   if (seen_frame_header_) throw BitstreamError("stream ends inside a frame");
 }
 
+RestartPoint Parser::restart_point() const {
+  finish();
+  return {seq_, operating_point_idc_, num_events_, temporal_unit_, shown_spatial_id_};
+}
+
+void Parser::restart(const RestartPoint& point) {
+  seq_ = point.seq;
+  operating_point_idc_ = point.operating_point_idc;
+  num_events_ = point.num_events;
+  temporal_unit_ = point.temporal_unit;
+  shown_spatial_id_ = point.shown_spatial_id;
+  slots_ = {};
+  seen_frame_header_ = false;
+  events_.clear();
+}
+
 // 5.3 OBU syntax
 void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
   std::size_t position = 0;
@@ -138,7 +154,7 @@ void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
 void Parser::sequence_header_obu(const std::uint8_t* data, std::size_t size) {
   if (seen_frame_header_) throw BitstreamError("sequence header inside a frame");
   BitReader reader(data, size);
-  seq_ = std::make_unique<SequenceHeader>(read_sequence_header(reader));
+  seq_ = std::make_shared<const SequenceHeader>(read_sequence_header(reader));
   const int op = options_.operating_point <= seq_->operating_points_cnt_minus_1
                      ? options_.operating_point
                      : 0;  // 7.20 note: a choice that the stream does not have means the first

@@ -66,6 +66,15 @@ struct Event {
   std::vector<int> tile_sizes;    // in bytes, in tile order
 };
 
+// What parsing can start again from at a shown key frame, which refers to no frame before it.
+struct RestartPoint {
+  std::shared_ptr<const SequenceHeader> seq;
+  int operating_point_idc = 0;
+  int num_events = 0;
+  int temporal_unit = -1;
+  int shown_spatial_id = -1;
+};
+
 class Parser {
  public:
   explicit Parser(const ParserOptions& options) : options_(options) {}
@@ -78,6 +87,12 @@ class Parser {
 
   // Throws BitstreamError when the stream ends inside a frame.
   void finish() const;
+
+  // Where the parser stands. Throws BitstreamError inside a frame.
+  RestartPoint restart_point() const;
+  // Goes on from a point that a parser of the same stream and operating point gave. Up to the next
+  // shown key frame, frames that refer to others are errors.
+  void restart(const RestartPoint& point);
 
   std::vector<std::unique_ptr<Event>>& events() { return events_; }
   // The sequence header in force; null before the first.
@@ -117,7 +132,7 @@ class Parser {
 
   ParserOptions options_;
   std::vector<std::unique_ptr<Event>> events_;
-  std::unique_ptr<SequenceHeader> seq_;
+  std::shared_ptr<const SequenceHeader> seq_;
   int operating_point_idc_ = 0;
   std::array<Slot, NUM_REF_FRAMES> slots_;
   int num_events_ = 0;
