@@ -129,6 +129,7 @@ class Row:
     mapper: MapperRun | None
     model: ModelFigures | None
     pose_errors: PoseErrors | None
+    poses_are_true: bool
     dense: tuple[FrontendRun, MapperRun, ModelFigures] | None
 
 
@@ -375,6 +376,7 @@ def measure_row(
         mapper=mapper,
         model=figures,
         pose_errors=errors,
+        poses_are_true=material.poses is not None,
         dense=None,
     )
 
@@ -426,39 +428,59 @@ def tracks_table(rows: Sequence[Row]) -> str:
 
 
 def models_table(rows: Sequence[Row]) -> str:
-    """Markdown table of the models and of what they take."""
+    """Markdown table of the models and of what they take, beside the reference's."""
     header = ["models", "images", "ATE (share of extent)", "rotation", "error px mean / median"]
-    header += ["points", "front-end s", "its CPU s", "its memory", "mapper s", "its CPU s"]
-    header += ["all tracks: points", "error px", "s", "CPU s"]
+    header += ["points", "all tracks: points", "their error px"]
+    header += ["front-end CPU s (wall)", "memory", "mapper CPU s (wall)", "all tracks CPU s (wall)"]
+    reference = next((row for row in rows if row.frontend == REFERENCE), None)
+    base_points = reference.model.num_points if reference and reference.model else None
+    base_cpu = reference.run.cpu_seconds if reference else None
     body = []
     for row in rows:
-        cells = [row.frontend]
-        if row.model is None:
-            cells += ["no model", "", "", "", ""]
-        else:
-            cells.append(f"{row.model.num_registered} of {row.statistics.num_images}")
-            e = row.pose_errors
-            cells.append(f"{e.ate:.4f} ({e.ate / e.extent:.2%})" if e is not None else "-")
-            cells.append(f"{e.rotation:.3f}°" if e is not None else "-")
-            cells.append(f"{row.model.mean_error:.3f} / {row.model.median_error:.3f}")
-            cells.append(f"{row.model.num_points:,}")
         memory = row.run.peak_memory
-        cells.append(f"{sum(row.run.seconds.values()):.1f}")
-        cells.append(f"{row.run.cpu_seconds:.1f}")
-        cells.append(f"{memory / 2**20:.0f} MB" if memory is not None else "-")
-        cells += (
-            [f"{row.mapper.seconds:.1f}", f"{row.mapper.cpu_seconds:.1f}"] if row.mapper else []
-        )
-        if row.dense is not None:
-            run, triangulated, figures = row.dense
-            cells.append(f"{figures.num_points:,}")
-            cells.append(f"{figures.mean_error:.3f} / {figures.median_error:.3f}")
-            cells.append(f"{sum(run.seconds.values()) + triangulated.seconds:.1f}")
-            cells.append(f"{run.cpu_seconds + triangulated.cpu_seconds:.1f}")
-        elif row.mapper:
-            cells += ["", "", "", ""]
-        body.append(cells)
+        cost = [
+            f"{took(row.run.cpu_seconds, row.run.seconds)}{share(row.run.cpu_seconds, base_cpu)}",
+            f"{memory / 2**20:.0f} MB" if memory is not None else "-",
+            took(row.mapper.cpu_seconds, row.mapper.seconds) if row.mapper else "-",
+        ]
+        if row.model is None:
+            body.append([row.frontend, "no model", *["-"] * 6, *cost, "-"])
+            continue
+        model, errors, dense = row.model, row.pose_errors, row.dense
+        cells = [row.frontend, f"{model.num_registered} of {row.statistics.num_images}"]
+        if errors is None or (row is reference and not row.poses_are_true):
+            cells += ["-", "-"]
+        else:
+            cells.append(f"{errors.ate:.4f} ({errors.ate / errors.extent:.2%})")
+            cells.append(f"{errors.rotation:.3f}°")
+        cells.append(f"{model.mean_error:.3f} / {model.median_error:.3f}")
+        cells.append(f"{model.num_points:,}{times(model.num_points, base_points)}")
+        if dense is None:
+            body.append([*cells, "-", "-", *cost, "-"])
+            continue
+        run, triangulation, figures = dense
+        cells.append(f"{figures.num_points:,}{times(figures.num_points, base_points)}")
+        cells.append(f"{figures.mean_error:.3f} / {figures.median_error:.3f}")
+        seconds = {**run.seconds, "triangulation": triangulation.seconds}
+        cost.append(took(run.cpu_seconds + triangulation.cpu_seconds, seconds))
+        body.append([*cells, *cost])
     return markdown(header, body)
+
+
+def took(cpu_seconds: float, seconds: float | dict[str, float]) -> str:
+    """CPU time and, behind it, wall time."""
+    wall = sum(seconds.values()) if isinstance(seconds, dict) else seconds
+    return f"{cpu_seconds:.1f} ({wall:.1f})"
+
+
+def share(value: float, base: float | None) -> str:
+    """What part of the reference's this is."""
+    return f", {value / base:.1%}" if base else ""
+
+
+def times(value: int, base: int | None) -> str:
+    """How many times the reference's this is."""
+    return f", {value / base:.1f}x" if base else ""
 
 
 def length_classes(rows: Sequence[Row]) -> list[str]:
