@@ -54,6 +54,7 @@ class TrackBuilder:
         max_uncoded_block_area: int,
         smoothness: float,
         border: float,
+        interpolation: float,
     ) -> None: ...
     def add(self, **frame: Any) -> None: ...
     def finish(

@@ -62,6 +62,9 @@ class TrackOptions:
     # do not trust motion that starts or ends within this many pixels of the picture's edge:
     # the encoder had no picture to compare with beyond it; None: trust all
     border: float | None = 14.0
+    # let motion vary within a block, towards blocks beside it whose displacements differ by
+    # less than this many pixels; None: move a block as one
+    interpolation: float | None = 1.5
 
 
 @dataclass(frozen=True)

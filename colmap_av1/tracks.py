@@ -90,6 +90,7 @@ def build_tracks(
         max_uncoded_block_area=_or_off(options.max_uncoded_block_area),
         smoothness=_or_off(options.smoothness),
         border=_or_off(options.border),
+        interpolation=_or_off(options.interpolation),
     )
     for count, frame in enumerate(motion, start=1):
         builder.add(
@@ -177,7 +178,10 @@ def _check_options(options: TrackOptions) -> None:
         )
     if not (0.0 <= options.cosine_scale < math.inf):
         raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
-    limits = ("max_interval", "max_block_area", "max_uncoded_block_area", "smoothness", "border")
+    limits = (
+        *("max_interval", "max_block_area", "max_uncoded_block_area"),
+        *("smoothness", "border", "interpolation"),
+    )
     for name in limits:
         value = getattr(options, name)
         if value is not None and not value >= 0:

@@ -33,6 +33,7 @@ OPEN = TrackOptions(
     max_uncoded_block_area=None,
     smoothness=None,
     border=None,
+    interpolation=None,
 )
 # The rules of trust that do not depend on how large the picture is.
 SMALL_PICTURES = TrackOptions(border=None)
@@ -578,6 +579,71 @@ def test_motion_at_the_edge_is_not_followed() -> None:
     assert len(tracks.offsets) - 1 == (16 - 4) * (12 - 4)
 
 
+def block_field(slope: float, jump: float = 0.0) -> list[FrameMotion]:
+    """A field of 16x16 blocks whose one vector is the linear field's at their centres."""
+    x = np.tile(np.arange(2, 160, 4), (32, 1))
+    dx = slope * (x // 16 * 16 + 8) + np.where(x >= 80, jump, 0.0)
+    field = np.stack([np.zeros_like(dx), np.rint(8 * dx)], axis=-1).astype(np.int16)
+    return low_delay([field] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+
+
+def first_steps(tracks: Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the motion of the second frame is from, and the displacement there."""
+    start = tracks.offsets[:-1][tracks.frame[tracks.offsets[:-1]] == 0]
+    step = tracks.xy[start] - tracks.xy[start + 1]
+    return tracks.xy[start + 1, 0].astype(float), step[:, 0].astype(float)
+
+
+def test_interpolation_lets_motion_vary_within_a_block() -> None:
+    frames = block_field(1 / 16)
+
+    def errors(interpolation: float | None) -> Any:
+        options = replace(OPEN, interpolation=interpolation)
+        x, dx = first_steps(build_tracks(frames, options))
+        inner = (x > 8) & (x < 152)
+        assert inner.sum() > 500
+        return np.abs(dx - x / 16)[inner]
+
+    assert np.max(errors(1.5)) < 0.15
+    assert np.max(errors(None)) > 0.4
+    # Blocks that differ by a pixel do not move alike.
+    np.testing.assert_array_equal(errors(0.5), errors(None))
+
+
+def test_interpolation_keeps_edges_of_motion() -> None:
+    x, dx = first_steps(build_tracks(block_field(1 / 32, 4.0), replace(OPEN, interpolation=1.5)))
+    left = (x > 8) & (x < 70)
+    right = (x > 90) & (x < 150)
+    for side, jump in ((left, 0.0), (right, 4.0)):
+        np.testing.assert_allclose(dx[side], x[side] / 32 + jump, atol=0.3)
+
+
+def test_expected_errors_follow_the_bitstream() -> None:
+    def last_sigma(**changes: Any) -> float:
+        frames = low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+        frames = [
+            replace(f, **{k: np.full_like(f.skip, v) for k, v in changes.items()}) for f in frames
+        ]
+        tracks = build_tracks(frames, OPEN)
+        return float(np.median(tracks.sigma[tracks.offsets[1:] - 1]))
+
+    plain = last_sigma()
+    assert last_sigma(skip=1) > plain
+    assert last_sigma(y_mode=GLOBALMV) > plain
+    assert last_sigma(mi_size=BLOCK_8X8) < plain < last_sigma(mi_size=BLOCK_32X32)
+    # Blocks in disorder are less sure than those that move as one.
+    rng = np.random.default_rng(0)
+    rough = rng.integers(-16, 17, (8, 10, 2)).repeat(4, axis=0).repeat(4, axis=1)
+    frames = low_delay([rough.astype(np.int16)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+    disorder = build_tracks(frames, replace(OPEN, min_length=2))
+    steady = build_tracks(
+        low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16),
+        replace(OPEN, min_length=2),
+    )
+    second = [float(np.median(t.sigma[t.offsets[:-1] + 1])) for t in (steady, disorder)]
+    assert second[1] > 2 * second[0]
+
+
 def shaking(seed: int = 0, frames: int = 20) -> list[FrameMotion]:
     """A camera that moves steadily and shakes by several pixels each frame."""
     rng = np.random.default_rng(seed)
@@ -715,6 +781,7 @@ any_options = st.builds(
     max_uncoded_block_area=st.sampled_from([None, 256]),
     smoothness=st.sampled_from([None, 1.5]),
     border=st.sampled_from([None, 6.0]),
+    interpolation=st.sampled_from([None, 1.5]),
 )
 
 
@@ -754,6 +821,7 @@ def test_no_shown_frame_is_an_error() -> None:
         {"max_block_area": -5},
         {"smoothness": math.nan},
         {"border": -1.0},
+        {"interpolation": -1.0},
     ],
 )
 def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:

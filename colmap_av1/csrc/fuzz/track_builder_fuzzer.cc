@@ -90,6 +90,7 @@ TrackBuilderOptions read_options(Input& input) {
   options.max_uncoded_block_area = (choice & 32) != 0 ? 256 : -1;
   options.smoothness = (choice & 64) != 0 ? 2.5 : -1;
   options.border = (choice & 128) != 0 ? 16 : -1;
+  options.interpolation = (choice & 2) != 0 ? 2 : -1;
   return options;
 }
 

@@ -166,6 +166,7 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
     }
   }
   judge_blocks(frame, coded);
+  if (options_.interpolation > 0) interpolate(frame);
   return frame;
 }
 
@@ -213,6 +214,47 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
     for (int list = 0; list < 2; ++list) {
       frame.motion[list][unit].variance = verdicts[list][unit].variance;
       if (verdicts[list][unit].rough) frame.motion[list][unit].ref = 0;
+    }
+  }
+}
+
+// A block has one vector, the best for all of it; what it shows moves smoothly. Every unit is given
+// the vector between the centres of its block and of the blocks beside it that move alike, across
+// and down. A warp already says how its block moves from place to place; at the border to one, its
+// unit's displacement counts where that unit lies.
+void TrackBuilder::interpolate(Frame& frame) {
+  const auto limit = static_cast<float>(options_.interpolation);
+  for (auto& list : frame.motion) {
+    block_motion_.assign(list.begin(), list.end());
+    for (int row = 0; row < frame.visible_rows; ++row) {
+      for (int col = 0; col < frame.visible_cols; ++col) {
+        const int unit = row * frame.cols + col;
+        const UnitMotion& own = block_motion_[unit];
+        if (own.ref == 0 || own.warp >= 0) continue;
+        const int mi_size = frame.mi_size[unit];
+        // Along one axis: from a unit at `place` to the block before or behind.
+        const auto add = [&](int place, int units, int end, int stride, bool across) {
+          const int first = place & ~(units - 1);
+          const int twice_offset = 2 * (place - first) + 1 - units;  // from the centre, in units
+          const int neighbour = twice_offset < 0 ? first - 1 : first + units;
+          if (twice_offset == 0 || neighbour < 0 || neighbour >= end) return;
+          const int other_unit = unit + (neighbour - place) * stride;
+          const UnitMotion& other = block_motion_[other_unit];
+          const float dx = other.dx - own.dx;
+          const float dy = other.dy - own.dy;
+          if (other.ref != own.ref || std::max(std::abs(dx), std::abs(dy)) >= limit) return;
+          const int other_size = frame.mi_size[other_unit];
+          const int other_units =
+              (across ? av1::kBlockWidth[other_size] : av1::kBlockHeight[other_size]) / 4;
+          const int twice_distance = units + (other.warp >= 0 ? 1 : other_units);
+          const float share =
+              static_cast<float>(std::abs(twice_offset)) / static_cast<float>(twice_distance);
+          list[unit].dx += share * dx;
+          list[unit].dy += share * dy;
+        };
+        add(col, av1::kBlockWidth[mi_size] / 4, frame.visible_cols, 1, true);
+        add(row, av1::kBlockHeight[mi_size] / 4, frame.visible_rows, frame.cols, false);
+      }
     }
   }
 }

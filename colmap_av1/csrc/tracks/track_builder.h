@@ -24,6 +24,7 @@ struct TrackBuilderOptions {
   int max_block_area = -1;
   int max_uncoded_block_area = -1;
   double smoothness = -1;
+  double interpolation = -1;
   double border = -1;
 };
 
@@ -167,6 +168,7 @@ class TrackBuilder {
   bool is_waiting(int display_index) const;
   Frame& read_frame(const CodedFrame& coded);
   void judge_blocks(Frame& frame, const CodedFrame& coded) const;
+  void interpolate(Frame& frame);
   Agreement judge_border(const Frame& frame, int row, int col, int list) const;
   void chain_up_to(int display_index);
   void chain_frame(Frame& frame);
@@ -214,6 +216,7 @@ class TrackBuilder {
   Frame* current_ = nullptr;
   std::vector<Link> links_;
   std::vector<Claim> claims_;
+  std::vector<UnitMotion> block_motion_;
   std::vector<MotionSample> samples_;
   std::vector<float> scratch_;
 };
