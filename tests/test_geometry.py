@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import build_tracks, read_motion
+from colmap_av1.density import select_tracks
 from colmap_av1.errors import ImageError, VideoError
 from colmap_av1.evaluate import (
     epipolar_errors,
@@ -21,7 +22,10 @@ from colmap_av1.evaluate import (
     read_sequence,
     track_statistics,
 )
+from colmap_av1.options import DensityOptions, RefineOptions
+from colmap_av1.refine import refine_tracks
 from colmap_av1.tracks import Tracks
+from colmap_av1.video import decode_frames
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -85,23 +89,46 @@ def true_tracks(render_scene, scene):
     return _tracks(size, offsets, np.tile(frames, len(points)), xy.reshape(-1, 2))
 
 
+@pytest.fixture(scope="module")
+def refined(tracks):
+    return refine_tracks(tracks, decode_frames(EXAMPLES / "scene.mp4"), RefineOptions(refine="lk"))
+
+
 # By span: median and 90th percentile in px, some 15 % above what is reached.
 EXACT = {1: (0.104, 0.36), 2: (0.139, 0.58), 4: (0.177, 0.86), 8: (0.231, 1.26), 16: (0.265, 1.49)}
+REFINED = {1: (0.097, 0.28), 2: (0.12, 0.39), 4: (0.146, 0.56), 8: (0.187, 0.92), 16: (0.21, 1.39)}
+TRUSTED = {1: (0.089, 0.2), 2: (0.107, 0.26), 4: (0.134, 0.39), 8: (0.179, 0.68), 16: (0.223, 1.15)}
 
 
-@pytest.mark.parametrize("span", EXACT)
-def test_tracks_keep_to_their_surface_points(tracks, transfer, span):
+def _check(tracks, transfer, span, limits, least):
     errors = exact_errors(tracks, transfer, span, max_pairs=40_000)
-    assert len(errors) > 15_000
+    assert len(errors) > least
     distance = np.linalg.norm(errors, axis=1)
-    median, percentile = EXACT[span]
+    median, percentile = limits[span]
     assert np.median(distance) <= median
     assert np.quantile(distance, 0.9) <= percentile
 
 
-def test_tracks_are_not_biased(tracks, transfer):
+@pytest.mark.parametrize("span", EXACT)
+def test_tracks_keep_to_their_surface_points(tracks, transfer, span):
+    _check(tracks, transfer, span, EXACT, 15_000)
+
+
+@pytest.mark.parametrize("span", REFINED)
+def test_refined_tracks_keep_closer(refined, transfer, span):
+    _check(refined, transfer, span, REFINED, 15_000)
+
+
+@pytest.mark.parametrize("span", TRUSTED)
+def test_tracks_chosen_for_poses_keep_closest(refined, transfer, span):
+    chosen = select_tracks(refined, DensityOptions(preset="sparse"))
+    _check(chosen, transfer, span, TRUSTED, 10_000)
+
+
+@pytest.mark.parametrize("kind", ["tracks", "refined"])
+def test_tracks_are_not_biased(kind, transfer, request):
     # Half a pixel between two conventions would show in every long track.
-    errors = exact_errors(tracks, transfer, 1, max_pairs=40_000)
+    errors = exact_errors(request.getfixturevalue(kind), transfer, 1, max_pairs=40_000)
     assert np.abs(errors.mean(0)).max() <= 0.05
     assert np.abs(np.median(errors, axis=0)).max() <= 0.01
 
