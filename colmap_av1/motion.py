@@ -22,6 +22,7 @@ from colmap_av1.video import open_stream
 # Bytes of block data that threads may read ahead of their use, all together.
 _READ_AHEAD = 1 << 28
 _BYTES_PER_UNIT = 24
+_SMALL_AHEAD = 4  # frames
 
 
 @dataclass(frozen=True)
@@ -284,13 +285,15 @@ def _read_events(
 ) -> Generator[_core.Event, None, None]:
     """Events of the parser in bitstream order; those before an error come first."""
     num_threads = options.num_threads or os.cpu_count() or 1
-    num_readers = min(num_threads, len(index.groups))
-    if num_readers == 1:
+    if num_threads == 1:
         for _, event in _read_groups(video, options, index.groups, num_threads=num_threads):
             if event is not None:
                 yield event
         return
-    depth = max(2, _READ_AHEAD // (num_readers * _BYTES_PER_UNIT * max(1, index.num_units)))
+    num_readers = min(num_threads, len(index.groups))
+    depth = _SMALL_AHEAD  # one reader: enough to work while the frames are used
+    if num_readers > 1:
+        depth = max(2, _READ_AHEAD // (num_readers * _BYTES_PER_UNIT * max(1, index.num_units)))
     stop = threading.Event()
     ahead: list[queue.Queue[tuple[int, Any]]] = [queue.Queue(depth) for _ in range(num_readers)]
 

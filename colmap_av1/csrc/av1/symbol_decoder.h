@@ -5,7 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#if defined(__SSE2__)
+#if defined(__SSE2__) || defined(_M_X64)
 #include <emmintrin.h>
 #endif
 
@@ -146,7 +146,7 @@ class SymbolDecoder {
     return static_cast<std::uint16_t>(count + 1 - (count >> 5));
   }
 
-#if defined(__SSE2__)
+#if defined(__SSE2__) || defined(_M_X64)
   // Bounds of all symbols into `bounds`, the symbol as result, and the adaptation of the array.
   // Lanes behind the last symbol are read and written back unchanged (CdfContext has room behind
   // its last array).

@@ -6,6 +6,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "av1/error.h"
@@ -83,8 +84,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   options.max_frame_size = kMaxFrameSize;
   Parser parser(options);
   std::size_t num_events = 0;
-  while (!input.empty() && num_events < kMaxEvents) {
-    const auto unit = input.unit();
+  std::span<const std::uint8_t> first;
+  const auto parse = [&](std::span<const std::uint8_t> unit) {
     // The parser sees a copy: a read past the unit is a read past an allocation.
     const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
     try {
@@ -95,8 +96,16 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     num_events += parser.events().size();
     for (const auto& event : parser.events()) check_event(*event, options);
     parser.events().clear();
+  };
+  while (!input.empty() && num_events < kMaxEvents) {
+    const auto unit = input.unit();
+    if (first.empty()) first = unit;
+    parse(unit);
   }
   try {
+    // Whatever follows, as a reader goes on that starts at a later group of frames
+    parser.restart(parser.restart_point());
+    parse(first);
     parser.finish();
   } catch (const BitstreamError&) {
   }
