@@ -44,7 +44,13 @@ from colmap_av1.options import (
     ViewOptions,
 )
 from colmap_av1.progress import Progress, no_progress
-from colmap_av1.view import serve_model, view_model, view_video, write_picture
+from colmap_av1.view import (
+    serve_model,
+    view_database,
+    view_model,
+    view_video,
+    write_picture,
+)
 
 _PROGRAM = "colmap-av1"
 _INTERRUPTED = 130
@@ -195,13 +201,23 @@ def _make_parser() -> argparse.ArgumentParser:
         "--video", "--video_path", metavar="PATH", help="draw motion and tracks of an AV1 video"
     )
     subject.add_argument(
+        "--database", "--database_path", metavar="PATH", help="draw the matches of two images"
+    )
+    subject.add_argument(
         "--model", "--model_path", metavar="PATH", help="draw points and camera path of a model"
     )
     command.add_argument(
         "--output",
         "--output_path",
         metavar="PATH",
-        help="an .mp4 file or a folder for PNG files (video), a .png or .jpg file (model)",
+        help="an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
+    )
+    command.add_argument("--image_path", metavar="PATH", help="folder of the database's images")
+    command.add_argument(
+        "--pair",
+        nargs=2,
+        metavar="NAME",
+        help="the images to draw [the pair with the most inliers]",
     )
     command.add_argument(
         "--interactive",
@@ -438,6 +454,12 @@ def _run_view(namespace: argparse.Namespace) -> None:
         raise OptionError("nowhere to draw: give --output")
     if namespace.model is not None:
         write_picture(view_model(namespace.model), namespace.output)
+        return
+    if namespace.database is not None:
+        if namespace.image_path is None:
+            raise OptionError("nothing to draw the matches on: give --image_path")
+        picture = view_database(namespace.database, namespace.image_path, namespace.pair)
+        write_picture(picture, namespace.output)
         return
     with _progress(namespace.quiet) as report:
         count = view_video(

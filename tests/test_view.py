@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sqlite3
 import urllib.request
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from conftest import Encode
 
 from colmap_av1 import view
 from colmap_av1.cli import main
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
+from colmap_av1.match import match
 from colmap_av1.options import TrackOptions, ViewOptions
 
 
@@ -100,19 +102,45 @@ def test_bad_options_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_matches_join_their_keypoints() -> None:
-    black = np.zeros((100, 60, 3), dtype=np.uint8)
-    left, right = np.array([[10.5, 20.5]], np.float32), np.array([[30.5, 70.5]], np.float32)
-    matches = np.array([[0, 0]], dtype=np.uint32)
-    picture = view.view_pair(black, black, left, right, matches)
-    assert picture.shape == (100, 120, 3)
-    lit = picture.any(axis=2)
-    assert lit[20, 10]
-    assert lit[70, 90]
-    assert lit[45, 50]  # half way
-    assert not lit[70, 30]
-    none = view.view_pair(black, black, left, right, matches[:0])
-    assert not none.any()
+def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
+    match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
+    before = (tmp_path / "a.db").read_bytes()
+    for path in (tmp_path / "frames").iterdir():
+        cv2.imwrite(str(path), np.zeros((128, 192, 3), np.uint8))
+    names = ["frame_000002.png", "frame_000007.png"]
+    words = ["view", "--database", str(tmp_path / "a.db"), "--image_path", str(tmp_path / "frames")]
+    output = str(tmp_path / "pair.png")
+    assert main([*words, "--pair", *names, "--output", output]) == 0
+    assert (tmp_path / "a.db").read_bytes() == before
+    # Wide pictures lie above each other: lines run from the one above to the one below.
+    lit = cv2.imread(output).any(axis=2)
+    assert lit.shape == (256, 192)
+    assert lit[120:136].any(axis=1).all()
+    with sqlite3.connect(f"file:{tmp_path / 'a.db'}?mode=ro", uri=True) as connection:
+        rows = connection.execute("SELECT data FROM keypoints WHERE image_id IN (3, 8)").fetchall()
+    for (data,), top in zip(rows, (0, 128), strict=True):
+        xy = np.frombuffer(data, "<f4").reshape(-1, 2)
+        near = np.zeros((128, 192), dtype=bool)
+        near[np.floor(xy[:, 1]).astype(int), np.floor(xy[:, 0]).astype(int)] = True
+        # Dots are where keypoints are, and lines lead away from them.
+        assert (lit[top : top + 128] & near).sum() > 100
+    swapped = view.view_database(tmp_path / "a.db", tmp_path / "frames", names[::-1])
+    assert not np.array_equal(swapped.any(axis=2), lit)
+
+
+@pytest.mark.parametrize(
+    ("pair", "message"),
+    [
+        (["x.png", "frame_000000.png"], "lists no image 'x.png'"),
+        (["frame_000000.png", "frame_000001.png"], "is missing or no image"),
+    ],
+)
+def test_pairs_that_cannot_be_drawn(
+    clip: Path, tmp_path: Path, pair: list[str], message: str
+) -> None:
+    match(tmp_path / "a.db", clip)
+    with pytest.raises(ColmapAv1Error, match=message):
+        view.view_database(tmp_path / "a.db", tmp_path, pair)
 
 
 @pytest.fixture(scope="module")
