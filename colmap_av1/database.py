@@ -100,7 +100,7 @@ def make_camera(options: CameraOptions, width: int, height: int) -> pycolmap.Cam
 
 
 def _parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:
-    wanted = f"{camera.model_name} takes {len(camera.params)} numbers, {camera.params_info}"
+    wanted = f"{camera.model.name} takes {len(camera.params)} numbers, {camera.params_info}"
     try:
         params = [float(word) for word in text.split(",")]
     except ValueError:
