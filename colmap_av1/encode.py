@@ -17,6 +17,7 @@ import av.error
 import imageio_ffmpeg
 
 from colmap_av1.errors import EncodeError, NotAv1Error, OptionError, VideoError
+from colmap_av1.files import whole_file
 from colmap_av1.options import EncodeOptions
 from colmap_av1.progress import Progress, no_progress
 from colmap_av1.video import open_stream
@@ -173,27 +174,26 @@ def encode(
     encoder = _ENCODERS[name]
     quality, speed = _settings(encoder, options)
 
-    partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
-    command = [
-        *(ffmpeg, "-v", "error", "-nostdin", "-y", *encoder.before_input),
+    before = [ffmpeg, "-v", "error", "-nostdin", "-y", *encoder.before_input]
+    if is_mov:
         # Frames that an edit list hides are frames all the same, and good ones.
-        *(("-ignore_editlist", "1") if is_mov else ()),
+        before += ["-ignore_editlist", "1"]
+    how = [
         *("-i", f"file:{video}", "-map", "0:V:0", "-an", "-sn", "-dn", "-vf", encoder.upload),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", _KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
         *("-metadata", f"comment={_mark(name, quality, speed)}"),
-        *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()], f"file:{partial}"),
+        *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
     ]
+    progress("encoding", 0, num_frames)
     try:
-        progress("encoding", 0, num_frames)
-        count = _run(command, video, lambda done: progress("encoding", done, num_frames))
-        if count == 0:
-            raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
-        partial.replace(output)
+        with whole_file(output) as partial:
+            command = [*before, *how, f"file:{partial}"]
+            count = _run(command, video, lambda done: progress("encoding", done, num_frames))
+            if count == 0:
+                raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
     except OSError as error:
         raise EncodeError(f"{output}: cannot be written: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
     return EncodeReport(output, encoder.ffmpeg_name, count)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.files import whole_file
 from colmap_av1.video import decode_frames
 
 _WRITE_PARAMETERS = {
@@ -376,10 +377,8 @@ def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
     _check_extension(path.name)
     suffix = path.suffix.lower()
     _, encoded = cv2.imencode(suffix, image, _WRITE_PARAMETERS[suffix])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_bytes(encoded.tobytes())
-        temporary.replace(path)
+        with whole_file(path) as partial:
+            partial.write_bytes(encoded.tobytes())
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise ImageError(f"{path}: cannot be written: {error.strerror}") from error

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.files import whole_file
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import ReadOptions
 
@@ -53,11 +54,10 @@ def export_motion(
     writers: dict[str, _Opener] = {".npz": _open_npz, ".h5": _open_h5, ".hdf5": _open_h5}
     if path.suffix.lower() not in writers:
         raise OptionError(f"{path}: give an output file that ends in .npz or .h5")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count = 0
     try:
-        try:
-            with writers[path.suffix.lower()](temporary) as write:
+        with whole_file(path) as partial:
+            with writers[path.suffix.lower()](partial) as write:
                 for frame in read_motion(video, options):
                     for name, array in _arrays(frame):
                         write(f"{count:06d}/{name}", array)
@@ -66,9 +66,6 @@ def export_motion(
                         progress(count)
             if count == 0:
                 raise VideoError(f"{video}: holds no frame: give a video with pictures")
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise OptionError(f"{path}: cannot be written: {error.strerror or error}") from error
     return count

@@ -25,6 +25,7 @@ from colmap_av1.database import (
 )
 from colmap_av1.database_file import check_layout, open_unaltered
 from colmap_av1.errors import DatabaseError, ImageError, OptionError
+from colmap_av1.files import whole_file
 from colmap_av1.images import image_file
 from colmap_av1.model import read_model
 from colmap_av1.motion import read_motion
@@ -316,8 +317,8 @@ def write_picture(picture: _Image, output: str | os.PathLike[str]) -> None:
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise OptionError(f"{path}: give an output that ends in .png or .jpg")
     _, encoded = cv2.imencode(path.suffix.lower(), picture)
-    with _whole_or_nothing(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+    with _output(path) as partial:
+        partial.write_bytes(encoded.tobytes())
 
 
 @dataclass(frozen=True)
@@ -486,7 +487,7 @@ def _open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[_Image],
             raise OptionError(f"{path}: cannot be made: {error.strerror}") from error
         yield write_file
         return
-    with _whole_or_nothing(path) as temporary, av.open(str(temporary), "w", "mp4") as container:
+    with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
         rate = Fraction(frame_rate).limit_denominator(1001)
         stream: Any = container.add_stream("libx264", rate, options={"crf": "18"})
         stream.pix_fmt = "yuv420p"
@@ -512,16 +513,13 @@ def _open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[_Image],
 
 
 @contextmanager
-def _whole_or_nothing(path: Path) -> Iterator[Path]:
-    """A name to write a file under that then gets its own name."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _output(path: Path) -> Iterator[Path]:
+    """A `whole_file`, whose errors become ours."""
     try:
-        yield temporary
-        temporary.replace(path)
+        with whole_file(path) as partial:
+            yield partial
     except (OSError, av.error.FFmpegError) as error:
         raise OptionError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
