@@ -29,7 +29,7 @@ _MAX_SOFTNESS = 0.15
 # Logarithm of a match's variance in px^2: constant, slope with the logarithm of the error that the
 # windows' difference lets expect, slope with that of the variance of the bitstream's motion since
 # the template; fitted by examples/benchmarks/fit_trust.py.
-_MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.67, 1.35, 0.68
+_MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.49, 1.17, 0.80
 # Standard deviation in pixels that is added where there is texture but nothing like the template:
 # hidden, or followed wrongly.
 _REFUSED_SIGMA = 0.7
@@ -73,7 +73,26 @@ def refine_tracks(
     _check_options(options)
     if options.refine == "none":
         return tracks
-    state = _State.start(tracks, options)
+    state = match_tracks(tracks, frames, options, progress)
+    return replace(
+        tracks,
+        xy=state.xy,
+        sigma=np.sqrt(state.variance).astype(np.float32),
+        confirmed=state.confirmed,
+    )
+
+
+def match_tracks(
+    tracks: Tracks,
+    frames: Iterable[tuple[int, NDArray[np.uint8]]],
+    options: RefineOptions,
+    progress: Callable[[int], None] | None = None,
+) -> RefinedTracks:
+    """Do the work of `refine_tracks`, and tell how every observation was found.
+
+    Args and errors are those of `refine_tracks`.
+    """
+    state = RefinedTracks.start(tracks, options)
     by_frame = np.argsort(tracks.frame, kind="stable")
     bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
     next_frame = 0
@@ -94,17 +113,23 @@ def refine_tracks(
             progress(count)
     for missing in range(next_frame, tracks.num_frames):
         state.skip(by_frame[bounds[missing] : bounds[missing + 1]])
-    return replace(
-        tracks,
-        xy=state.xy,
-        sigma=np.sqrt(state.variance).astype(np.float32),
-        confirmed=state.confirmed,
-    )
+    return state
 
 
 @dataclass
-class _State:
-    """What is known of every track after some of the frames."""
+class RefinedTracks:
+    """What is known of every track after some of the frames.
+
+    Attributes:
+        xy: float32 [num_observations, 2] corrected positions in pixels.
+        variance: float64 [num_observations] their expected variance in px^2.
+        confirmed: bool [num_observations].
+        source: int64 [num_observations] the observation whose picture each was found by; -1 for
+            those that are not confirmed.
+        noise: float32 [num_observations] error in pixels that the difference of the matched
+            pictures would make if it were noise; 0 for those that are not confirmed.
+        bitstream_variance: float64 [num_observations] variance before refinement.
+    """
 
     tracks: Tracks
     options: RefineOptions
@@ -117,12 +142,15 @@ class _State:
     xy: NDArray[np.float32]
     variance: NDArray[np.float64]
     confirmed: NDArray[np.bool_]
+    source: NDArray[np.int64]
+    noise: NDArray[np.float32]
     templates: _Templates
     last_image: NDArray[np.uint8] | None = None
     last_frame: int = -1
 
     @classmethod
-    def start(cls, tracks: Tracks, options: RefineOptions) -> _State:
+    def start(cls, tracks: Tracks, options: RefineOptions) -> RefinedTracks:
+        """What is known before the first frame."""
         num_observations = len(tracks.frame)
         num_tracks = len(tracks.offsets) - 1
         is_first = np.zeros(num_observations, dtype=np.bool_)
@@ -146,6 +174,8 @@ class _State:
             xy=tracks.xy.copy(),
             variance=variance.copy(),
             confirmed=np.zeros(num_observations, dtype=np.bool_),
+            source=np.full(num_observations, -1),
+            noise=np.zeros(num_observations, dtype=np.float32),
             templates=_Templates.empty(tracks, options, int(np.cumsum(alive).max(initial=0))),
         )
 
@@ -170,8 +200,7 @@ class _State:
         found = _match(
             templates.atlas, canvas, templates.point[track], self.xy[tracked], self.options
         )
-        prior = np.maximum(self.bitstream_variance[tracked] - templates.prior[track], 0.0)
-        sure = self._accept(tracked, found, templates.variance[track], prior)
+        sure = self._accept(tracked, found, templates.source[track])
         templates.misses[track[sure]] = 0
         templates.misses[track[~sure]] += 1
 
@@ -184,8 +213,7 @@ class _State:
             found = _match(
                 self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
             )
-            prior = self.step_variance[lost]
-            sure = self._accept(lost, found, self.variance[lost - 1], prior)
+            sure = self._accept(lost, found, lost - 1)
             fresh = lost[sure]
             self.variance[lost[~sure]] += _REFUSED_SIGMA**2
 
@@ -194,8 +222,7 @@ class _State:
         renewed = renewed[~self.is_last[renewed]]
         templates.drop(self.track[seen[self.is_last[seen]]])
         templates.take(image, self.track[renewed], self.xy[renewed])
-        templates.variance[self.track[renewed]] = self.variance[renewed]
-        templates.prior[self.track[renewed]] = self.bitstream_variance[renewed]
+        templates.source[self.track[renewed]] = renewed
         self.last_image, self.last_frame = image, frame
 
     def _follow(self, later: NDArray[np.int64]) -> None:
@@ -208,16 +235,14 @@ class _State:
         self,
         observations: NDArray[np.int64],
         found: _Matches,
-        variance: NDArray[np.float64],
-        prior: NDArray[np.float64],
+        source: NDArray[np.int64],
     ) -> NDArray[np.bool_]:
         """Take over the matches that are good enough; tells which are.
 
         Args:
             observations: int64 [n].
             found: their matches.
-            variance: float64 [n] of the positions they were matched with.
-            prior: float64 [n] variance of the bitstream's motion since then.
+            source: int64 [n] the observations whose pictures were looked for.
         """
         track = self.track[observations]
         contrast = self.templates.contrast[track]
@@ -226,8 +251,11 @@ class _State:
         taken = observations[sure]
         noise = found.difference[sure] * self.templates.softness[track[sure]]
         self.xy[taken] = found.position[sure]
-        self.variance[taken] = variance[sure] + _match_variance(noise, prior[sure])
+        since = self.bitstream_variance[taken] - self.bitstream_variance[source[sure]]
+        self.variance[taken] = self.variance[source[sure]] + _match_variance(noise, since)
         self.confirmed[taken] = True
+        self.source[taken] = source[sure]
+        self.noise[taken] = noise
         return sure
 
 
@@ -246,8 +274,7 @@ class _Templates:
     num_free: int
     slot: NDArray[np.int64]  # of each track, -1: none
     point: NDArray[np.float32]  # of each track in the atlas, first pixel's centre (0, 0)
-    variance: NDArray[np.float64]  # of the templates' positions
-    prior: NDArray[np.float64]  # of the bitstream's motion up to there
+    source: NDArray[np.int64]  # observation of each track that its template shows
     contrast: NDArray[np.float32]  # mean absolute deviation, in grey levels
     softness: NDArray[np.float32]  # pixels of matching error for a grey level of noise
     misses: NDArray[np.int32]  # frames without a confirmation
@@ -266,8 +293,7 @@ class _Templates:
             num_free=capacity,
             slot=np.full(num_tracks, -1),
             point=np.zeros((num_tracks, 2), dtype=np.float32),
-            variance=np.zeros(num_tracks),
-            prior=np.zeros(num_tracks),
+            source=np.full(num_tracks, -1),
             contrast=np.zeros(num_tracks, dtype=np.float32),
             softness=np.zeros(num_tracks, dtype=np.float32),
             misses=np.zeros(num_tracks, dtype=np.int32),
@@ -393,7 +419,8 @@ def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> N
         prior: variance in px^2 of the bitstream's motion over the same frames.
     """
     exponent = _MATCH_CONSTANT + _MATCH_NOISE * np.log(0.02 + noise)
-    return np.asarray(np.exp(exponent + _MATCH_PRIOR * np.log(0.01 + prior)), np.float64)
+    exponent += _MATCH_PRIOR * np.log(0.01 + np.maximum(prior, 0.0))
+    return np.asarray(np.exp(exponent), np.float64)
 
 
 def _check_options(options: RefineOptions) -> None:

@@ -10,14 +10,14 @@ namespace {
 
 // Logarithm of the variance in px^2, linear in these traits; fitted by
 // examples/benchmarks/fit_trust.py.
-constexpr float kConstant = -2.58F;
-constexpr float kDisagreement = 0.85F;  // times log(0.1 px + disagreement)
-constexpr float kLength = 0.68F;        // times log(1 px + length)
-constexpr float kSize = 0.24F;          // times log2 of the area over that of 8x8
-constexpr float kUncoded = 0.45F;
-constexpr float kOverlapped = 0.17F;
-constexpr float kWarped = -0.44F;
-constexpr float kNewVector = -1.23F;
+constexpr float kConstant = -2.77F;
+constexpr float kDisagreement = 0.87F;  // times log(0.1 px + disagreement)
+constexpr float kLength = 0.71F;        // times log(1 px + length)
+constexpr float kSize = 0.28F;          // times log2 of the area over that of 8x8
+constexpr float kUncoded = 0.49F;
+constexpr float kOverlapped = 0.19F;
+constexpr float kWarped = -0.31F;
+constexpr float kNewVector = -1.37F;
 
 // A block that nothing around it speaks for or against.
 constexpr float kUnknownDisagreement = 0.5F;
