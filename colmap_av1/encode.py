@@ -26,6 +26,7 @@ from colmap_av1.video import open_stream
 _PROBE_FRAMES = 8
 _PROBE_TIMEOUT = 30.0
 _NUM_QUALITIES = 64
+_LIBAOM_REALTIME = 5
 # A frame further than any video is long: the first is the only intra frame.
 _KEY_FRAME_DISTANCE = "9999"
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
@@ -102,7 +103,9 @@ def _vaapi(quality: int, speed: int) -> list[str]:
 
 
 def _libaom(quality: int, speed: int) -> list[str]:
-    how = ["-usage", "realtime", "-cpu-used", str(speed), "-lag-in-frames", "0", "-row-mt", "1"]
+    # Its realtime mode starts at speed 5.
+    usage = "realtime" if speed >= _LIBAOM_REALTIME else "good"
+    how = ["-usage", usage, "-cpu-used", str(speed), "-lag-in-frames", "0", "-row-mt", "1"]
     return [*how, "-crf", str(quality), "-b:v", "0"]
 
 

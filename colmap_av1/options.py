@@ -31,7 +31,8 @@ class EncodeOptions:
     encoder: Literal["auto", "nvenc", "qsv", "amf", "vaapi", "libaom", "svt"] = "auto"
     # constant quantiser, 0 (best) to 63; None: the encoder's default
     quality: int | None = None
-    # preset on the encoder's own scale: -cpu-used of libaom, -preset of others; None: its default
+    # preset on the encoder's own scale: -cpu-used of libaom (5 and up its realtime mode), -preset
+    # of others; None: its default
     speed: int | None = None
 
 
