@@ -46,7 +46,7 @@ HARDWARE = ("nvenc", "qsv", "amf", "vaapi")
 SETTINGS = (
     *(EncodeOptions("libaom", 20, speed) for speed in (4, 6, 8)),
     *(EncodeOptions("libaom", quality, 6) for quality in (30, 40)),
-    *(EncodeOptions("svt", 20, speed) for speed in (6, 8, 10)),
+    *(EncodeOptions("svt", 20, speed) for speed in (8, 10)),
     EncodeOptions("svt", 40, 8),
 )
 CLIPS = ("street", "log_building", "kitchen")
