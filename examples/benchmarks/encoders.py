@@ -59,7 +59,7 @@ class Row:
     """What one setting gives on one clip."""
 
     setting: str
-    frames_per_second: float
+    cpu_per_frame: float
     bytes_per_frame: float
     num_tracks: dict[int, int]
     errors: dict[int, float]
@@ -144,7 +144,7 @@ def measure_clip(
         rows.append(
             Row(
                 setting=f"{setting.encoder} {setting.speed or ''} | {setting.quality or ''}",
-                frames_per_second=material.num_frames / encoding["seconds"],
+                cpu_per_frame=encoding["cpu_seconds"] / material.num_frames,
                 bytes_per_frame=stream.stat().st_size / material.num_frames,
                 num_tracks={n: int(np.count_nonzero(length >= n)) for n in LONG},
                 errors={
@@ -192,7 +192,7 @@ def encode_quietly(source: Path, stream: Path, setting: EncodeOptions) -> None:
 def table(rows: list[Row]) -> str:
     """Markdown table of the settings."""
     lines = [
-        "| encoder, speed | quality | frames a s | kB a frame | "
+        "| encoder, speed | quality | CPU ms a frame | kB a frame | "
         + " | ".join(f"tracks of {n}+" for n in LONG)
         + f" | epipolar px at {' / '.join(map(str, SPANS))} frames | registered | mapped at |",
         "|---|---|" + "---:|" * (4 + len(LONG)) + "---:|",
@@ -201,7 +201,7 @@ def table(rows: list[Row]) -> str:
         errors = " / ".join(f"{row.errors[span]:.2f}" for span in SPANS)
         counts = " | ".join(f"{row.num_tracks[n]:,}" for n in LONG)
         lines.append(
-            f"| {row.setting} | {row.frames_per_second:.1f} | {row.bytes_per_frame / 1000:.1f} | "
+            f"| {row.setting} | {1000 * row.cpu_per_frame:.0f} | {row.bytes_per_frame / 1000:.1f} | "
             f"{counts} | {errors} | {row.num_registered} of {row.num_images} | "
             f"{row.mean_error:.2f} px |"
         )
