@@ -2,8 +2,9 @@
 
 python examples/benchmarks/encoders.py --cache benchmark_tracks
 
-Each clip is encoded with each setting; tracks are measured against true poses (where there are
-none, against the model of SIFT and exhaustive matching), and a spread subset of them is mapped.
+Each clip is encoded with each setting; tracks are measured against true poses where these and the
+intrinsics are known, where neither is against the model of SIFT and exhaustive matching; a spread
+subset of them is mapped.
 Hardware encoders are measured where they work. The cache is that of tracks.py.
 """
 
@@ -62,7 +63,7 @@ class Row:
     cpu_per_frame: float
     bytes_per_frame: float
     num_tracks: dict[int, int]
-    errors: dict[int, float]
+    errors: dict[int, float] | None
     num_registered: int
     num_images: int
     mean_error: float
@@ -119,11 +120,10 @@ def measure_clip(
         fixed_intrinsics=material.camera is not None, forward_motion=case.forward_motion
     )
     truth = ruler.known_truth(material)
-    if truth.geometry is None:
+    if truth.poses is None:
         footage = prepare_footage(material.video, folder / "footage", **how)
         model = ruler.reference_model(footage, folder, mapper, console)
         truth = ruler.with_reference(truth, model, material.num_frames)
-    assert truth.geometry is not None
     source = lossless(material, folder)
     rows = []
     for setting in settings:
@@ -140,6 +140,11 @@ def measure_clip(
             continue
         tracks = build_tracks(read_motion(stream))
         length = np.diff(tracks.offsets)
+        errors = None
+        if truth.geometry is not None:
+            errors = {
+                span: ruler.median(epipolar_errors(tracks, *truth.geometry, span)) for span in SPANS
+            }
         figures = model_figures(read_model(mapped.model)) if mapped.model is not None else None
         rows.append(
             Row(
@@ -147,10 +152,7 @@ def measure_clip(
                 cpu_per_frame=encoding["cpu_seconds"] / material.num_frames,
                 bytes_per_frame=stream.stat().st_size / material.num_frames,
                 num_tracks={n: int(np.count_nonzero(length >= n)) for n in LONG},
-                errors={
-                    span: ruler.median(epipolar_errors(tracks, *truth.geometry, span))
-                    for span in SPANS
-                },
+                errors=errors,
                 num_registered=figures.num_registered if figures is not None else 0,
                 num_images=len(footage.frames),
                 mean_error=figures.mean_error if figures is not None else float("nan"),
@@ -198,7 +200,9 @@ def table(rows: list[Row]) -> str:
         "|---|---|" + "---:|" * (4 + len(LONG)) + "---:|",
     ]
     for row in rows:
-        errors = " / ".join(f"{row.errors[span]:.2f}" for span in SPANS)
+        errors = "-"
+        if row.errors is not None:
+            errors = " / ".join(f"{row.errors[span]:.2f}" for span in SPANS)
         counts = " | ".join(f"{row.num_tracks[n]:,}" for n in LONG)
         lines.append(
             f"| {row.setting} | {1000 * row.cpu_per_frame:.0f} | {row.bytes_per_frame / 1000:.1f} | "
