@@ -523,12 +523,18 @@ def _info_rows(report: StreamReport) -> _Rows:
         f"{report.num_shown} shown, {report.num_coded} coded, {report.num_hidden} never shown, "
         f"{report.num_key_frames} intra"
     )
+    if report.num_cut:
+        frames += f", {report.num_cut} hidden by an edit list"
+    display = report.display
+    cropped = any(display.crop)
     return [
         ("video", str(report.path)),
         ("container", report.container),
         ("codec", "av1"),
         ("size", f"{report.width}x{report.height}"),
-        ("rotation", str(report.rotation)),
+        ("rotation", f"{display.rotation}{', upside down' if display.is_mirrored else ''}"),
+        *([("cropped", "{} left, {} top, {} right, {} bottom".format(*display.crop))] * cropped),
+        *([("pixel aspect", f"{display.pixel_aspect:.3f}")] * (display.pixel_aspect != 1)),
         ("frame rate", rate),
         ("frames", frames),
         ("references", ", ".join(references) or "none"),

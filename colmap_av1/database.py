@@ -33,6 +33,11 @@ from colmap_av1.options import CameraOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints
 from colmap_av1.verify import TwoViewConfig, TwoViewGeometry
 
+# Models of new cameras: COLMAP's own choice, and the simplest with two focal lengths that
+# knows distortion.
+_MODEL, _MODEL_OF_OBLONG_PIXELS = "SIMPLE_RADIAL", "OPENCV"
+# Encoders that scale pictures round their display size: a few tenths of a percent.
+_SQUARE_TOLERANCE = 5e-3
 # COLMAP's kinds of two-view geometry beside those of TwoViewConfig.
 _UNDEFINED, _WATERMARK, _MULTIPLE = 0, 7, 8
 # COLMAP's SensorType of a camera.
@@ -65,38 +70,52 @@ class DatabaseImage:
     num_matches: int
 
 
-def make_camera(options: CameraOptions, width: int, height: int) -> pycolmap.Camera:
+def make_camera(
+    options: CameraOptions, width: int, height: int, pixel_aspect: float = 1.0
+) -> pycolmap.Camera:
     """Make the camera of new images.
 
     Without parameters it is COLMAP's first guess, without a focal length prior: focal length
-    1.2 times the longer side, principal point in the centre, no distortion. Given parameters
-    count as a prior.
+    1.2 times the longer side, principal point in the centre, no distortion. Where pixels are
+    not square, this holds for the picture as it is shown. Given parameters count as a prior.
 
     Args:
         options: camera model and parameters.
         width: image width in pixels.
         height: image height in pixels.
+        pixel_aspect: width of a pixel over its height.
 
     Raises:
         OptionError: the model is unknown, or the parameters do not fit it.
     """
     names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-    if options.camera_model not in names:
-        raise OptionError(
-            f"unknown camera model {options.camera_model!r}: give one of {', '.join(names)}"
-        )
-    model = pycolmap.CameraModelId.__members__[options.camera_model]
+    name = options.camera_model
+    if name is None:
+        name = _MODEL if is_square(pixel_aspect) else _MODEL_OF_OBLONG_PIXELS
+    if name not in names:
+        raise OptionError(f"unknown camera model {name!r}: give one of {', '.join(names)}")
+    model = pycolmap.CameraModelId.__members__[name]
     create = getattr(pycolmap.Camera, "create_from_model_id", None) or pycolmap.Camera.create
-    camera = create(0, model, 1.2 * max(width, height), width, height)
+    focal_length = 1.2 * max(width * pixel_aspect, height)
+    camera = create(0, model, focal_length, width, height)
+    if len(camera.focal_length_idxs()) == 2:
+        params = camera.params
+        params[camera.focal_length_idxs()[0]] = focal_length / pixel_aspect
+        camera.params = params
     if len(camera.focal_length_idxs()) == 0:
         raise OptionError(
-            f"camera model {options.camera_model} has no focal length, so it does not fit a "
+            f"camera model {name} has no focal length, so it does not fit a "
             "video: give a perspective or fisheye model such as SIMPLE_RADIAL"
         )
     camera.has_prior_focal_length = options.camera_params is not None
     if options.camera_params is not None:
         camera.params = _parse_camera_params(options.camera_params, camera)
     return camera
+
+
+def is_square(pixel_aspect: float) -> bool:
+    """Whether pixels are square, but for what rounding does to their width."""
+    return abs(pixel_aspect - 1) < _SQUARE_TOLERANCE
 
 
 def _parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:

@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import Tracks, keep_observations
 
 # Error in pixels that an observation has however sure its motion is; keeps one sure
 # observation from outweighing many good ones.
@@ -71,30 +70,6 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         min_length=limits.min_length,
     )
     return keep_observations(tracks, kept.astype(np.bool_))
-
-
-def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
-    """The tracks with some of their observations only.
-
-    Args:
-        tracks: any tracks.
-        kept: bool [num_observations].
-
-    Returns:
-        Tracks in their former order, without those that keep nothing.
-    """
-    if kept.all():
-        return tracks
-    counts = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
-    lengths = np.diff(counts)
-    return replace(
-        tracks,
-        offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),
-        frame=tracks.frame[kept],
-        xy=tracks.xy[kept],
-        sigma=tracks.sigma[kept],
-        confirmed=tracks.confirmed[kept],
-    )
 
 
 def _limits(options: DensityOptions) -> _Limits:

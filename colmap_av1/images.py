@@ -95,13 +95,15 @@ def frames_of_images(
 
 
 def size_of_images(
-    sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int]
+    sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int], pixel_aspect: float = 1.0
 ) -> tuple[int, int]:
     """The one size of images that exist: that of the video's pictures, or these scaled.
 
     Args:
         sizes: (width, height) of each image, by name; empty where none exist.
         video_size: (width, height) of the pictures, turned as players do.
+        pixel_aspect: width of the pictures' pixels over their height; images whose pixels were
+            made square fit, too.
 
     Raises:
         ImageError: the images differ in size, or in shape from the video's pictures.
@@ -116,7 +118,8 @@ def size_of_images(
                 "images of one video have one size; match those of other cameras apart"
             )
     width, height = video_size
-    if abs(first[0] * height - first[1] * width) > max(width, height, *first):
+    square = (width * pixel_aspect, height)
+    if not has_shape(first, video_size) and not has_shape(first, square):
         turned = first == video_size[::-1]
         raise ImageError(
             f"image '{first_name}' is {first[0]}x{first[1]}, the video's pictures are "
@@ -124,6 +127,11 @@ def size_of_images(
             "video's shape, or a new database and folder"
         )
     return first
+
+
+def has_shape(size: tuple[int, int], of: tuple[float, float]) -> bool:
+    """Whether a (width, height) is another one scaled, rounded to whole pixels."""
+    return abs(size[0] * of[1] - size[1] * of[0]) <= max(*size, *of)
 
 
 def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> None:

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_av1.display import Display
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import ReadOptions
-from colmap_av1.video import VideoStream, display_rotation, open_stream
+from colmap_av1.video import VideoStream, open_stream, presented_frames, read_display
 
 _KEY_FRAME, _INTRA_ONLY_FRAME = 0, 2
 
@@ -34,12 +35,13 @@ class StreamReport:
     Attributes:
         path: the file.
         container: FFmpeg's name of the container.
-        width: picture width in pixels, unrotated.
+        width: picture width in pixels as stored.
         height: picture height in pixels.
-        rotation: degrees counter-clockwise players turn the pictures by.
+        display: how players show the pictures.
         frame_rate: frames per second; None where unknown.
         num_coded: frames with block data.
-        num_shown: frames that are shown.
+        num_shown: frames that the bitstream shows.
+        num_cut: those of them that an edit list hides.
         num_hidden: coded frames that are never shown.
         num_key_frames: key frames and intra-only frames among the coded ones.
         inter_share: share of inter units in all frames but the first.
@@ -56,10 +58,11 @@ class StreamReport:
     container: str
     width: int
     height: int
-    rotation: int
+    display: Display
     frame_rate: float | None
     num_coded: int
     num_shown: int
+    num_cut: int
     num_hidden: int
     num_key_frames: int
     inter_share: float
@@ -96,6 +99,10 @@ def inspect(
     structure = counts.structure
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frame: give a video with pictures")
+    presented = presented_frames(video)
+    num_presented = (
+        structure.num_shown if presented is None else int((presented < structure.num_shown).sum())
+    )
     with open_stream(video) as stream:
         bytes_per_frame = _num_bytes(stream) / structure.num_shown
         bits_per_pixel = 8 * bytes_per_frame / max(1, stream.width * stream.height)
@@ -112,10 +119,11 @@ def inspect(
             container=stream.container,
             width=stream.width,
             height=stream.height,
-            rotation=display_rotation(video),
+            display=read_display(video),
             frame_rate=stream.frame_rate,
             num_coded=structure.num_coded,
             num_shown=structure.num_shown,
+            num_cut=structure.num_shown - num_presented,
             num_hidden=counts.num_hidden,
             num_key_frames=structure.num_key_frames,
             inter_share=structure.inter_share,
@@ -137,7 +145,8 @@ class Structure:
 
     Attributes:
         num_coded: frames with block data.
-        num_shown: frames that are shown.
+        num_shown: frames that the bitstream shows.
+        num_cut: those of them that an edit list hides.
         num_key_frames: key frames and intra-only frames among the coded ones.
         later_units: units of all frames but the first.
         inter_units: those of them that are inter coded.

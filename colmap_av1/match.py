@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from colmap_av1.choice import ChosenImages, check_image_options, choose_images
 from colmap_av1.database import (
     DatabaseImage,
+    is_square,
     make_camera,
     read_cameras,
     read_images,
     write_matches,
 )
-from colmap_av1.density import keep_observations, select_tracks
+from colmap_av1.density import select_tracks
+from colmap_av1.display import Display
 from colmap_av1.encode import stream_of
 from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
 from colmap_av1.images import (
@@ -34,19 +36,26 @@ from colmap_av1.images import (
 )
 from colmap_av1.info import Structure, inspect
 from colmap_av1.motion import FrameMotion, read_motion
-from colmap_av1.options import MatchOptions, OnExisting
+from colmap_av1.options import CameraOptions, MatchOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.refine import refine_tracks
-from colmap_av1.tracks import Tracks, build_tracks, scale_tracks, turn_tracks
+from colmap_av1.tracks import (
+    Tracks,
+    build_tracks,
+    keep_observations,
+    scale_tracks,
+    show_tracks,
+)
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 from colmap_av1.video import (
     decode_frames,
-    display_rotation,
     frame_times,
     is_av1,
     open_stream,
     picture_size,
+    presented_frames,
+    read_display,
 )
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -136,13 +145,15 @@ class VideoSource:
     Attributes:
         stream: the AV1 file whose motion is read.
         pictures: the file whose pictures become images.
-        rotation: degrees counter-clockwise by which players turn the stream's pictures.
+        display: how players show the stream's pictures.
+        presented: indices of the stream's frames that players show, where they hide some.
         num_packets: number of packets of the stream; None where unknown.
     """
 
     stream: Path
     pictures: Path
-    rotation: int
+    display: Display
+    presented: NDArray[np.int32] | None
     num_packets: int | None
 
 
@@ -218,12 +229,13 @@ def match(
 
     # What can be refused is refused before the long work.
     video_size = picture_size(video)
+    pixel_aspect = read_display(video).pixel_aspect
     listed = _read_listed_images(database, options)
     existing = {image.name: (image.width, image.height) for image in listed}
     if folder is not None and not listed:
         names = existing_images(folder, options.images.image_name)
         existing = {name: image_size(folder / name) for name in names}
-    size = size_of_images(existing, video_size)
+    size = size_of_images(existing, video_size, pixel_aspect)
     check_options(options, size)
     if folder is not None:
         check_image_folder(folder, list(existing) or options.images.image_name, size)
@@ -236,7 +248,13 @@ def match(
     )
     tracks = tracked.tracks
     if (tracks.width, tracks.height) != video_size:
-        size = size_of_images(existing, (tracks.width, tracks.height))
+        if source.stream != source.pictures:
+            raise VideoError(
+                f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+                f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
+            )
+        video_size = (tracks.width, tracks.height)
+        size = size_of_images(existing, video_size, pixel_aspect)
 
     def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
         pictures = _decodable_frames(source.pictures, tracks.num_frames, options)
@@ -260,7 +278,12 @@ def match(
     with clock.measure("pairs"):
         seen = np.isin(tracks.frame, chosen.frames)
         tracks = select_tracks(keep_observations(tracks, seen), options.density)
-    cameras, new_cameras = _cameras(database, listed, chosen.names, size, options)
+    # Images may be scaled by different factors along x and y.
+    pixel_aspect *= video_size[0] * size[1] / (video_size[1] * size[0])
+    cameras, new_cameras = _cameras(
+        database, listed, chosen.names, size, options.camera, pixel_aspect=pixel_aspect
+    )
+    notes = [*tracked.warnings, *_camera_notes(cameras, listed, pixel_aspect)]
     matched = match_images(video, tracks, chosen, cameras, options, clock=clock, progress=progress)
 
     num_written = 0
@@ -310,7 +333,7 @@ def match(
         configs={kind: kinds.count(kind) for kind in sorted(set(kinds))},
         forward_motion=matched.forward_motion,
         seconds=clock.seconds,
-        warnings=tracked.warnings,
+        warnings=tuple(notes),
     )
 
 
@@ -342,7 +365,8 @@ def open_source(
         stream = encoded.output
     with open_stream(stream) as opened:
         num_packets = opened.num_frames
-    return VideoSource(stream, video, display_rotation(stream), num_packets)
+    # A stream made of a video holds the frames that its edit list hides, too.
+    return VideoSource(stream, video, read_display(stream), presented_frames(video), num_packets)
 
 
 def track_video(
@@ -381,7 +405,8 @@ def track_video(
         warnings.simplefilter("always")
         with clock.measure("tracks"):
             tracks = build_tracks(motion, options.tracks, count)
-            tracks = turn_tracks(tracks, source.rotation)
+            num_frames = tracks.num_frames
+            tracks = show_tracks(tracks, source.display, source.presented)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
@@ -399,7 +424,7 @@ def track_video(
     notes = [str(w.message) for w in caught]
     # Of the whole file, so a rate that is found low is even lower.
     bits = 8 * source.stream.stat().st_size
-    reasons = structure.reasons(bits / (tracks.num_frames * tracks.width * tracks.height))
+    reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
     if reasons and source.stream == source.pictures:
         notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
     return TrackedVideo(tracks, structure.num_coded, tuple(notes))
@@ -553,7 +578,9 @@ def _cameras(
     listed: Sequence[DatabaseImage],
     names: Sequence[str],
     size: tuple[int, int],
-    options: MatchOptions,
+    options: CameraOptions,
+    *,
+    pixel_aspect: float,
 ) -> tuple[list[Any], Any]:
     """The camera of each image, and what the database is to get where it lists no images."""
     if listed:
@@ -563,6 +590,19 @@ def _cameras(
         if missing is not None:
             raise DatabaseError(f"{database}: image '{missing}' has no camera")
         return [cameras[camera_id[name]] for name in names], None
-    camera = make_camera(options.camera, *size)
+    camera = make_camera(options, *size, pixel_aspect)
     each = [camera] * len(names)
-    return each, camera if options.camera.single_camera else each
+    return each, camera if options.single_camera else each
+
+
+def _camera_notes(cameras: Sequence[Any], listed: Sequence[Any], pixel_aspect: float) -> list[str]:
+    """What is to be said of cameras whose one focal length cannot be right."""
+    if is_square(pixel_aspect) or len(cameras[0].focal_length_idxs()) == 2:
+        return []
+    what_to_do = (
+        "import the images with one of these" if listed else "leave out --camera_model or give one"
+    )
+    return [
+        f"pixels are {pixel_aspect:.3f} times as wide as high, but {cameras[0].model_name} has one "
+        f"focal length for both directions; OPENCV and PINHOLE have two: {what_to_do}"
+    ]

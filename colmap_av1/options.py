@@ -141,8 +141,9 @@ class VerifyOptions:
 class CameraOptions:
     """The camera written for new images."""
 
-    # name of one of COLMAP's camera models
-    camera_model: str = "SIMPLE_RADIAL"
+    # name of one of COLMAP's camera models; None: SIMPLE_RADIAL, or OPENCV, which has two
+    # focal lengths, where the video's pixels are not square
+    camera_model: str | None = None
     # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: focal length 1.2
     # times the longer side and the principal point in the centre, both to be refined
     camera_params: str | None = None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
+from colmap_av1.display import Display, shown_points, shown_size
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.motion import FrameMotion
 from colmap_av1.options import TrackOptions
@@ -128,21 +129,54 @@ def build_tracks(
     return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
 
 
-def turn_tracks(tracks: Tracks, rotation: int) -> Tracks:
-    """The tracks in pictures that are turned, as players do by the container's display matrix.
+def show_tracks(
+    tracks: Tracks, display: Display, presented: NDArray[np.int32] | None = None
+) -> Tracks:
+    """The tracks in the pictures that players show, in place of those that are stored.
 
     Args:
-        tracks: tracks in the pictures of the bitstream.
-        rotation: degrees counter-clockwise: 0, 90, 180 or 270.
+        tracks: tracks through all shown frames of a bitstream.
+        display: how its pictures are cut and turned.
+        presented: indices of the frames that players show, ascending; None: all.
+
+    Returns:
+        The observations within what is shown; frames are numbered anew where some are left out.
     """
-    x, y = tracks.xy[:, 0], tracks.xy[:, 1]
-    width, height = tracks.width, tracks.height
-    if rotation == 0:
+    size = shown_size((tracks.width, tracks.height), display)
+    xy = shown_points(tracks.xy, (tracks.width, tracks.height), display)
+    shown = replace(tracks, width=size[0], height=size[1], xy=xy)
+    kept = np.all((xy >= 0) & (xy <= size), axis=1)
+    if presented is not None:
+        presented = presented[presented < tracks.num_frames]
+        number = np.full(tracks.num_frames, -1, dtype=np.int32)
+        number[presented] = np.arange(len(presented), dtype=np.int32)
+        shown = replace(shown, num_frames=len(presented), frame=number[tracks.frame])
+        kept &= shown.frame >= 0
+    return keep_observations(shown, kept)
+
+
+def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
+    """The tracks with some of their observations only.
+
+    Args:
+        tracks: any tracks.
+        kept: bool [num_observations].
+
+    Returns:
+        Tracks in their former order, without those that keep nothing.
+    """
+    if kept.all():
         return tracks
-    if rotation == 180:
-        return replace(tracks, xy=np.stack([width - x, height - y], axis=1))
-    turned = [y, width - x] if rotation == 90 else [height - y, x]
-    return replace(tracks, width=height, height=width, xy=np.stack(turned, axis=1))
+    counts = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
+    lengths = np.diff(counts)
+    return replace(
+        tracks,
+        offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),
+        frame=tracks.frame[kept],
+        xy=tracks.xy[kept],
+        sigma=tracks.sigma[kept],
+        confirmed=tracks.confirmed[kept],
+    )
 
 
 def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:

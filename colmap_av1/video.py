@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import shlex
+import struct
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,14 +18,18 @@ from typing import Any
 
 import av
 import av.error
+import av.logging
 import numpy as np
 from av.stream import Disposition
 from numpy.typing import NDArray
 
+from colmap_av1.display import Display, shown_picture, shown_size, turn_of_matrix
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 
 # Edit lists drop or hide samples, but a later frame may reference them: read them all.
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
+# FFmpeg names it in its summary of a file; PyAV gives no other access to it.
+_CROPPING = re.compile(r"^ +Frame Cropping: (\d+)/(\d+)/(\d+)/(\d+)$", re.MULTILINE)
 
 _IVF_FRAME_HEADER_SIZE = 12
 _IVF_RATE_OFFSET = 16  # rate and scale, 32 bits each
@@ -190,49 +196,59 @@ def decode_frames(
     *,
     operating_point: int = 0,
     num_threads: int | None = None,
+    display: Display | None = None,
 ) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
-    """Decode the shown frames in output order, without film grain, turned as players do.
+    """Decode the frames that players show, as they show them but for film grain.
 
     Args:
         video: a file of any codec that FFmpeg decodes.
         operating_point: operating point of a scalable stream.
         num_threads: threads of the decoder; None: as many as it likes.
+        display: how pictures are cut and turned; None: as `read_display` says. Pixels stay as
+            wide as they are stored.
 
     Yields:
-        (display_index, image): the image is uint8 [height, width, 3] in BGR order.
+        (index, image) in output order: the index counts the frames that players show, see
+        `presented_frames`; the image is uint8 [height, width, 3] in BGR order.
 
     Raises:
         BitstreamError: the stream is damaged; the frames before have been given.
         VideoError: the file is missing, empty, not a video, or holds no video stream.
     """
+    display = display if display is not None else read_display(video)
+    presented = presented_frames(video)
+    index_of = None if presented is None else {int(f): i for i, f in enumerate(presented)}
+
+    def shown(number: int, frame: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        index = number if index_of is None else index_of.get(number)
+        if index is not None:
+            yield index, shown_picture(frame.to_ndarray(format="bgr24"), display)
+
     count = 0
     try:
         for frame in _decode(video, operating_point, num_threads):
-            yield count, _upright(frame)
+            yield from shown(count, frame)
             count += 1
     except BitstreamError:
         if num_threads == 1:
             raise
         # Threads lose the frames in flight at the damage; one thread has none in flight.
-        for index, frame in enumerate(_decode(video, operating_point, 1)):
-            if index >= count:
-                yield index, _upright(frame)
+        for number, frame in enumerate(_decode(video, operating_point, 1)):
+            if number >= count:
+                yield from shown(number, frame)
 
 
-def display_rotation(video: str | os.PathLike[str]) -> int:
-    """Find the rotation players apply to the pictures, from the container's display matrix.
+def read_display(video: str | os.PathLike[str]) -> Display:
+    """Find how players show the pictures, from the container and the first frame.
 
     Args:
         video: a file of any codec that FFmpeg decodes.
 
-    Returns:
-        Degrees counter-clockwise: 0, 90, 180 or 270. The bitstream itself is unrotated.
-
     Raises:
         BitstreamError: no frame can be decoded.
-        VideoError: as `decode_frames`.
+        VideoError: as `decode_frames`, or pictures are turned by anything but quarters.
     """
-    return _rotation(_first_frame(video))
+    return _look(video)[1]
 
 
 def picture_size(video: str | os.PathLike[str]) -> tuple[int, int]:
@@ -240,11 +256,42 @@ def picture_size(video: str | os.PathLike[str]) -> tuple[int, int]:
 
     Raises:
         BitstreamError: no frame can be decoded.
+        VideoError: as `read_display`.
+    """
+    return shown_size(*_look(video))
+
+
+def presented_frames(video: str | os.PathLike[str]) -> NDArray[np.int32] | None:
+    """Find the frames that players show, where an edit list hides some, as of a trimmed clip.
+
+    The others are frames all the same: motion runs through them. A frame that an edit list
+    shows several times counts once.
+
+    Returns:
+        int32 indices among all shown frames of the stream, ascending; None: all of them.
+
+    Raises:
         VideoError: as `decode_frames`.
     """
-    frame = _first_frame(video)
-    size = (frame.width, frame.height)
-    return size[::-1] if _rotation(frame) in (90, 270) else size
+    path = Path(video)
+    with _open_container(path) as container:
+        if "mov" not in container.format.name:
+            return None
+        stream = _find_video_stream(container, path)
+        num_entries = len(stream.index_entries)
+        with _open_container(path, apply_edits=True) as edited:
+            entries = list(_find_video_stream(edited, path).index_entries)
+        shown = {entry.pos for entry in entries if not entry.is_discard}
+        if len(shown) == num_entries or not entries:
+            return None
+        # Where pictures are coded out of order, packets come in another order than pictures.
+        packets: list[tuple[int, bool]] = []
+        with contextlib.suppress(av.error.FFmpegError, OSError):
+            for number, packet in enumerate(p for p in container.demux(stream) if p.size):
+                time = packet.pts if packet.pts is not None else number
+                packets.append((time, packet.pos in shown))
+    packets.sort(key=lambda packet: packet[0])
+    return np.flatnonzero([is_shown for _, is_shown in packets]).astype(np.int32)
 
 
 def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
@@ -278,24 +325,56 @@ def is_av1(video: str | os.PathLike[str]) -> bool:
         return _codec_name(_find_video_stream(container, path)) == "av1"
 
 
-def _first_frame(video: str | os.PathLike[str]) -> Any:
-    for frame in _decode(video, 0, 1):
-        return frame
-    raise BitstreamError(f"{video}: no frame can be decoded: the file is damaged")
+def _look(video: str | os.PathLike[str]) -> tuple[tuple[int, int], Display]:
+    """(width, height) of the first stored picture, and how it is shown."""
+    path = Path(video)
+    frames = _decode(path, 0, 1)
+    frame = next(frames, None)
+    frames.close()
+    if frame is None:
+        raise BitstreamError(f"{path}: no frame can be decoded: the file is damaged")
+    matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
+    turn = Display().turn if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
+    if turn is None:
+        raise VideoError(
+            f"{path}: players turn its pictures by an angle that is no multiple of 90 degrees: "
+            "take the turn out with 'ffmpeg -display_rotation 0 -i ... -c copy'"
+        )
+    with _open_container(path) as container:
+        stream = _find_video_stream(container, path)
+        crop = _container_crop(container, stream.index)
+        aspect = float(stream.sample_aspect_ratio or 1)
+    left, top, right, bottom = crop
+    if left + right >= frame.width or top + bottom >= frame.height:
+        raise VideoError(f"{path}: its container cuts off the whole picture: it is damaged")
+    aspect = aspect if turn[0][0] else 1 / aspect
+    return (frame.width, frame.height), Display(crop, turn, aspect)
 
 
-def _rotation(frame: Any) -> int:
-    return int(round(frame.rotation / 90) * 90 % 360)
-
-
-def _upright(frame: Any) -> NDArray[np.uint8]:
-    turned = np.rot90(frame.to_ndarray(format="bgr24"), _rotation(frame) // 90)
-    return np.ascontiguousarray(turned)
+def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, int]:
+    """Pixels that the container cuts off at the left, top, right and bottom."""
+    if not {"mov", "matroska"} & set(container.format.name.split(",")):
+        return (0, 0, 0, 0)
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.INFO)
+    try:
+        summary = container.dumps_format()
+    finally:
+        av.logging.set_level(level)
+    of_stream = re.split(r"^  Stream #0:(\d+)", summary, flags=re.MULTILINE)
+    for number, text in zip(of_stream[1::2], of_stream[2::2], strict=True):
+        # The container's side data comes after its metadata, which may say anything.
+        _, _, side_data = text.rpartition("\n    Side data:\n")
+        found = _CROPPING.search(side_data)
+        if int(number) == stream_index and found:
+            left, right, top, bottom = map(int, found.groups())
+            return left, top, right, bottom
+    return (0, 0, 0, 0)
 
 
 def _decode(
     video: str | os.PathLike[str], operating_point: int, num_threads: int | None
-) -> Iterator[Any]:
+) -> Generator[Any, None, None]:
     path = Path(video)
     with _open_container(path) as container:
         stream = _find_video_stream(container, path)
@@ -358,7 +437,7 @@ def _is_ivf_without_rate(path: Path) -> bool:
 
 
 @contextmanager
-def _open_container(path: Path) -> Iterator[Any]:
+def _open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
     file: _IvfWithRate | None = None
     try:
         if not path.exists():
@@ -370,7 +449,10 @@ def _open_container(path: Path) -> Iterator[Any]:
         if _is_ivf_without_rate(path):
             file = _IvfWithRate(path)
         # An absolute path: FFmpeg would take 'name:...' for a protocol.
-        container = av.open(file or os.path.abspath(path), container_options=_CONTAINER_OPTIONS)
+        container = av.open(
+            file or os.path.abspath(path),
+            container_options={} if apply_edits else _CONTAINER_OPTIONS,
+        )
     except (PermissionError, av.error.FFmpegError, OSError, ValueError) as error:
         if file is not None:
             file.close()

@@ -31,8 +31,8 @@ from colmap_av1.model import read_model
 from colmap_av1.motion import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.progress import Progress, no_progress
-from colmap_av1.tracks import Tracks, build_tracks, turn_tracks
-from colmap_av1.video import decode_frames, display_rotation, open_stream
+from colmap_av1.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.video import decode_frames, open_stream, presented_frames, read_display
 
 _Image = NDArray[np.uint8]
 
@@ -105,7 +105,7 @@ def view_video(
     chained = build_tracks(
         read_motion(video, read), tracks, lambda done: report("tracks", done, num_packets)
     )
-    chained = turn_tracks(chained, display_rotation(video))
+    chained = show_tracks(chained, read_display(video), presented_frames(video))
     drawing = _prepare(chained, options)
     draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
     operating_point = read.operating_point if read is not None else 0

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_av1.density import keep_observations, select_tracks
+from colmap_av1.density import select_tracks
 from colmap_av1.errors import OptionError
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import Tracks, keep_observations
 
 WIDTH, HEIGHT, FRAMES = 320, 240, 30
 ANY = {"max_tracks_per_image": 0, "spacing": 0.0, "min_length": 1, "max_sigma": 0.0}

@@ -13,7 +13,7 @@ from colmap_av1.info import inspect
 def test_good_stream(clip: Path) -> None:
     report = inspect(clip)
     assert report.good
-    assert (report.width, report.height, report.rotation) == (192, 128, 0)
+    assert (report.width, report.height, report.display.rotation) == (192, 128, 0)
     assert (report.num_shown, report.num_coded, report.num_key_frames) == (16, 16, 1)
     assert report.inter_share > 0.6
     assert report.reference_distances[-1] > 0.5
@@ -36,7 +36,7 @@ def test_pyramid_references_the_future(encode: Encode, tmp_path: Path) -> None:
 
 def test_rotation_is_reported(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     turned = ffmpeg("-display_rotation", "90", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
-    assert inspect(turned).rotation == 90
+    assert inspect(turned).display.rotation == 90
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,11 @@ from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 from colmap_av1.video import (
     decode_frames,
-    display_rotation,
     is_av1,
     open_stream,
     packets,
     picture_size,
+    read_display,
 )
 
 TEMPORAL_DELIMITER = 2
@@ -182,7 +182,7 @@ def test_edit_lists_drop_no_packet(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Pat
         shown = sum(1 for _ in container.decode(video=0))
     assert shown < 12  # the edit list hides frames that later ones reference
     assert len(list(packets(trimmed))) == 12
-    assert len(list(decode_frames(trimmed))) == 12
+    assert len(list(decode_frames(trimmed))) == shown
 
 
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
@@ -196,7 +196,7 @@ def test_pictures_are_turned_as_ffmpeg_turns_them(
         "-display_rotation", str(angle), "-i", plain, "-c", "copy", tmp_path / "turned.mp4"
     )
     assert is_av1(turned) == (codec == "av1")
-    assert display_rotation(turned) == angle
+    assert read_display(turned).rotation == angle
     assert picture_size(turned) == ((64, 96) if angle in (90, 270) else (96, 64))
     ffmpeg("-i", turned, tmp_path / "%d.png")
     decoded = list(decode_frames(turned))

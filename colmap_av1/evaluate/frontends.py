@@ -155,7 +155,9 @@ def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str,
 def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> dict[str, float]:
     clock = Clock()
     pycolmap.set_random_seed(0)
-    reader = pycolmap.ImageReaderOptions(camera_model=footage.camera.camera_model)
+    reader = pycolmap.ImageReaderOptions()
+    if footage.camera.camera_model is not None:
+        reader.camera_model = footage.camera.camera_model
     reader.camera_params = footage.camera.camera_params or ""
     pycolmap.Database.open(database).close()
     # Threads of the extraction would number the images in the order in which they finish.

@@ -1,0 +1,112 @@
+"""How players show the pictures of a video: cut, turned, and with pixels that may not be square."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# How far a display matrix may be from a turn by quarters, in units of its longer column.
+_QUARTER_TURN_TOLERANCE = 0.02
+
+Turn = tuple[tuple[int, int], tuple[int, int]]
+
+_UPRIGHT: Turn = ((1, 0), (0, 1))
+
+
+@dataclass(frozen=True)
+class Display:
+    """How the pictures of a stream are shown. The bitstream holds them as they were stored.
+
+    Attributes:
+        crop: pixels that are cut off at the left, top, right and bottom of stored pictures.
+        turn: ((a, b), (c, d)), a quarter turn, a reflection, or both: what is stored x right
+            and y down of the middle is shown a x + b y right and c x + d y down of it.
+        pixel_aspect: width of a shown pixel over its height.
+    """
+
+    crop: tuple[int, int, int, int] = (0, 0, 0, 0)
+    turn: Turn = _UPRIGHT
+    pixel_aspect: float = 1.0
+
+    @property
+    def rotation(self) -> int:
+        """Degrees counter-clockwise of the turn, without its reflection."""
+        (a, b), _ = self.turn
+        turned = (1, 0) if a else (0, 1)
+        return {(1, 0): 0 if a > 0 else 180, (0, 1): 90 if b > 0 else 270}[turned]
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the turn has a reflection: along y, after the rotation."""
+        (a, b), (c, d) = self.turn
+        return a * d - b * c < 0
+
+
+def turn_of_matrix(matrix: Sequence[int]) -> Turn | None:
+    """The quarter turn or reflection that a container's display matrix asks for.
+
+    Args:
+        matrix: the 9 values of ISO/IEC 14496-12, 8.3.2: a, b, u, c, d, v, x, y, w.
+
+    Returns:
+        The turn as `Display` has it; None where it turns by anything but quarters.
+    """
+    a, b, c, d = matrix[0], matrix[1], matrix[3], matrix[4]
+    # The matrix holds what (1, 0) and (0, 1) become, and may scale as well.
+    columns = np.array([[a, c], [b, d]], dtype=np.float64)
+    lengths = np.hypot(columns[0], columns[1])
+    if not lengths.all():
+        return None
+    columns /= lengths
+    turn = np.rint(columns)
+    if np.abs(columns - turn).max() > _QUARTER_TURN_TOLERANCE or abs(np.linalg.det(turn)) != 1:
+        return None
+    (p, q), (r, s) = turn.astype(int).tolist()
+    return ((p, q), (r, s))
+
+
+def shown_size(size: tuple[int, int], display: Display) -> tuple[int, int]:
+    """(width, height) in pixels of a stored picture of a size, as it is shown."""
+    left, top, right, bottom = display.crop
+    width, height = size[0] - left - right, size[1] - top - bottom
+    return (width, height) if display.turn[0][0] else (height, width)
+
+
+def shown_picture(stored: NDArray[np.uint8], display: Display) -> NDArray[np.uint8]:
+    """A stored picture, uint8 [height, width, 3], as it is shown."""
+    left, top, right, bottom = display.crop
+    height, width = stored.shape[:2]
+    picture = stored[top : height - bottom, left : width - right]
+    (a, b), (c, d) = display.turn
+    if a == 0:
+        picture = picture.transpose(1, 0, 2)
+    if a + b < 0:
+        picture = picture[:, ::-1]
+    if c + d < 0:
+        picture = picture[::-1]
+    return np.ascontiguousarray(picture)
+
+
+def shown_points(
+    stored: NDArray[np.float32], size: tuple[int, int], display: Display
+) -> NDArray[np.float32]:
+    """Where points of stored pictures are shown.
+
+    Args:
+        stored: float32 [n, 2] (x, y) in pixels, origin at the stored picture's top-left corner.
+        size: (width, height) of the stored pictures.
+        display: how they are shown.
+
+    Returns:
+        float32 [n, 2], origin at the shown picture's top-left corner; what was cut off lies
+        beyond the picture.
+    """
+    turn = np.array(display.turn, dtype=np.float32)
+    left, top, _, _ = display.crop
+    points = (stored - np.array([left, top], dtype=np.float32)) @ turn.T
+    # What turned towards negative coordinates is counted from the other edge.
+    points += np.where(turn.sum(axis=1) < 0, shown_size(size, display), 0)
+    return np.asarray(points, dtype=np.float32)
