@@ -27,9 +27,11 @@ class _Limits:
     max_sigma: float
 
 
+# max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
+# as errors grow from step to step.
 _PRESETS = {
-    "sparse": _Limits(max_tracks_per_image=1500, spacing=12.0, min_length=4, max_sigma=0.8),
-    "default": _Limits(max_tracks_per_image=4000, spacing=8.0, min_length=4, max_sigma=1.0),
+    "sparse": _Limits(max_tracks_per_image=1500, spacing=12.0, min_length=3, max_sigma=0.8),
+    "default": _Limits(max_tracks_per_image=3000, spacing=8.0, min_length=3, max_sigma=0.8),
     "dense": _Limits(max_tracks_per_image=0, spacing=0.0, min_length=1, max_sigma=0.0),
 }
 
@@ -37,7 +39,8 @@ _PRESETS = {
 def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
     """Choose tracks that are long, sure and spread over every image.
 
-    Observations less sure than `max_sigma` go first. Then tracks are taken best first, the
+    Observations less sure than `max_sigma`, against the first one of their track, are left out.
+    Then tracks are taken best first, the
     weight of an observation being its inverse expected variance. One is used where at least
     half of its observations lie in images that are not full, and there in cells, `spacing`
     wide, that no better track lies in; it loses the observations in full images.
@@ -53,10 +56,16 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
     Raises:
         OptionError: an option has a value that cannot work.
     """
-    limits = _limits(options if options is not None else DensityOptions())
+    options = options if options is not None else DensityOptions()
+    limits = _limits(options)
+    variance = _variance_since_first(tracks)
     if limits.max_sigma > 0:
-        tracks = keep_observations(tracks, tracks.sigma <= limits.max_sigma)
-    weight = 1.0 / (_SIGMA_FLOOR**2 + tracks.sigma.astype(np.float64) ** 2)
+        max_variance = limits.max_sigma**2
+        if options.max_sigma is None:
+            max_variance *= _frames_between_images(tracks)
+        sure = variance <= max_variance
+        tracks, variance = keep_observations(tracks, sure), variance[sure]
+    weight = 1.0 / (_SIGMA_FLOOR**2 + variance)
     total = np.concatenate([[0.0], np.cumsum(weight)])
     score = total[tracks.offsets[1:]] - total[tracks.offsets[:-1]]
     kept = _core.select_spread(
@@ -70,6 +79,18 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         min_length=limits.min_length,
     )
     return keep_observations(tracks, kept.astype(np.bool_))
+
+
+def _variance_since_first(tracks: Tracks) -> NDArray[np.float64]:
+    """Variance of each observation against the first of its track that is left, in px^2."""
+    variance = tracks.sigma.astype(np.float64) ** 2
+    first = np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
+    return np.asarray(np.maximum(variance - first, 0.0), np.float64)
+
+
+def _frames_between_images(tracks: Tracks) -> float:
+    frames = np.unique(tracks.frame)
+    return float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
 
 
 def _limits(options: DensityOptions) -> _Limits:

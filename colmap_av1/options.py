@@ -87,7 +87,7 @@ class DensityOptions:
     """How many of the tracks are used; options that are None are set by the preset."""
 
     # 'sparse': few and sure ones, for poses; 'default': for maps; 'dense': all
-    preset: Literal["sparse", "default", "dense"] = "dense"
+    preset: Literal["sparse", "default", "dense"] = "default"
     # tracks an image sees at most, the surest first; 0: any number
     max_tracks_per_image: int | None = None
     # width in pixels of the cells of an image that one track each is wanted in; 0: any

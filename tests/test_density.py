@@ -98,6 +98,23 @@ def test_max_sigma_and_min_length_hold_for_what_is_left() -> None:
     assert len(chosen.offsets) - 1 == (np.diff(expected.offsets) >= 5).sum()
 
 
+def test_presets_follow_the_distance_of_images() -> None:
+    tracks = random_tracks()
+    # Every fourth frame is an image, and errors are as large as those of four steps.
+    spaced = keep_observations(tracks, tracks.frame % 4 == 0)
+    chosen = select_tracks(spaced, DensityOptions())
+    largest = chosen.sigma.max()
+    assert largest > 0.8
+    sigma = spaced.sigma.astype(float)
+    first = np.repeat(sigma[spaced.offsets[:-1]], np.diff(spaced.offsets))
+    reach = np.sqrt(np.maximum(sigma**2 - first**2, 0))
+    given = select_tracks(spaced, DensityOptions(max_sigma=0.5, min_length=1))
+    assert len(given.frame) <= (reach <= 0.5).sum()
+    # The first observation that is left is what the others are held against.
+    late = keep_observations(tracks, tracks.sigma >= 0.3)
+    assert len(select_tracks(late, DensityOptions(**ANY | {"max_sigma": 0.2})).frame) > 0
+
+
 def test_kept_observations_stay_with_their_tracks() -> None:
     tracks = random_tracks(50)
     kept = np.random.default_rng(1).random(len(tracks.frame)) < 0.3
