@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
