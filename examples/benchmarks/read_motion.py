@@ -3,8 +3,9 @@
 python examples/benchmarks/read_motion.py --cache benchmark_clips
 
 Both start from the file's name and end at its last frame: demuxing is part of either time, and
-no frame is converted. Runs take turns in one process; the table shows medians. The example clip
-is always there, the other clips are made of the sequences in ../shared.
+no frame is converted. Runs take turns in one process; the table shows medians: of CPU time with
+one thread, which other work on the machine changes little, and of real time with more. The example
+clip is always there, the other clips are made of the sequences in ../shared.
 """
 
 from __future__ import annotations
@@ -64,18 +65,27 @@ CLIPS = [
         for encoder, words in ENCODERS.items()
         for rate in RATES
     ),
+    # What threads can share: groups of frames that start at a key frame, and tiles
+    Clip("street-keys", "street", f"{LIBAOM} -crf 20 -g 10"),
+    Clip("1080p-keys", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 24"),
+    Clip("1080p-tiles", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 9999 -tiles 2x2"),
 ]
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Medians in seconds over the whole clip; `reader` and `dav1d` by number of threads."""
+    """Medians in seconds over the whole clip; `reader` and `dav1d` by number of threads.
+
+    `gain` is by how much more threads shorten the reader's real time. All other times with one
+    thread are CPU time.
+    """
 
     clip: str
     frames: int
     megabits: float
     reader: dict[int, float]
     dav1d: dict[int, float]
+    gain: dict[int, float]
     demux: float
     parse: float
 
@@ -183,7 +193,7 @@ def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing
     """Run everything in turns, once untimed and then `repeats` times."""
     with open_stream(path) as stream:
         configuration = stream.configuration
-        packets = [packet.data for packet in stream.packets()]
+        packets = [bytes(packet.data) for packet in stream.packets()]
     units = [configuration, *packets] if configuration else packets
     runs: dict[tuple[str, int], Callable[[], int]] = {
         ("demux", 1): partial(demux, path),
@@ -195,22 +205,29 @@ def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing
 
     frames = {key: run() for key, run in runs.items()}
     shown = frames["dav1d", threads[0]]
-    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
+    real: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
+    used: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
     for turn in range(repeats):
         # Backwards every other time: what one run leaves in the caches serves each in turn.
         for key in list(runs)[:: -1 if turn % 2 else 1]:
-            start = time.perf_counter()
+            start = time.perf_counter(), time.process_time()
             runs[key]()
-            seconds[key].append(time.perf_counter() - start)
-    median = {key: statistics.median(values) for key, values in seconds.items()}
+            real[key].append(time.perf_counter() - start[0])
+            used[key].append(time.process_time() - start[1])
+
+    def median(what: str, n: int = 1) -> float:
+        return statistics.median((used if n == 1 else real)[what, n])
+
+    alone = statistics.median(real["reader", threads[0]])
     return Timing(
         clip=name,
         frames=shown,
         megabits=sum(map(len, packets)) * 8 / 1e6,
-        reader={n: median["reader", n] for n in threads},
-        dav1d={n: median["dav1d", n] for n in threads},
-        demux=median["demux", 1],
-        parse=median["parse", 1],
+        reader={n: median("reader", n) for n in threads},
+        dav1d={n: median("dav1d", n) for n in threads},
+        gain={n: alone / statistics.median(real["reader", n]) for n in threads},
+        demux=median("demux"),
+        parse=median("parse"),
     )
 
 
@@ -255,8 +272,12 @@ def count(items: Iterator[object]) -> int:
 
 
 def print_table(timings: list[Timing], threads: list[int]) -> None:
-    """Print milliseconds a shown frame, and how many times faster the reader is."""
-    first = [c for n in threads for c in (f"reader, {n}T", f"dav1d, {n}T", "ratio")]
+    """Print milliseconds a shown frame, how many times faster the reader is, what threads gain."""
+    first = []
+    for n in threads:
+        first += [f"reader, {n}T", f"dav1d, {n}T", "ratio"]
+        if n > threads[0]:
+            first.append(f"gain of {n}T")
     header = ["clip", "frames", "Mbit", *first, "demux", "parse"]
     print("| " + " | ".join(header) + " |")
     print("|---|" + "---:|" * (len(header) - 1))
@@ -269,6 +290,8 @@ def print_table(timings: list[Timing], threads: list[int]) -> None:
                 f"{timing.dav1d[n] * per_frame:.3f}",
                 f"{timing.dav1d[n] / timing.reader[n]:.2f}",
             ]
+            if n > threads[0]:
+                row.append(f"{timing.gain[n]:.2f}")
         row += [f"{timing.demux * per_frame:.3f}", f"{timing.parse * per_frame:.3f}"]
         print("| " + " | ".join(row) + " |")
 
@@ -283,9 +306,10 @@ def machine(repeats: int) -> str:
                 break
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (
-        f"Milliseconds per shown frame, medians of {repeats} runs in turns; T: threads. Of the "
+        f"Milliseconds per shown frame, medians of {repeats} runs in turns; T: threads. CPU time "
+        "with one thread, real time with more. Of the "
         "reader's time at one thread, demux is reading the packets once (the reader does it "
-        "twice), parse the parser alone.\n"
+        "twice), parse the parser alone. Gain: times that the reader is faster with more threads.\n"
         f"{os.cpu_count()} cores, {cpu}{load}; Python {platform.python_version()}, "
         f"PyAV {av.__version__} with FFmpeg {av.ffmpeg_version_info} and its libdav1d."
     )

@@ -1,0 +1,89 @@
+"""Measure the memory that reading the motion of a long 4K video takes.
+
+python examples/benchmarks/read_memory.py --cache benchmark_clips
+
+Encodes 100 frames of 3840x2160, repeats their packets to the wanted number of frames, and reads
+the result frame by frame in a process of its own, whose peak resident set it prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import imageio_ffmpeg
+
+from colmap_av1 import ReadOptions, read_motion
+
+ENCODED = 100
+SOURCE = "testsrc2=size=3840x2160:rate=25"
+
+
+def main() -> int:
+    """Make the video if it is absent, read it, print one line."""
+    parser = argparse.ArgumentParser(
+        description="Measure the memory of reading a long 4K video.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--cache", type=Path, help="folder that keeps the video")
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--read", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.read is not None:
+        return read(arguments.read, arguments.threads)
+    with contextlib.ExitStack() as stack:
+        folder = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        video = make_video(folder, arguments.frames)
+        words = ["--threads", str(arguments.threads), "--read", str(video)]
+        return subprocess.run([sys.executable, __file__, *words], check=False).returncode
+
+
+def make_video(folder: Path, frames: int) -> Path:
+    """The video of `frames` frames, encoded and repeated unless `folder` holds it."""
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y"]
+    clip = folder / "4k.mp4"
+    if not clip.exists():
+        encoding = f"-frames:v {ENCODED} -c:v libsvtav1 -preset 12 -crf 35 -pix_fmt yuv420p"
+        subprocess.run(
+            [*ffmpeg, "-f", "lavfi", "-i", SOURCE, *encoding.split(), str(clip)],
+            env=os.environ | {"SVT_LOG": "1"},  # errors alone
+            check=True,
+        )
+    video = folder / f"4k-{frames}.mp4"
+    if not video.exists():
+        loops = str(-(-frames // ENCODED) - 1)
+        repeat = ["-stream_loop", loops, "-i", str(clip), "-c", "copy", "-frames:v", str(frames)]
+        subprocess.run([*ffmpeg, *repeat, str(video)], check=True)
+    return video
+
+
+def read(video: Path, threads: int) -> int:
+    """Read a video frame by frame and print what that took."""
+    imported = peak_mb()
+    frames = units = 0
+    for motion in read_motion(video, ReadOptions(num_threads=threads)):
+        frames += 1
+        units = max(units, motion.mi_size.size)
+    print(
+        f"{video.name}: {frames} coded frames of up to {units} units, {threads} threads: "
+        f"peak {peak_mb():.0f} MB, of which {imported:.0f} MB before reading"
+    )
+    return 0
+
+
+def peak_mb() -> float:
+    """Peak resident set of this process in megabytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
