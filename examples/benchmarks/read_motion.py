@@ -66,8 +66,8 @@ CLIPS = [
         for rate in RATES
     ),
     # What threads can share: groups of frames that start at a key frame, and tiles
-    Clip("street-keys", "street", f"{LIBAOM} -crf 20 -g 10"),
-    Clip("1080p-keys", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 24"),
+    Clip("street-keys", "street", f"{LIBAOM} -crf 20 -g 9"),
+    Clip("1080p-keys", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 20"),
     Clip("1080p-tiles", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 9999 -tiles 2x2"),
 ]
 
