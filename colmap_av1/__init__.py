@@ -22,17 +22,22 @@ from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
+    DensifyOptions,
     DensityOptions,
     EncodeOptions,
     ExportOptions,
     ImageOptions,
+    MapperOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
+    ReconstructOptions,
     RefineOptions,
     TrackOptions,
+    TriangulateOptions,
     VerifyOptions,
 )
+from colmap_av1.reconstruct import DensifyReport, ReconstructReport, densify, reconstruct
 from colmap_av1.tracks import Tracks, build_tracks
 
 __all__ = [
@@ -41,6 +46,8 @@ __all__ = [
     "CheckReport",
     "ColmapAv1Error",
     "DatabaseError",
+    "DensifyOptions",
+    "DensifyReport",
     "DensityOptions",
     "EncodeError",
     "EncodeOptions",
@@ -52,6 +59,7 @@ __all__ = [
     "ImageError",
     "ImageOptions",
     "LimitError",
+    "MapperOptions",
     "MatchOptions",
     "MatchReport",
     "ModelError",
@@ -59,14 +67,18 @@ __all__ = [
     "OptionError",
     "PairOptions",
     "ReadOptions",
+    "ReconstructOptions",
+    "ReconstructReport",
     "RefineOptions",
     "StreamReport",
     "TrackOptions",
     "Tracks",
+    "TriangulateOptions",
     "VerifyOptions",
     "VideoError",
     "build_tracks",
     "check",
+    "densify",
     "encode",
     "export_hloc",
     "export_motion",
@@ -74,4 +86,5 @@ __all__ = [
     "match",
     "read_hloc",
     "read_motion",
+    "reconstruct",
 ]

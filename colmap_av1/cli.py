@@ -31,19 +31,24 @@ from colmap_av1.match import MatchReport, match
 from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
+    DensifyOptions,
     DensityOptions,
     EncodeOptions,
     ExportOptions,
     ImageOptions,
+    MapperOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
+    ReconstructOptions,
     RefineOptions,
     TrackOptions,
+    TriangulateOptions,
     VerifyOptions,
     ViewOptions,
 )
 from colmap_av1.progress import Progress, no_progress
+from colmap_av1.reconstruct import densify, reconstruct
 from colmap_av1.view import (
     serve_model,
     view_database,
@@ -145,6 +150,51 @@ def _make_parser() -> argparse.ArgumentParser:
             EncodeOptions: "encoding of a video that is not AV1",
         },
     )
+    _add_quiet(command)
+
+    command = _add_command(
+        commands, "reconstruct", _run_reconstruct, "make a dense model for 3D Gaussian splatting"
+    )
+    _add_video(command, "a video; one that is not AV1 is converted first")
+    command.add_argument(
+        "--output",
+        "--output_path",
+        required=True,
+        metavar="PATH",
+        help="folder for images/ and sparse/0/; that of an earlier run is gone on with",
+    )
+    stages = {
+        MapperOptions: "poses",
+        TriangulateOptions: "points",
+        ImageOptions: "images",
+        MatchOptions: "stream",
+        CameraOptions: "camera",
+        TrackOptions: "tracks",
+        RefineOptions: "refinement",
+        PairOptions: "pairs",
+        VerifyOptions: "two-view geometry",
+        ReadOptions: "bitstream",
+        EncodeOptions: "encoding of a video that is not AV1",
+    }
+    _add_options(command, stages, without=("on_existing",))
+    _add_quiet(command)
+
+    command = _add_command(
+        commands, "densify", _run_densify, "put dense points on the poses of a model that is there"
+    )
+    command.add_argument(
+        "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
+    )
+    _add_video(command, "the video its images come from")
+    command.add_argument(
+        "--output", "--output_path", required=True, metavar="PATH", help="new folder for the model"
+    )
+    command.add_argument(
+        "--image_path", metavar="PATH", help="folder of its images, where names leave doubt"
+    )
+    for kind in (MapperOptions, CameraOptions, PairOptions):
+        del stages[kind]
+    _add_options(command, stages, without=("on_existing",))
     _add_quiet(command)
 
     command = _add_command(commands, "encode", _run_encode, "convert a video to a good AV1 stream")
@@ -267,14 +317,21 @@ def _underscored(word: str) -> str:
     return f"--{name.replace('-', '_')}{equals}{value}"
 
 
-def _add_options(command: argparse.ArgumentParser, kinds: dict[type, str]) -> None:
+def _add_options(
+    command: argparse.ArgumentParser, kinds: dict[type, str], *, without: Sequence[str] = ()
+) -> None:
     """Add an option for each field of some options dataclasses, in groups of the given titles.
 
     The field's comment is the help text. Fields that hold further options are left out; a name
     that several kinds have, such as num_threads, is one option for all of them. What is not
     given on the command line does not appear in the namespace.
+
+    Args:
+        command: the subcommand.
+        kinds: title of each dataclass's group.
+        without: fields that the subcommand has no use for.
     """
-    added: set[str] = set()
+    added: set[str] = set(without)
     for kind, title in kinds.items():
         group = command.add_argument_group(title)
         hints = typing.get_type_hints(kind)
@@ -360,8 +417,8 @@ def _spell(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
-def _run_match(namespace: argparse.Namespace) -> None:
-    options = _given(
+def _match_options(namespace: argparse.Namespace) -> MatchOptions:
+    return _given(
         namespace,
         MatchOptions,
         images=_given(namespace, ImageOptions),
@@ -374,6 +431,10 @@ def _run_match(namespace: argparse.Namespace) -> None:
         verify=_given(namespace, VerifyOptions),
         camera=_given(namespace, CameraOptions),
     )
+
+
+def _run_match(namespace: argparse.Namespace) -> None:
+    options = _match_options(namespace)
     with _progress(namespace.quiet) as report:
         result = match(
             namespace.database,
@@ -387,6 +448,62 @@ def _run_match(namespace: argparse.Namespace) -> None:
     if not namespace.quiet:
         _print_summary(_match_rows(result))
         _print_next(result)
+
+
+def _run_reconstruct(namespace: argparse.Namespace) -> None:
+    options = ReconstructOptions(
+        match=_match_options(namespace),
+        mapping=_given(namespace, MapperOptions),
+        triangulate=_given(namespace, TriangulateOptions),
+    )
+    with _progress(namespace.quiet) as report:
+        result = reconstruct(namespace.video, namespace.output, options=options, progress=report)
+    for warning in result.warnings:
+        _print_warning(warning)
+    if not namespace.quiet:
+        rows = [
+            ("output", str(result.output)),
+            ("images", f"{result.num_registered} of {result.num_images} with a pose"),
+            ("tracks", f"{result.num_tracks}, {result.num_pose_tracks} for the poses"),
+            ("mapper", result.mapper),
+            ("points", f"{result.num_points}, {result.num_observations} observations"),
+            ("reprojection error", f"{result.mean_error:.3f} px"),
+            ("focal length", f"{result.focal_length:.2f} px"),
+        ]
+        if result.resumed:
+            rows.append(("finished before", ", ".join(result.resumed)))
+        _print_summary([*rows, *_seconds_rows(result.seconds)])
+
+
+def _run_densify(namespace: argparse.Namespace) -> None:
+    options = DensifyOptions(
+        match=_match_options(namespace), triangulate=_given(namespace, TriangulateOptions)
+    )
+    with _progress(namespace.quiet) as report:
+        result = densify(
+            namespace.model,
+            namespace.video,
+            namespace.output,
+            image_path=namespace.image_path,
+            options=options,
+            progress=report,
+        )
+    for warning in result.warnings:
+        _print_warning(warning)
+    if not namespace.quiet:
+        rows = [
+            ("output", str(result.output)),
+            ("images", str(result.num_images)),
+            ("tracks", f"{result.num_tracks}, {result.agreeing:.1%} agree with the poses"),
+            ("points", f"{result.num_points}, the model had {result.num_model_points}"),
+            ("reprojection error", f"{result.mean_error:.3f} px"),
+        ]
+        _print_summary([*rows, *_seconds_rows(result.seconds)])
+
+
+def _seconds_rows(seconds: dict[str, float]) -> _Rows:
+    rows = [(f"seconds, {stage}", f"{s:.2f}") for stage, s in seconds.items()]
+    return [*rows, ("seconds, total", f"{sum(seconds.values()):.2f}")]
 
 
 def _run_encode(namespace: argparse.Namespace) -> None:
@@ -505,8 +622,7 @@ def _match_rows(report: MatchReport) -> _Rows:
     ]
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
-    rows += [(f"seconds, {stage}", f"{s:.2f}") for stage, s in report.seconds.items()]
-    return [*rows, ("seconds, total", f"{sum(report.seconds.values()):.2f}")]
+    return [*rows, *_seconds_rows(report.seconds)]
 
 
 def _info_rows(report: StreamReport) -> _Rows:

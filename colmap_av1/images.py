@@ -221,6 +221,7 @@ def write_images(
     *,
     num_threads: int | None = None,
     operating_point: int = 0,
+    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> int:
     """Write video frames as images, PNG or JPEG (quality 95) by the names' extensions.
@@ -235,6 +236,8 @@ def write_images(
         frames: display index of each image.
         num_threads: threads; None: one per CPU.
         operating_point: operating point of a scalable stream.
+        change: called with (display_index, picture) of each image that is not there yet, in
+            display order; gives the picture to write.
         progress: called with the number of images done so far.
 
     Returns:
@@ -271,7 +274,8 @@ def write_images(
     # OpenCV releases the interpreter lock while it compresses.
     with ThreadPoolExecutor(max_workers=workers) as executor:
         try:
-            for index, image in decoded:
+            for index, picture in decoded:
+                image = picture
                 size = size or image.shape
                 if image.shape != size:
                     raise ImageError(
@@ -280,6 +284,7 @@ def write_images(
                         "re-encode the video at one size"
                     )
                 if index in wanted:
+                    image = change(index, image) if change is not None else image
                     queue.append(executor.submit(_write_image, wanted.pop(index), image))
                 while len(queue) > (workers * _QUEUE_PER_THREAD if index < last else 0):
                     queue.pop(0).result()

@@ -1,16 +1,136 @@
-"""COLMAP models on disk."""
+"""COLMAP models on disk: read by pycolmap, written point by point without it."""
 
 from __future__ import annotations
 
 import os
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 
 _FILES = ("cameras", "images", "points3D")
+
+# Records of COLMAP's binary files, little-endian and packed.
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])
+_POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
+# Points written at a time; bounds memory.
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """An image of a model.
+
+    Attributes:
+        image_id: its id.
+        name: path relative to the image folder.
+        camera_id: id of its camera.
+        cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    cam_from_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """Points of a model and where its images see them, in compressed sparse row form.
+
+    Attributes:
+        xyz: float64 [num_points, 3].
+        rgb: uint8 [num_points, 3].
+        error: float64 [num_points] mean reprojection error in pixels.
+        offsets: int64 [num_points + 1] observations of each point.
+        image: int64 [num_observations] index of the image.
+        xy: float64 [num_observations, 2] pixels, the first pixel's centre at (0.5, 0.5).
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    error: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    image: NDArray[np.int64]
+    xy: NDArray[np.float64]
+
+
+def write_model(
+    folder: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
+) -> None:
+    """Write cameras.bin, images.bin and points3D.bin, as all versions of COLMAP read them.
+
+    Args:
+        folder: an existing folder.
+        cameras: pycolmap.Camera by id.
+        images: the images.
+        points: the points; their ids count from 1.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    with (folder / "cameras.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(cameras)))
+        for camera_id, camera in sorted(cameras.items()):
+            size = int(camera.width), int(camera.height)
+            file.write(struct.pack("<IiQQ", camera_id, int(camera.model.value), *size))
+            file.write(np.asarray(camera.params, dtype="<f8").tobytes())
+
+    lengths = np.diff(points.offsets)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    by_image = np.argsort(points.image, kind="stable")
+    bounds = np.searchsorted(points.image[by_image], np.arange(len(images) + 1))
+    place = np.empty(len(points.image), dtype=np.int64)
+    place[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
+    with (folder / "images.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(images)))
+        for image, start, stop in zip(images, bounds[:-1], bounds[1:], strict=True):
+            x, y, z, w = pycolmap.Rotation3d(image.cam_from_world[:, :3]).quat
+            pose = (w, x, y, z, *image.cam_from_world[:, 3])
+            file.write(struct.pack("<I7dI", image.image_id, *pose, image.camera_id))
+            file.write(image.name.encode() + b"\0")
+            seen = by_image[start:stop]
+            rows = np.empty(len(seen), dtype=_OBSERVATION)
+            rows["xy"], rows["point3D_id"] = points.xy[seen], owner[seen] + 1
+            file.write(struct.pack("<Q", len(rows)))
+            file.write(rows.tobytes())
+
+    elements = np.empty(len(points.image), dtype=_ELEMENT)
+    elements["image_id"] = np.array([i.image_id for i in images], dtype=np.uint32)[points.image]
+    elements["point2D_idx"] = place
+    with (folder / "points3D.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(lengths)))
+        for first in range(0, len(lengths), _CHUNK):
+            last = min(first + _CHUNK, len(lengths))
+            file.write(_point_records(points, elements, first, last))
+
+
+def _point_records(points: ModelPoints, elements: NDArray[Any], first: int, last: int) -> bytes:
+    """The records of the points from `first` to before `last`, each with its track."""
+    offsets = points.offsets[first : last + 1]
+    lengths = np.diff(offsets)
+    heads = np.empty(last - first, dtype=_POINT)
+    heads["id"] = np.arange(first, last) + 1
+    heads["xyz"], heads["rgb"] = points.xyz[first:last], points.rgb[first:last]
+    heads["error"], heads["length"] = points.error[first:last], lengths
+    size, each = _POINT.itemsize, _ELEMENT.itemsize
+    starts = np.arange(last - first) * size + (offsets[:-1] - offsets[0]) * each
+    is_head = np.zeros(len(heads) * size + int(lengths.sum()) * each, dtype=np.bool_)
+    is_head[(starts[:, None] + np.arange(size)).ravel()] = True
+    records = np.empty(len(is_head), dtype=np.uint8)
+    records[is_head] = heads.view(np.uint8).ravel()
+    records[~is_head] = elements[offsets[0] : offsets[-1]].view(np.uint8).ravel()
+    return records.tobytes()
 
 
 def read_model(model: str | os.PathLike[str]) -> Any:

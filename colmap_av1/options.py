@@ -199,6 +199,50 @@ class MatchOptions:
 
 
 @dataclass(frozen=True)
+class TriangulateOptions:
+    """What makes a track a point."""
+
+    # largest reprojection error of an observation, in pixels
+    max_reprojection_error: float = 2.0
+    # smallest angle, in degrees, at which the widest two rays of a point meet
+    min_angle: float = 1.5
+    # observations a point needs
+    min_observations: int = 3
+
+
+@dataclass(frozen=True)
+class MapperOptions:
+    """How the poses are found."""
+
+    # COLMAP's 'incremental' or 'global' mapper; 'auto': the incremental one, but the global
+    # one where the camera moves along its axis
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    # refine focal length and distortion; None: unless camera_params are given
+    refine_intrinsics: bool | None = None
+    # tracks an image gives to the poses
+    pose_tracks_per_image: int = 600
+    # width in pixels of the cells of an image that one of these tracks each is wanted in
+    pose_spacing: float = 16.0
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Everything `reconstruct` can be told; of `match`, all but the tracks' density applies."""
+
+    match: MatchOptions = MatchOptions()
+    mapping: MapperOptions = MapperOptions()
+    triangulate: TriangulateOptions = TriangulateOptions()
+
+
+@dataclass(frozen=True)
+class DensifyOptions:
+    """Everything `densify` can be told."""
+
+    match: MatchOptions = MatchOptions()
+    triangulate: TriangulateOptions = TriangulateOptions()
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """What is written of a database for other programs."""
 

@@ -1,0 +1,94 @@
+"""The pinhole camera that shows what a distorted one does, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ModelError
+
+_Image = NDArray[np.uint8]
+
+# Zoom of the undistorted camera against the distorted one.
+_ZOOM_RANGE = (0.25, 4.0)
+_BISECTIONS = 40
+
+
+def pinhole_camera(camera: Any) -> Any:
+    """The undistorted camera of the same size: as wide a view as leaves no pixel empty.
+
+    Args:
+        camera: pycolmap.Camera of any perspective model.
+
+    Returns:
+        pycolmap.Camera, PINHOLE, with id 1 and the principal point of the given one.
+
+    Raises:
+        ModelError: no such camera exists, as with a fisheye lens that sees to the side.
+    """
+    size = {"width": int(camera.width), "height": int(camera.height)}
+    centre = [camera.principal_point_x, camera.principal_point_y]
+    focal = np.array([camera.focal_length_x, camera.focal_length_y])
+    zoom = 1.0
+    if camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        width, height = size["width"], size["height"]
+        x, y = np.arange(width + 1.0), np.arange(height + 1.0)
+        edge = np.concatenate(
+            [
+                *(np.column_stack([x, np.full_like(x, at)]) for at in (0, height)),
+                *(np.column_stack([np.full_like(y, at), y]) for at in (0, width)),
+            ]
+        )
+
+        def is_filled(zoom: float) -> bool:
+            on_source = _project(camera, (edge - centre) / (focal * zoom))
+            inside = (on_source >= -0.5) & (on_source <= np.array([width, height]) + 0.5)
+            return bool(inside.all())
+
+        low, high = _ZOOM_RANGE
+        if not is_filled(high):
+            raise ModelError(
+                f"camera {camera.model_name} {list(camera.params)} cannot be undistorted: give "
+                "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE"
+            )
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if is_filled(middle) else (middle, high)
+        zoom = high
+    params = [*(focal * zoom), *centre]
+    return pycolmap.Camera(camera_id=1, model="PINHOLE", params=params, **size)
+
+
+def _project(camera: Any, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of undistorted positions (x / z, y / z)."""
+    return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+
+
+def on_pinhole(camera: Any, pinhole: Any, xy: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Pixels of the undistorted camera that show the same."""
+    fx, fy, cx, cy = pinhole.params
+    rays = np.asarray(camera.cam_from_img(xy.astype(np.float64)))
+    return np.asarray(rays * (fx, fy) + (cx, cy))
+
+
+def undistortion(camera: Any, pinhole: Any) -> Callable[[_Image], _Image] | None:
+    """A function that undistorts pictures; None where there is nothing to do."""
+    if camera.model_name in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return None
+    fx, fy, cx, cy = pinhole.params
+    width, height = int(pinhole.width), int(pinhole.height)
+    y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
+    source = _project(camera, np.column_stack([(x - cx) / fx, (y - cy) / fy]))
+    # OpenCV counts from the centre of the first pixel.
+    at = (source - 0.5).reshape(height, width, 2).astype(np.float32)
+
+    def undistort(picture: _Image) -> _Image:
+        edge = cv2.BORDER_REPLICATE
+        return np.asarray(cv2.remap(picture, at, None, cv2.INTER_CUBIC, borderMode=edge), np.uint8)
+
+    return undistort
