@@ -55,6 +55,8 @@ _Image = NDArray[np.uint8]
 
 # Tracks that agree with the poses of a model of the same video, at least.
 _LEAST_AGREEING = 0.5
+# Share of pairs that a homography explains from which on depth is doubtful.
+_MANY_FLAT = 0.9
 
 
 @dataclass(frozen=True)
@@ -711,6 +713,12 @@ def _notes(facts: dict[str, Any]) -> list[str]:
     if facts["other_models"]:
         sizes = ", ".join(map(str, facts["other_models"]))
         notes.append(f"the mapper made further models, of {sizes} images, which are left out")
+    if facts["num_flat_pairs"] > _MANY_FLAT * facts["num_verified_pairs"]:
+        notes.append(
+            f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "
+            "turns or the scene is flat: the depth of the points may mean nothing; film while "
+            "moving sideways"
+        )
     if facts["agreeing"] < _LEAST_AGREEING:
         notes.append(
             f"only {facts['agreeing']:.0%} of the tracks agree with the poses, which may be wrong: "

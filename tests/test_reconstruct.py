@@ -38,6 +38,7 @@ OPTIONS = ReconstructOptions(
     match=MatchOptions(images=ImageOptions(every=EVERY)),
     mapping=MapperOptions(pose_tracks_per_image=300, pose_spacing=24.0),
 )
+OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 NO_POINTS = ModelPoints(
     np.empty((0, 3)),
     np.empty((0, 3), np.uint8),
@@ -393,8 +394,16 @@ def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:
         frames.append(cv2.warpPerspective(wall, shown, (320, 240)))
     frames = np.stack(frames)
     video = encode(frames, tmp_path / "flat.mp4")
+    report = reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
+    assert any("the camera only turns or the scene is flat" in w for w in report.warnings)
+
+
+def test_camera_that_stands_still(encode: Encode, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    wall = cv2.resize(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8), (320, 240))
+    video = encode(np.stack([wall] * 8), tmp_path / "still.mp4")
     with pytest.raises(ModelError, match=r"finds no start: too little parallax, in \d+ of"):
-        reconstruct(video, tmp_path / "out")
+        reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()
     assert not (tmp_path / "out" / "sparse").exists()
 
