@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.choice import ChosenImages, choose_images
 from colmap_av1.database import make_camera, write_matches
-from colmap_av1.density import keep_observations, select_tracks
+from colmap_av1.density import select_tracks
 from colmap_av1.errors import ModelError, OptionError
 from colmap_av1.images import size_of_images, write_images
 from colmap_av1.mapper import map_poses
@@ -40,7 +40,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.stages import Kept, open_stages, run_stage
-from colmap_av1.tracks import Tracks, scale_tracks
+from colmap_av1.tracks import Tracks, keep_observations, scale_tracks
 from colmap_av1.triangulate import (
     Points,
     Sightings,
@@ -49,7 +49,7 @@ from colmap_av1.triangulate import (
     triangulate,
 )
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
-from colmap_av1.video import decode_frames, frame_times, picture_size
+from colmap_av1.video import decode_frames, frame_times, picture_size, read_display
 
 _Image = NDArray[np.uint8]
 
@@ -243,7 +243,7 @@ def densify(
         name: (int(cameras[i.camera_id].width), int(cameras[i.camera_id].height))
         for name, i in by_name.items()
     }
-    size = size_of_images(sizes, video_size)
+    size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
 
     source = open_source(video, options.match, clock=clock, progress=progress)
     tracked = track_video(source, options.match, one_size=True, clock=clock, progress=progress)
@@ -424,7 +424,8 @@ def _match_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept)
         with clock.measure("pairs"):
             seen = np.isin(tracks.frame, chosen.frames)
             sparse = select_tracks(keep_observations(tracks, seen), density)
-        camera = make_camera(options.match.camera, tracks.width, tracks.height)
+        pixel_aspect = read_display(run.source.pictures).pixel_aspect
+        camera = make_camera(options.match.camera, tracks.width, tracks.height, pixel_aspect)
         matched = match_images(
             run.source.pictures,
             sparse,
