@@ -19,6 +19,7 @@ from colmap_av1.choice import ChosenImages, choose_images
 from colmap_av1.database import make_camera, write_matches
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.files import whole_file
 from colmap_av1.images import size_of_images, write_images
 from colmap_av1.mapper import map_poses
 from colmap_av1.match import (
@@ -731,10 +732,8 @@ def _notes(facts: dict[str, Any]) -> list[str]:
 def _write_report(report: ReconstructReport) -> None:
     text = json.dumps(dataclasses.asdict(report), indent=1, default=str)
     path = report.output / "report.json"
-    partial = path.with_suffix(".partial")
     try:
-        partial.write_text(text + "\n")
-        partial.replace(path)
+        with whole_file(path) as partial:
+            partial.write_text(text + "\n")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ModelError(f"{path}: cannot be written: {error.strerror}") from error
