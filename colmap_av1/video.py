@@ -281,7 +281,8 @@ def presented_frames(video: str | os.PathLike[str]) -> NDArray[np.int32] | None:
         num_entries = len(stream.index_entries)
         with _open_container(path, apply_edits=True) as edited:
             entries = list(_find_video_stream(edited, path).index_entries)
-        shown = {entry.pos for entry in entries if not entry.is_discard}
+            # Entries lie in the container's memory: they are read while it is open.
+            shown = {entry.pos for entry in entries if not entry.is_discard}
         if len(shown) == num_entries or not entries:
             return None
         # Where pictures are coded out of order, packets come in another order than pictures.
