@@ -7,6 +7,7 @@ import dataclasses
 import importlib.metadata
 import inspect
 import re
+import signal
 import sys
 import threading
 import types
@@ -83,10 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         Exit status: 0, 1 where a check fails, 2 for bad input, 130 when interrupted.
+
+    Raises:
+        SystemExit: the process is told to end.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _make_parser()
-    with _warnings_as_lines():
+    with _warnings_as_lines(), _ending_in_order():
         try:
             # argparse exits by itself, with status 2 and one line, on words it does not know.
             namespace = parser.parse_args([_underscored(word) for word in words])
@@ -98,6 +102,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{_PROGRAM}: interrupted", file=sys.stderr)
             return _INTERRUPTED
     return status or 0
+
+
+@contextmanager
+def _ending_in_order() -> Iterator[None]:
+    """Let the signals that end a process unwind it, so that nothing half-written is left."""
+
+    def end(number: int, _: types.FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    names = ("SIGTERM", "SIGHUP")  # some systems have no SIGHUP
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    # What is ignored, as nohup asks for, stays ignored.
+    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: old for number, old in before.items() if old == signal.SIG_DFL}
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -207,6 +234,11 @@ def _make_parser() -> argparse.ArgumentParser:
         help="the stream: .mp4, .mkv, .webm or .ivf",
     )
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="fail on a damaged video instead of using the frames before the damage",
+    )
     _add_options(command, {EncodeOptions: "encoding"})
     _add_quiet(command)
 
@@ -512,6 +544,7 @@ def _run_encode(namespace: argparse.Namespace) -> None:
             namespace.video,
             namespace.output,
             overwrite=namespace.overwrite,
+            strict=namespace.strict,
             options=_given(namespace, EncodeOptions),
             progress=report,
         )

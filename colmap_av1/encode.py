@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +18,11 @@ import av
 import av.error
 import imageio_ffmpeg
 
-from colmap_av1.errors import EncodeError, NotAv1Error, OptionError, VideoError
+from colmap_av1.errors import BitstreamError, EncodeError, NotAv1Error, OptionError, VideoError
 from colmap_av1.files import whole_file
 from colmap_av1.options import EncodeOptions
 from colmap_av1.progress import Progress, no_progress
-from colmap_av1.video import open_stream
+from colmap_av1.video import VideoFacts, count_frames, open_stream, video_facts
 
 # Whether an encoder works is found out by encoding so many frames.
 _PROBE_FRAMES = 8
@@ -30,8 +32,15 @@ _LIBAOM_REALTIME = 5
 # A frame further than any video is long: the first is the only intra frame.
 _KEY_FRAME_DISTANCE = "9999"
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
-# Marks a stream with what it was made with, so that it is not taken for another.
+# Marks a stream with what it was made of and with, so that it is not taken for another.
 _MARK = "colmap-av1"
+# These hold the mark.
+_KEPT_FORMATS = (".mp4", ".mkv", ".webm")
+# So that every message says how grave it is.
+_TALK = ("-hide_banner", "-nostats", "-v", "level+info")
+_MESSAGE_SOURCE = re.compile(r"^(\[[^\]]+\] )+")
+_GRAVE = re.compile(r"\[(error|fatal|panic)\]")
+_NEW_SIZE = re.compile(r"Reconfiguring filter graph.* changed to .*, (\d+)x(\d+)")
 
 
 @dataclass(frozen=True)
@@ -110,8 +119,9 @@ def _libaom(quality: int, speed: int) -> list[str]:
 
 
 def _svt(quality: int, speed: int) -> list[str]:
-    # pred-struct 1 is low delay: frames refer to earlier ones only.
-    return ["-preset", str(speed), "-crf", str(quality), "-svtav1-params", "pred-struct=1"]
+    # Low delay, and without layers: frames refer to those just before them.
+    how = "pred-struct=1:hierarchical-levels=0"
+    return ["-preset", str(speed), "-crf", str(quality), "-svtav1-params", how]
 
 
 # In the order in which they are tried.
@@ -137,6 +147,7 @@ def encode(
     output: str | os.PathLike[str],
     *,
     overwrite: bool = False,
+    strict: bool = False,
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
@@ -144,17 +155,20 @@ def encode(
 
     Every frame of the video becomes one of the stream, none is dropped or doubled, and time
     stamps are kept. Pictures are turned as players turn them; sound is left out. The stream
-    appears under its name only when whole.
+    appears under its name only when whole. Of a damaged video the frames before the damage are
+    converted, with a warning.
 
     Args:
         video: a video that ffmpeg decodes.
         output: the stream; its extension .mp4, .mkv, .webm or .ivf says the container.
         overwrite: replace an output that exists.
+        strict: refuse a damaged video.
         options: which encoder and how.
         progress: called with the stage "encoding", the frames done, and of how many where known.
 
     Raises:
         VideoError: the video is missing or cannot be decoded.
+        BitstreamError: the video is damaged, and must not be.
         EncodeError: no encoder works, or the output cannot be written.
         OptionError: an option has a value that cannot work, or the output exists.
     """
@@ -172,29 +186,42 @@ def encode(
         raise EncodeError(f"{output}: the folder does not exist: make it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
-    num_frames, is_mov = _look_at(video)
+    facts = video_facts(video)
     name, ffmpeg = find_encoder(options)
     encoder = _ENCODERS[name]
     quality, speed = _settings(encoder, options)
-
-    before = [ffmpeg, "-v", "error", "-nostdin", "-y", *encoder.before_input]
-    if is_mov:
+    before = [ffmpeg, *_TALK, "-nostdin", "-y", *encoder.before_input]
+    if "mov" in facts.container:
         # Frames that an edit list hides are frames all the same, and good ones.
         before += ["-ignore_editlist", "1"]
     how = [
-        *("-i", f"file:{video}", "-map", "0:V:0", "-an", "-sn", "-dn", "-vf", encoder.upload),
+        *("-i", f"file:{video}", "-map", f"0:{facts.index}", "-vf", encoder.upload),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", _KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
-        *("-metadata", f"comment={_mark(name, quality, speed)}"),
         *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
     ]
-    progress("encoding", 0, num_frames)
+    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(video)}
+
+    def convert(partial: Path, num_frames: int | None = None) -> int:
+        total = num_frames or facts.num_packets
+        progress("encoding", 0, total)
+        command = [*before, *how]
+        if num_frames is not None:
+            command += ["-frames:v", str(num_frames)]
+        words = _mark(mark if num_frames is None else {**mark, "readable": num_frames})
+        command += ["-metadata", f"comment={words}", f"file:{partial}"]
+        count = _run(command, video, facts.size, lambda done: progress("encoding", done, total))
+        if count == 0:
+            raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
+        _check_stream(partial, count)
+        return count
+
     try:
         with whole_file(output) as partial:
-            command = [*before, *how, f"file:{partial}"]
-            count = _run(command, video, lambda done: progress("encoding", done, num_frames))
-            if count == 0:
-                raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
+            count = convert(partial)
+            readable = _readable_frames(video, facts, count, strict)
+            if readable < count:
+                count = convert(partial, readable)
     except OSError as error:
         raise EncodeError(f"{output}: cannot be written: {error.strerror or error}") from error
     return EncodeReport(output, encoder.ffmpeg_name, count)
@@ -203,6 +230,7 @@ def encode(
 def stream_of(
     video: str | os.PathLike[str],
     *,
+    strict: bool = False,
     options: EncodeOptions | None = None,
     keep_stream: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
@@ -210,17 +238,19 @@ def stream_of(
     """The AV1 stream of a video that is not AV1: the one kept from before, or a new one.
 
     It is kept beside the video, as 'phone.av1.mp4' for 'phone.mov', or where `keep_stream`
-    says, and used again while it is newer than the video, whole, and made with the settings
-    that `options` ask for.
+    says, and used again while it is newer than the video, whole, and made of a file of the
+    video's size with the settings that `options` ask for.
 
     Args:
         video: a video that ffmpeg decodes.
+        strict: refuse a damaged video.
         options: which encoder and how.
         keep_stream: where the stream is kept; its extension says the container.
         progress: as in `encode`.
 
     Raises:
         VideoError: the video is missing or cannot be decoded.
+        BitstreamError: the video is damaged, and must not be.
         EncodeError: no encoder works, or the stream cannot be written.
         OptionError: an option has a value that cannot work, or `keep_stream` names a file
             that is no kept stream.
@@ -228,7 +258,9 @@ def stream_of(
     options = options if options is not None else EncodeOptions()
     video = Path(video)
     output = Path(keep_stream) if keep_stream is not None else video.with_suffix(".av1.mp4")
-    num_frames, _ = _look_at(video)
+    if output.suffix.lower() not in _KEPT_FORMATS:
+        raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
+    facts = video_facts(video)
     if output.exists():
         mark = _mark_of(output)
         if mark is None:
@@ -236,16 +268,19 @@ def stream_of(
                 f"{output}: exists and is no stream that was kept of {video.name}: give another "
                 "--keep_stream, or remove it"
             )
-        if _fits(mark, options) and output.stat().st_mtime_ns >= video.stat().st_mtime_ns:
-            kept = _count_frames(output)
-            if kept and (num_frames is None or kept == num_frames):
-                return EncodeReport(output, mark["encoder"], kept, reused=True)
-    elif not os.access(output.resolve().parent, os.W_OK | os.X_OK):
+        if _fits(mark, video, options) and output.stat().st_mtime_ns >= video.stat().st_mtime_ns:
+            kept = _count_packets(output)
+            readable = int(mark.get("readable", 0))
+            if kept and not (strict and readable):
+                if readable:
+                    _warn_of_damage(video, readable, facts, f"{output} was made of what is before")
+                return EncodeReport(output, _ENCODERS[mark["encoder"]].ffmpeg_name, kept, True)
+    if not os.access(output.resolve().parent, os.W_OK | os.X_OK):
         raise EncodeError(
             f"{output.resolve().parent}: the AV1 stream of {video.name} cannot be written there: "
             "say where with --keep_stream"
         )
-    return encode(video, output, overwrite=True, options=options, progress=progress)
+    return encode(video, output, overwrite=True, strict=strict, options=options, progress=progress)
 
 
 def find_encoder(options: EncodeOptions) -> tuple[str, str]:
@@ -312,7 +347,7 @@ def _ffmpeg_programs() -> list[str]:
 def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:
     """Why an encoder does not work; None where it does."""
     command = [
-        *(program, "-v", "error", "-nostdin", *encoder.before_input),
+        *(program, *_TALK, "-nostdin", *encoder.before_input),
         *("-f", "lavfi", "-i", "testsrc2=size=320x192:rate=25", "-frames:v", str(_PROBE_FRAMES)),
         *("-vf", encoder.upload, "-c:v", encoder.ffmpeg_name, "-g", _KEY_FRAME_DISTANCE),
         *(*encoder.words(quality, speed), "-f", "null", "-"),
@@ -325,11 +360,13 @@ def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | N
         return f"no frame within {_PROBE_TIMEOUT:.0f} s"
     except OSError as error:
         return f"{program}: {error.strerror}"
-    return None if run.returncode == 0 else _last_words(run.stderr)
+    return None if run.returncode == 0 else _reason(run.stderr)
 
 
-def _run(command: Sequence[str], video: Path, report: Callable[[int], None]) -> int:
-    """Run ffmpeg and return the number of frames it wrote."""
+def _run(
+    command: Sequence[str], video: Path, size: tuple[int, int], report: Callable[[int], None]
+) -> int:
+    """Run ffmpeg on a video of a size and return the number of frames it wrote."""
     count = dropped = doubled = 0
     with tempfile.TemporaryFile() as words, _process(command, words) as process:
         for line in process.stdout or ():
@@ -343,15 +380,24 @@ def _run(command: Sequence[str], video: Path, report: Callable[[int], None]) -> 
                 doubled = int(value)
         status = process.wait()
         words.seek(0)
-        reason = _last_words(words.read().decode(errors="replace"))
+        said = words.read().decode(errors="replace")
     if status != 0:
-        if "No space left" in reason:
+        reason = _reason(said)
+        if "No space left" in said:
             raise EncodeError(
                 f"{video}: the disk is full: free some space, or say where the stream goes"
             )
-        if "Invalid data" in reason or "does not contain any stream" in reason:
+        if count == 0 and ("Invalid data" in said or "does not contain any stream" in said):
             raise VideoError(f"{video}: cannot be decoded: {reason}")
-        raise EncodeError(f"{video}: the encoder failed after {count} frames: {reason}")
+        raise EncodeError(
+            f"{video}: the encoder failed after {count} frames ({reason}): try another --encoder"
+        )
+    sizes = {(int(width), int(height)) for width, height in _NEW_SIZE.findall(said)} - {size}
+    if sizes:
+        raise VideoError(
+            f"{video}: its pictures change their size from {size[0]}x{size[1]} to "
+            f"{' and '.join(f'{w}x{h}' for w, h in sorted(sizes))}: convert it to one size first"
+        )
     if dropped or doubled:
         raise EncodeError(
             f"{video}: ffmpeg dropped {dropped} and doubled {doubled} frames, so frames of the "
@@ -380,40 +426,68 @@ def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen
             process.stdout.close()
 
 
-def _last_words(text: str) -> str:
+def _reason(text: str) -> str:
+    """What ffmpeg gives as the reason of a failure, on a line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    # Later lines say that the conversion failed, the first says why.
-    return lines[0] if lines else "it ended without a word"
+    # Later lines say that the conversion failed, the first says why. Where ffmpeg itself has
+    # not come to speak, whoever stands in its place has.
+    grave = [line for line in lines if _GRAVE.search(line)] or lines
+    return _MESSAGE_SOURCE.sub("", grave[0]).rstrip(".") if grave else "it ended without a word"
 
 
-def _look_at(video: Path) -> tuple[int | None, bool]:
-    """The number of frames, None where unknown, and whether FFmpeg's mov demuxer reads it."""
-    if not video.is_file():
-        raise VideoError(
-            f"{video}: {'is a folder' if video.is_dir() else 'no such file'}: give a video file"
+def _readable_frames(video: Path, facts: VideoFacts, count: int, strict: bool) -> int:
+    """How many frames are the same to ffmpeg, which wrote `count`, and to who reads pictures.
+
+    ffmpeg goes on after damage, and the frames it leaves out shift those that follow.
+    """
+    if count == facts.num_packets:
+        return count
+    readable, damage = count_frames(video)
+    if damage is None and readable == count:
+        return count
+    if damage is None or readable > count:
+        raise EncodeError(
+            f"{video}: ffmpeg decodes {count} frames of it, PyAV {readable}: frames of the stream "
+            "would not be those of the video: convert it with another program first"
         )
-    try:
-        with av.open(os.path.abspath(video), container_options={"ignore_editlist": "1"}) as opened:
-            if not opened.streams.video:
-                raise VideoError(f"{video}: holds no video stream: give a video")
-            stream = opened.streams.video[0]
-            return stream.frames or None, "mov" in opened.format.name
-    except (av.error.FFmpegError, OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise VideoError(f"{video}: not a video, or damaged: {reason}") from error
+    if readable == 0:
+        raise VideoError(f"{video}: no frame can be decoded: {damage}")
+    if strict:
+        raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
+    _warn_of_damage(video, readable, facts, damage)
+    return readable
 
 
-def _count_frames(stream: Path) -> int:
-    """Frames of a kept stream; 0 where it is damaged or no AV1."""
+def _warn_of_damage(video: Path, readable: int, facts: VideoFacts, reason: str) -> None:
+    warnings.warn(
+        f"{video}: damaged after {readable} of {facts.num_packets} frames, which are used: "
+        f"{reason}",
+        stacklevel=3,
+    )
+
+
+def _check_stream(stream: Path, count: int) -> None:
+    """Refuse a stream that has not as many frames as ffmpeg says it wrote."""
+    found = _count_packets(stream)
+    if found != count:
+        raise EncodeError(f"the encoder wrote {found} of {count} frames: give another --encoder")
+
+
+def _count_packets(stream: Path) -> int:
+    """Frames of a stream that was made here; 0 where it is damaged or no AV1."""
     try:
         with open_stream(stream) as opened:
-            return opened.num_frames or 0
-    except (VideoError, NotAv1Error):
+            return sum(1 for _ in opened.packets())
+    except (VideoError, NotAv1Error, BitstreamError):
         return 0
 
 
-def _mark(encoder: str, quality: int, speed: int) -> str:
-    return f"{_MARK} encoder={encoder} quality={quality} speed={speed}"
+def _size(video: Path) -> int:
+    return video.stat().st_size
+
+
+def _mark(facts: Mapping[str, object]) -> str:
+    return " ".join([_MARK, *(f"{key}={value}" for key, value in facts.items())])
 
 
 def _mark_of(stream: Path) -> dict[str, str] | None:
@@ -429,8 +503,10 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
     return dict(word.split("=", 1) for word in words)
 
 
-def _fits(mark: dict[str, str], options: EncodeOptions) -> bool:
-    """Whether a kept stream was made with what is asked for now."""
+def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
+    """Whether a kept stream was made of the video with what is asked for now."""
+    if mark.get("encoder") not in _ENCODERS or mark.get("source") != str(_size(video)):
+        return False
     encoder = None if options.encoder == "auto" else options.encoder
     wanted = {"encoder": encoder, "quality": options.quality, "speed": options.speed}
     return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)

@@ -358,6 +358,7 @@ def open_source(
         with clock.measure("encoding"):
             encoded = stream_of(
                 video,
+                strict=options.read.strict,
                 options=options.encode,
                 keep_stream=options.keep_stream,
                 progress=progress,

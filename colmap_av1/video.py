@@ -326,6 +326,58 @@ def is_av1(video: str | os.PathLike[str]) -> bool:
         return _codec_name(_find_video_stream(container, path)) == "av1"
 
 
+@dataclass(frozen=True)
+class VideoFacts:
+    """What a file of any codec says of its video, without decoding.
+
+    Attributes:
+        container: FFmpeg's name of the container format.
+        index: number of the video among the streams of the file.
+        size: (width, height) in pixels of the pictures as they are stored.
+        num_packets: packets of the video, usually one a frame.
+    """
+
+    container: str
+    index: int
+    size: tuple[int, int]
+    num_packets: int
+
+
+def video_facts(video: str | os.PathLike[str]) -> VideoFacts:
+    """Look into a file of any codec; its packets are counted where the container does not say.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    path = Path(video)
+    with _open_container(path) as container:
+        stream = _find_video_stream(container, path)
+        if stream.codec_context is None:
+            raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
+        count = stream.frames
+        if not count:
+            with contextlib.suppress(av.error.FFmpegError, OSError):
+                for packet in container.demux(stream):
+                    count += packet.size > 0
+        size = (stream.codec_context.width, stream.codec_context.height)
+        return VideoFacts(container.format.name, stream.index, size, count)
+
+
+def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
+    """Decode a file of any codec: its frames before any damage, and what the damage is.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    count = 0
+    try:
+        for _ in _decode(video, 0, 1):
+            count += 1
+    except BitstreamError as error:
+        return count, _reason(error.__cause__ or error)
+    return count, None
+
+
 def _look(video: str | os.PathLike[str]) -> tuple[tuple[int, int], Display]:
     """(width, height) of the first stored picture, and how it is shown."""
     path = Path(video)

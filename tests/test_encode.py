@@ -18,7 +18,13 @@ from conftest import Encode, Ffmpeg, make_frames
 from colmap_av1.cli import main
 from colmap_av1.encode import encode as encode_video
 from colmap_av1.encode import find_encoder, stream_of
-from colmap_av1.errors import ColmapAv1Error, EncodeError, OptionError, VideoError
+from colmap_av1.errors import (
+    BitstreamError,
+    ColmapAv1Error,
+    EncodeError,
+    OptionError,
+    VideoError,
+)
 from colmap_av1.info import inspect
 from colmap_av1.match import match
 from colmap_av1.motion import read_motion
@@ -62,6 +68,8 @@ def test_streams_refer_backwards_only(
         assert f.ref_display_index[1:].max() < max(f.display_index, 1)
     np.testing.assert_allclose(times(report.output), times(phone), atol=2e-3)
     assert [p.name for p in tmp_path.iterdir()] == [f"out.{ending}"]
+    # Motion to the frame before is what makes good tracks.
+    assert inspect(report.output).reference_distances[-1] > 0.6
 
 
 def test_pictures_are_those_of_the_video(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
@@ -112,6 +120,19 @@ def test_stream_is_kept_and_used_again(phone: Path, tmp_path: Path) -> None:
     assert not stream_of(video).reused
 
 
+def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
+    first = stream_of(video)
+    # As many frames, older than the stream, and the stream's name is the same.
+    other = ffmpeg("-i", phone, "-vf", "hflip", *H264, tmp_path / "phone.mov")
+    os.utime(other, (0, 0))
+    assert not stream_of(other).reused
+    assert not stream_of(video).reused
+    assert stream_of(video).output == first.output
+    with pytest.raises(OptionError, match=r"ends in \.mp4, \.mkv, \.webm"):
+        stream_of(video, keep_stream=tmp_path / "out.ivf")
+
+
 def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
     other = tmp_path / "phone.av1.mp4"
@@ -157,20 +178,90 @@ def test_reencode_only_what_is_poor(
     assert good.stream == clip
 
 
-def test_interrupted_conversion_leaves_nothing(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def hurt(video: Path, output: Path, packet: int) -> Path:
+    """A copy of an MP4 file in which a packet, counted as coded, cannot be decoded."""
+    with av.open(str(video)) as container:
+        coded = [p for p in container.demux(video=0) if p.size][packet]
+        start, end = coded.pos, coded.pos + coded.size
+    data = bytearray(video.read_bytes())
+    data[start:end] = b"\xff" * (end - start)
+    output.write_bytes(data)
+    return output
+
+
+def test_damaged_video_is_used_up_to_the_damage(
+    encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Without B frames, so that packets come in the order of the pictures.
+    how = ("-c:v", "libx264", "-g", "6", "-bf", "0")
+    whole = encode(make_frames(24, 96, 64), tmp_path / "whole.mp4", *how)
+    video = hurt(whole, tmp_path / "video.mp4", 13)
+    with pytest.warns(UserWarning, match=r"video\.mp4: damaged after 13 of 24 frames"):
+        first = stream_of(video)
+    assert first.num_frames == len(list(decode_frames(first.output))) == 13
+    for (_, before), (_, after) in zip(
+        decode_frames(whole), decode_frames(first.output), strict=False
+    ):
+        assert cv2.PSNR(before, after) > 30
+    # Nor is the damage forgotten when the stream is used again.
+    with pytest.warns(UserWarning, match="damaged after 13 of 24 frames"):
+        again = stream_of(video)
+    assert again.reused
+    assert again.num_frames == 13
+    bytes_before = first.output.read_bytes()
+    with pytest.raises(BitstreamError, match="damaged after 13 frames"):
+        stream_of(video, strict=True)
+    words = ["encode", "--video", str(video), "--output", str(tmp_path / "out.mp4"), "--quiet"]
+    assert main([*words, "--strict"]) == 2
+    assert not (tmp_path / "out.mp4").exists()
+    assert main(words) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1] for line in lines] == [" error", " warning"]
+    assert first.output.read_bytes() == bytes_before
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_frames_are_counted_where_the_container_does_not(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    video = ffmpeg("-i", phone, "-c", "copy", tmp_path / "phone.ts")
+    done: list[tuple[str, int, int | None]] = []
+    encode_video(video, tmp_path / "out.mp4", progress=lambda *what: done.append(what))
+    assert done[0] == ("encoding", 0, 12)
+    assert done[-1] == ("encoding", 12, 12)
+
+
+def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
+    video = tmp_path / "video.h264"
+    video.write_bytes(
+        b"".join(
+            encode(make_frames(4, *size), tmp_path / "part.h264", "-c:v", "libx264").read_bytes()
+            for size in [(96, 64), (128, 96)]
+        )
+    )
+    with pytest.raises(VideoError, match="change their size from 96x64 to 128x96"):
+        encode_video(video, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
+    assert not list(tmp_path.glob("*out*"))
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_conversion_leaves_nothing(
+    ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int
+) -> None:
     long = ffmpeg(
-        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=20"),
+        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
         *("-c:v", "libx264", "-preset", "ultrafast", tmp_path / "long.mp4"),
     )
     words = ["encode", "--video", str(long), "--output", str(tmp_path / "out.mp4")]
+    words += ["--encoder", "libaom", "--speed", "2"]
     with subprocess.Popen([sys.executable, "-m", "colmap_av1", *words]) as process:
         deadline = time.monotonic() + 60
         while not list(tmp_path.glob(".out.mp4.*.partial")):
             assert time.monotonic() < deadline
             assert process.poll() is None
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+        process.send_signal(number)
+        assert process.wait(30) == status
     assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
     assert str(long) not in running.stdout
@@ -194,9 +285,19 @@ def test_encoder_that_fails_half_way(
     (tmp_path / "bin").mkdir()
     program = fake_ffmpeg(tmp_path / "bin", FAIL_HALF_WAY)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
-    with pytest.raises(EncodeError, match="failed after 7 frames: Error submitting a packet"):
+    with pytest.raises(EncodeError, match=r"failed after 7 frames \(Error submitting a packet"):
         encode_video(phone, tmp_path / "out.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["bin"]
+
+
+def test_full_disk(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = """Svt[info]: ----
+    [vost#0:0/libsvtav1 @ 0x55d5b6f68380] [error] Error muxing a packet: No space left"""
+    script = f"case \"$*\" in *lavfi*) ;; *) echo '{words} on device' >&2; exit 1;; esac"
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, script)))
+    with pytest.raises(EncodeError, match="the disk is full"):
+        encode_video(phone, tmp_path / "out.mp4")
+    assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 def test_no_encoder_at_all(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
