@@ -214,8 +214,8 @@ class TriangulateOptions:
 class MapperOptions:
     """How the poses are found."""
 
-    # COLMAP's 'incremental' or 'global' mapper; 'auto': the incremental one, but the global
-    # one where the camera moves along its axis
+    # COLMAP's 'incremental' or 'global' mapper; 'auto': the global one where camera_params
+    # are given, else the incremental one
     mapper: Literal["auto", "incremental", "global"] = "auto"
     # refine focal length and distortion; None: unless camera_params are given
     refine_intrinsics: bool | None = None

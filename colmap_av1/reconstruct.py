@@ -477,7 +477,7 @@ def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
     forward = bool(matched.facts["forward_motion"])
     mapper = mapping.mapper
     if mapper == "auto":
-        mapper = "global" if forward else "incremental"
+        mapper = "incremental" if camera.camera_params is None else "global"
     refine = mapping.refine_intrinsics
     if refine is None:
         refine = camera.camera_params is None
