@@ -527,6 +527,7 @@ def start_writing(path: Path, mode: str) -> subprocess.Popen[str]:
         [sys.executable, "-c", textwrap.dedent(WAITING), path, Path(__file__).parent, mode],
         stdout=subprocess.PIPE,
         text=True,
+        cwd=path.parent,  # else the checkout would hide the installed package
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "half-way\n"

@@ -19,10 +19,12 @@ from colmap_av1.errors import VideoError
 from colmap_av1.info import inspect
 from colmap_av1.match import match
 from colmap_av1.motion import read_motion
-from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
+from colmap_av1.options import CameraOptions, DensityOptions, ImageOptions, MatchOptions
 from colmap_av1.tracks import build_tracks, show_tracks
 from colmap_av1.video import decode_frames, presented_frames, read_display
 
+# The presets choose tracks by cells of the picture, which are not those of a cut or scaled one.
+ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"))
 TURNS = [
     ((a, 0), (0, d)) if not swapped else ((0, a), (d, 0))
     for swapped in (False, True)
@@ -228,7 +230,9 @@ def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path)
     assert shown.num_frames == 11
     np.testing.assert_array_equal(shown.frame, tracks.frame[tracks.frame >= 5] - 5)
     for name, folder in (("new", "images"), ("cut", "cut")):
-        report = match(tmp_path / f"{name}.db", trimmed, image_path=tmp_path / folder)
+        report = match(
+            tmp_path / f"{name}.db", trimmed, image_path=tmp_path / folder, options=ALL_TRACKS
+        )
         assert report.num_frames == report.num_images == 11
         for index, xy in enumerate(keypoints(tmp_path / f"{name}.db")):
             assert len(xy) > 300
@@ -309,13 +313,13 @@ def test_images_whose_pixels_were_made_square(
 ) -> None:
     clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
     cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-vf", "scale=288:128,setsar=1")
-    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut")
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut", options=ALL_TRACKS)
     assert (report.num_images, report.num_written_images, report.warnings) == (10, 0, ())
     with sqlite3.connect(tmp_path / "a.db") as connection:
         row = connection.execute("SELECT model, width, height, params FROM cameras").fetchone()
     assert row[:3] == (2, 288, 128)
     assert np.frombuffer(row[3])[0] == pytest.approx(1.2 * 288)
-    match(tmp_path / "b.db", clip)
+    match(tmp_path / "b.db", clip, options=ALL_TRACKS)
     for square, stored in zip(
         keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db"), strict=True
     ):

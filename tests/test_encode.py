@@ -254,7 +254,7 @@ def test_interrupted_conversion_leaves_nothing(
     )
     words = ["encode", "--video", str(long), "--output", str(tmp_path / "out.mp4")]
     words += ["--encoder", "libaom", "--speed", "2"]
-    with subprocess.Popen([sys.executable, "-m", "colmap_av1", *words]) as process:
+    with subprocess.Popen([sys.executable, "-m", "colmap_av1", *words], cwd=tmp_path) as process:
         deadline = time.monotonic() + 60
         while not list(tmp_path.glob(".out.mp4.*.partial")):
             assert time.monotonic() < deadline

@@ -26,7 +26,7 @@ from colmap_av1.evaluate import (
     triangulate_database,
 )
 from colmap_av1.evaluate.resume import kept
-from colmap_av1.options import CameraOptions, MatchOptions, TrackOptions
+from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, TrackOptions
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -95,7 +95,9 @@ def test_results_are_kept_while_their_key_is_the_same(tmp_path):
 
 def test_tracks_of_a_database_are_those_written(clip, tmp_path):
     # Every pair of images is written, so nothing but verification takes tracks apart.
-    options = MatchOptions(tracks=TrackOptions(min_length=3))
+    options = MatchOptions(
+        tracks=TrackOptions(min_length=3), density=DensityOptions(preset="dense")
+    )
     match(tmp_path / "a.db", clip, options=options)
     tracks = build_tracks(read_motion(clip), options.tracks)
     before = (tmp_path / "a.db").read_bytes()
