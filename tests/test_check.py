@@ -345,7 +345,7 @@ def test_interrupted_write_is_told(tmp_path: Path) -> None:
         connection.execute("UPDATE keypoints SET data = ZEROBLOB(LENGTH(data))")
         os._exit(1)
     """
-    subprocess.run([sys.executable, "-c", textwrap.dedent(script), path], check=False, cwd=path.parent)
+    subprocess.run([sys.executable, "-c", textwrap.dedent(script), path], check=False)
     assert path.with_name("given.db-journal").stat().st_size > 0
     before = listing(tmp_path)
     with pytest.raises(DatabaseError, match="a write to it was interrupted"):
