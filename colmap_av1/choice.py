@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.content import frames_by_content
+from colmap_av1.content import check_content, frames_by_content
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images import (
+    check_new_name,
     frames_of_images,
     image_file,
     image_names,
@@ -67,9 +68,10 @@ def choose_images(
 ) -> ChosenImages:
     """Choose the frames that are images: those that existing images show, else by the options.
 
-    Existing images are told apart by `frame_list`, or in the order of their names by `every`
-    (from frame 0 on), or by count and names, see `frames_of_images`; where these leave doubt
-    and the files are there, by what they show.
+    Existing images are told apart by `frame_list`; by `every`, in the order of their names from
+    frame 0 on, or with `first_number` by the numbers in them; or by count and names, see
+    `frames_of_images`. Where these leave doubt or turn out wrong, and the files are there, what
+    they show says it.
 
     Args:
         tracks: tracks through all frames.
@@ -87,10 +89,10 @@ def choose_images(
         chosen = _find_existing(tracks.num_frames, options, existing, folder, decode)
     elif options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, tracks.num_frames, options)
+        for name in chosen.names:
+            check_new_name(name)
     else:
         at = times() if options.fps or options.num_images else None
-        if at is not None and len(at) != tracks.num_frames:
-            at = None
         frames = choose_frames(tracks, options, at)
         if folder is not None and options.skip_blurred and (options.fps or options.num_images):
             frames = skip_blurred(frames, tracks, lambda asked: _sharpness(asked, decode()))
@@ -304,30 +306,56 @@ def _find_existing(
             "give a new database and folder"
         )
     by_name = [names[i] for i in natural_order(names)]
+    files = [image_file(folder, name) for name in by_name] if folder is not None else []
+    if not all(file.exists() for file in files):
+        files = []
     if options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
         odd = sorted(set(names) ^ set(chosen.names))
         if odd:
             where = "has no image" if odd[0] in chosen.names else f"{options.frame_list} has no"
             raise ImageError(f"{where} '{odd[0]}': list each image that exists, and no other")
-        return chosen
-    if options.every is not None:
-        frames = np.arange(len(names), dtype=np.int32) * options.every
-        if frames[-1] >= num_frames:
-            raise ImageError(
-                f"{len(names)} images, one for every {options.every} frames, are more than the "
-                f"video's {num_frames} frames give: give another every"
-            )
-        return ChosenImages(by_name, frames)
-    try:
-        frames = frames_of_images(names, num_frames, options.first_number)
-    except ImageError:
-        files = [image_file(folder, name) for name in by_name] if folder is not None else []
-        if options.first_number is not None or not files or not all(f.exists() for f in files):
-            raise
-        return ChosenImages(by_name, frames_by_content(files, decode()))
-    order = np.argsort(frames)
+    elif options.every is not None:
+        chosen = _in_order(by_name, _at_steps(by_name, num_frames, options))
+    else:
+        try:
+            frames = frames_of_images(by_name, num_frames, options.first_number)
+        except ImageError:
+            if options.first_number is not None or not files:
+                raise
+            return _in_order(by_name, frames_by_content(files, decode()))
+        chosen = _in_order(by_name, frames)
+    if files:
+        # The first and the last: a wrong start or rate shows there.
+        ends = sorted({0, len(chosen.names) - 1})
+        paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
+        check_content(paths, chosen.frames[ends].tolist(), decode())
+    return chosen
+
+
+def _in_order(names: Sequence[str], frames: NDArray[np.int32]) -> ChosenImages:
+    order = np.argsort(frames, kind="stable")
     return ChosenImages([names[i] for i in order], frames[order])
+
+
+def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> NDArray[np.int32]:
+    """The frames of images that show one in every `every` frames."""
+    step = options.every or 1
+    numbers = list(range(len(names)))
+    if options.first_number is not None:
+        found = [last_number(name) for name in names]
+        if None in found:
+            raise ImageError(f"'{names[found.index(None)]}' has no number: leave out first_number")
+        numbers = [(n or 0) - options.first_number for n in found]
+    for name, number in zip(names, numbers, strict=True):
+        if not 0 <= number * step < num_frames:
+            raise ImageError(
+                f"'{name}' would be frame {number * step} of the video, which has frames 0 to "
+                f"{num_frames - 1}: give another every or first_number"
+            )
+    if len(set(numbers)) < len(numbers):
+        raise ImageError("two images have one number: name their frames with --frame_list")
+    return np.array(numbers, dtype=np.int32) * step
 
 
 def _sharpness(

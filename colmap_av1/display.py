@@ -68,6 +68,13 @@ def turn_of_matrix(matrix: Sequence[int]) -> Turn | None:
     return ((p, q), (r, s))
 
 
+def turned_back(display: Display) -> Display:
+    """What turns shown pictures back to how they are stored; what was cut off stays so."""
+    (a, b), (c, d) = display.turn
+    aspect = display.pixel_aspect if a else 1 / display.pixel_aspect
+    return Display(turn=((a, c), (b, d)), pixel_aspect=aspect)
+
+
 def shown_size(size: tuple[int, int], display: Display) -> tuple[int, int]:
     """(width, height) in pixels of a stored picture of a size, as it is shown."""
     left, top, right, bottom = display.crop

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.display import Display
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.files import whole_file
 from colmap_av1.video import decode_frames
@@ -23,6 +24,8 @@ _WRITE_PARAMETERS = {
     ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
 }
+# Images that others wrote are only read.
+_READABLE = {*_WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
 # Frames waiting to be compressed, per thread; bounds memory.
 _QUEUE_PER_THREAD = 2
 
@@ -149,15 +152,15 @@ def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> 
 
 
 def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
-    """Images that a folder holds already, where none is named as this package names them.
+    """Images that a folder holds already, where they are not of a run of this package before.
 
     Args:
         folder: the folder; it need not exist.
         pattern: pattern of the names of new images, see `image_names`.
 
     Returns:
-        File names in their natural order; none where one of them follows the pattern: then
-        they are this package's own, of a run before.
+        File names in their natural order; none where frame 0 is there under the name that the
+        pattern gives it. Other programs count from 1.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -165,10 +168,9 @@ def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
     names = [
         p.name
         for p in root.iterdir()
-        if p.suffix.lower() in _WRITE_PARAMETERS and not p.name.startswith(".")
+        if p.suffix.lower() in _READABLE and not p.name.startswith(".")
     ]
-    regex = _pattern_regex(pattern)
-    if any(regex.fullmatch(name) for name in names):
+    if image_names(pattern, [0])[0] in names:
         return []
     return sorted(names, key=_natural_key)
 
@@ -196,7 +198,8 @@ def check_image_folder(
         existing_parent = existing_parent.parent
     if not existing_parent.is_dir():
         raise ImageError(f"{existing_parent}: is a file: give a folder for the images")
-    if not os.access(existing_parent, os.W_OK | os.X_OK):
+    is_complete = not isinstance(names, str) and all(image_file(root, n).exists() for n in names)
+    if not is_complete and not os.access(existing_parent, os.W_OK | os.X_OK):
         raise ImageError(f"{existing_parent}: no permission to write images there")
     if isinstance(names, str):
         regex = _pattern_regex(names)
@@ -222,6 +225,7 @@ def write_images(
     num_threads: int | None = None,
     operating_point: int = 0,
     change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
+    display: Display | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> int:
     """Write video frames as images, PNG or JPEG (quality 95) by the names' extensions.
@@ -238,6 +242,7 @@ def write_images(
         operating_point: operating point of a scalable stream.
         change: called with (display_index, picture) of each image that is not there yet, in
             display order; gives the picture to write.
+        display: how pictures are cut and turned; None: as players do.
         progress: called with the number of images done so far.
 
     Returns:
@@ -270,7 +275,9 @@ def write_images(
     size: tuple[int, ...] | None = None
     workers = num_threads or os.cpu_count() or 1
     queue: list[Future[None]] = []
-    decoded = decode_frames(video, operating_point=operating_point, num_threads=num_threads)
+    decoded = decode_frames(
+        video, operating_point=operating_point, num_threads=num_threads, display=display
+    )
     # OpenCV releases the interpreter lock while it compresses.
     with ThreadPoolExecutor(max_workers=workers) as executor:
         try:
@@ -356,6 +363,17 @@ def _check_extension(name: str) -> None:
         raise OptionError(f"image name '{name}' must end in .png, .jpg or .jpeg")
 
 
+def check_new_name(name: str) -> None:
+    """Check that an image can be written under a name.
+
+    Raises:
+        OptionError: it is of no kind that can be written.
+        ImageError: it leads out of the image folder.
+    """
+    _check_extension(name)
+    image_file(Path(), name)
+
+
 def image_file(root: Path, name: str) -> Path:
     """The file of an image in a folder.
 
@@ -364,7 +382,9 @@ def image_file(root: Path, name: str) -> Path:
     """
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
-        raise ImageError(f"image '{name}' of the database lies outside the image folder")
+        raise ImageError(
+            f"image '{name}' lies outside the image folder: give names within the folder"
+        )
     return root / name
 
 

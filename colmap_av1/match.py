@@ -6,7 +6,7 @@ import os
 import shlex
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.choice import ChosenImages, check_image_options, choose_images
+from colmap_av1.content import check_content, is_turned_back
 from colmap_av1.database import (
     DatabaseImage,
     is_square,
@@ -23,13 +24,14 @@ from colmap_av1.database import (
     write_matches,
 )
 from colmap_av1.density import select_tracks
-from colmap_av1.display import Display
+from colmap_av1.display import Display, shown_size, turned_back
 from colmap_av1.encode import stream_of
 from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
 from colmap_av1.images import (
     check_image_folder,
     check_images_there,
     existing_images,
+    has_shape,
     image_size,
     size_of_images,
     write_images,
@@ -229,13 +231,18 @@ def match(
 
     # What can be refused is refused before the long work.
     video_size = picture_size(video)
-    pixel_aspect = read_display(video).pixel_aspect
+    display = read_display(video)
     listed = _read_listed_images(database, options)
     existing = {image.name: (image.width, image.height) for image in listed}
     if folder is not None and not listed:
         names = existing_images(folder, options.images.image_name)
         existing = {name: image_size(folder / name) for name in names}
-    size = size_of_images(existing, video_size, pixel_aspect)
+    back = _way_back(video, display, video_size, existing, folder)
+    if back is not None:
+        # What exists was written by a program that does not turn pictures.
+        display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
+        video_size = shown_size(video_size, back)
+    size = size_of_images(existing, video_size, display.pixel_aspect)
     check_options(options, size)
     if folder is not None:
         check_image_folder(folder, list(existing) or options.images.image_name, size)
@@ -246,7 +253,7 @@ def match(
     tracked = track_video(
         source, options, one_size=folder is not None, clock=clock, progress=progress
     )
-    tracks = tracked.tracks
+    tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
     if (tracks.width, tracks.height) != video_size:
         if source.stream != source.pictures:
             raise VideoError(
@@ -254,10 +261,10 @@ def match(
                 f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
             )
         video_size = (tracks.width, tracks.height)
-        size = size_of_images(existing, video_size, pixel_aspect)
+        size = size_of_images(existing, video_size, display.pixel_aspect)
 
     def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        pictures = _decodable_frames(source.pictures, tracks.num_frames, options)
+        pictures = _decodable_frames(source.pictures, tracks.num_frames, options, display)
         for index, picture in pictures:
             progress("looking", index + 1, tracks.num_frames)
             yield index, picture
@@ -268,18 +275,22 @@ def match(
             options.images,
             existing=list(existing),
             folder=folder,
-            times=lambda: frame_times(source.stream),
+            times=lambda: _times(source, tracks.num_frames),
             decode=decode,
         )
     if folder is not None:
         check_image_folder(folder, chosen.names, size)
+        kept = zip(chosen.names, chosen.frames.tolist(), strict=True)
+        first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
+        if not existing and first_kept is not None:
+            check_content([folder / first_kept[0]], [first_kept[1]], decode())
     tracks = scale_tracks(tracks, size)
 
     with clock.measure("pairs"):
         seen = np.isin(tracks.frame, chosen.frames)
         tracks = select_tracks(keep_observations(tracks, seen), options.density)
     # Images may be scaled by different factors along x and y.
-    pixel_aspect *= video_size[0] * size[1] / (video_size[1] * size[0])
+    pixel_aspect = display.pixel_aspect * video_size[0] * size[1] / (video_size[1] * size[0])
     cameras, new_cameras = _cameras(
         database, listed, chosen.names, size, options.camera, pixel_aspect=pixel_aspect
     )
@@ -296,6 +307,7 @@ def match(
                 chosen.frames.tolist(),
                 num_threads=options.verify.num_threads,
                 operating_point=options.read.operating_point,
+                display=display,
                 progress=lambda done: progress("images", done, len(chosen.names)),
             )
 
@@ -528,6 +540,37 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     return listed
 
 
+def _way_back(
+    video: Path,
+    display: Display,
+    video_size: tuple[int, int],
+    existing: dict[str, tuple[int, int]],
+    folder: Path | None,
+) -> Display | None:
+    """What turns shown pictures to how images that exist show them; None where they are shown so.
+
+    Their shape says it. Where either would do, the first image says it by what it shows, if its
+    file is there; else images count as turned, as players and ffmpeg do.
+    """
+    if display.turn == Display().turn or not existing:
+        return None
+    back = turned_back(display)
+    name, size = next(iter(existing.items()))
+    as_shown = has_shape(size, video_size)
+    as_stored = has_shape(size, shown_size(video_size, back))
+    if as_shown and as_stored and folder is not None and (folder / name).exists():
+        return back if is_turned_back(folder / name, decode_frames(video), display) else None
+    return back if as_stored and not as_shown else None
+
+
+def _times(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
+    """Times of the frames that players show; None where they are unknown."""
+    times = frame_times(source.stream)
+    if times is not None and source.presented is not None:
+        times = times[source.presented[source.presented < len(times)]]
+    return None if times is None or len(times) < num_frames else times[:num_frames]
+
+
 def _counted(motion: Iterable[FrameMotion], structure: Structure) -> Iterator[FrameMotion]:
     """The same frames; counts them."""
     for frame in motion:
@@ -551,13 +594,14 @@ def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
 
 
 def _decodable_frames(
-    video: Path, num_frames: int, options: MatchOptions
+    video: Path, num_frames: int, options: MatchOptions, display: Display | None = None
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """The pictures of the frames that have tracks; those before a damage, with a warning."""
     decoded = decode_frames(
         video,
         operating_point=options.read.operating_point,
         num_threads=options.verify.num_threads,
+        display=display,
     )
     count = 0
     try:

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
+import re
 import sqlite3
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Encode, Ffmpeg, make_frames
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1.choice import (
@@ -23,6 +26,8 @@ from colmap_av1.match import match
 from colmap_av1.options import ImageOptions, MatchOptions
 from colmap_av1.tracks import Tracks
 from colmap_av1.video import decode_frames, frame_times
+
+LOSSLESS = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "0", "-crf", "1"]
 
 
 def tracks_from(paths: np.ndarray, size: tuple[int, int] = (640, 480)) -> Tracks:
@@ -58,6 +63,7 @@ def project(centres: np.ndarray, angles: np.ndarray) -> Tracks:
     return tracks_from(np.array(paths).transpose(2, 0, 1))
 
 
+@settings(deadline=None)
 @given(st.integers(2, 60), st.integers(2, 60), st.randoms(use_true_random=False))
 def test_any_number_of_images_is_spread(num_frames: int, wanted: int, random: object) -> None:
     rng = np.random.default_rng(random.getrandbits(32))  # type: ignore[attr-defined]
@@ -219,27 +225,111 @@ def keypoints(database: Path) -> list[np.ndarray]:
     return [np.frombuffer(data, "<f4").reshape(-1, 2) for (data,) in rows]
 
 
+def save(folder: Path, pictures: Sequence[np.ndarray], name: str = "x%d.png") -> Path:
+    folder.mkdir(exist_ok=True)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / (name % number)), picture)
+    return folder
+
+
 def test_images_that_look_like_no_frame_or_like_many_are_refused(
     clip: Path, cut: list[np.ndarray], encode: Encode, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "others"
-    folder.mkdir()
-    for number in range(5):
-        cv2.imwrite(str(folder / f"x{number}.png"), 255 - cut[3 * number])
+    folder = save(tmp_path / "others", [255 - cut[3 * number] for number in range(5)])
     with pytest.raises(ImageError, match="shows no frame of the video"):
         match(tmp_path / "a.db", clip, image_path=folder)
-    for number in range(5):
-        cv2.imwrite(str(folder / f"x{number}.png"), cut[0])
-    with pytest.raises(ImageError, match=r"shows no frame|looks like frame"):
+    save(folder, [cut[0]] * 5)
+    with pytest.raises(ImageError, match=r"x0\.png and .* show the same frame, 0"):
         match(tmp_path / "a.db", clip, image_path=folder)
+    twice = encode(np.concatenate([make_frames(8)] * 2), tmp_path / "twice.mp4", *LOSSLESS)
+    save(folder, [picture for _, picture in decode_frames(twice)][1:6])
+    with pytest.raises(ImageError, match=r"x0\.png: looks like frame 1 and like frame 9"):
+        match(tmp_path / "a.db", twice, image_path=folder)
     assert not (tmp_path / "a.db").exists()
-    # A camera that does not move gives no frame away.
-    same = encode(np.repeat(make_frames(1), 12, axis=0), tmp_path / "same.mp4")
-    for number, (_, picture) in enumerate(decode_frames(same)):
-        if number < 5:
-            cv2.imwrite(str(folder / f"x{number}.png"), picture)
-    with pytest.raises(ImageError, match="looks like frame"):
-        match(tmp_path / "a.db", same, image_path=folder)
+
+
+def test_images_named_as_ours_but_from_one_on(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """As ffmpeg numbers them: each is one frame earlier than its name would say."""
+    (tmp_path / "cut").mkdir()
+    ffmpeg("-i", clip, tmp_path / "cut" / "frame_%06d.png")
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut")
+    assert (report.num_images, report.num_written_images) == (16, 0)
+    match(tmp_path / "b.db", clip)
+    for ours, theirs in zip(
+        keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db"), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    # Two of them are missing: their content says which frames the others are.
+    for number in (3, 16):
+        (tmp_path / "cut" / f"frame_{number:06d}.png").unlink()
+    assert match(tmp_path / "c.db", clip, image_path=tmp_path / "cut").num_images == 14
+    kept = [k for i, k in enumerate(keypoints(tmp_path / "b.db")) if i not in (2, 15)]
+    for ours, theirs in zip(keypoints(tmp_path / "c.db"), kept, strict=True):
+        assert set(map(tuple, ours)) <= set(map(tuple, theirs))
+
+
+def test_folder_of_all_frames_of_another_video(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path
+) -> None:
+    folder = save(tmp_path / "other", [picture[::-1] for picture in cut])
+    with pytest.raises(ImageError, match="shows no frame of the video"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    # Under our own names, too, be it of all frames or of some.
+    folder = save(tmp_path / "ours", [picture[::-1] for picture in cut[:3]], "frame_%06d.png")
+    with pytest.raises(ImageError, match=r"frame_000000\.png: should show frame 0"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    assert len(list(folder.iterdir())) == 3
+    # As many as frames, but the last ones were lost and others added.
+    folder = save(tmp_path / "odd", [*cut[:-1], cut[0]])
+    with pytest.raises(ImageError, match="show the same frame"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+
+
+def test_images_of_a_folder_that_may_not_be_written(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = save(tmp_path / "cut", cut)
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != folder and access(path, mode))
+    assert match(tmp_path / "a.db", clip, image_path=folder).num_images == 16
+    empty = save(tmp_path / "empty", ())
+    monkeypatch.setattr(os, "access", lambda path, mode: path != empty and access(path, mode))
+    with pytest.raises(ImageError, match="no permission to write images there"):
+        match(tmp_path / "b.db", clip, image_path=empty)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("../a.png", ImageError), ("/a.png", ImageError), ("a.tif", OptionError)]
+)
+def test_names_that_cannot_be_written(
+    clip: Path, tmp_path: Path, name: str, error: type[Exception]
+) -> None:
+    (tmp_path / "list.txt").write_text(f"0 {name}\n3 b.png\n")
+    options = MatchOptions(images=ImageOptions(frame_list=str(tmp_path / "list.txt")))
+    with pytest.raises(error, match=re.escape(name)):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "images", options=options)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["list.txt"]
+
+
+def test_images_as_they_are_stored(
+    clip: Path, cut: list[np.ndarray], ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Programs that do not turn pictures: shape or content says so, keypoints follow."""
+    match(tmp_path / "plain.db", clip)
+    expected = keypoints(tmp_path / "plain.db")
+    folder = save(tmp_path / "stored", cut)
+    for angle in (90, 180):
+        turned = ffmpeg(
+            *("-display_rotation", str(angle), "-i", clip, "-c", "copy"), tmp_path / f"{angle}.mp4"
+        )
+        database = tmp_path / f"{angle}.db"
+        assert match(database, turned, image_path=folder).num_written_images == 0
+        for ours, theirs in zip(keypoints(database), expected, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    upright = save(tmp_path / "upright", [picture[::-1, ::-1] for picture in cut])
+    match(tmp_path / "upright.db", turned, image_path=upright)
+    for ours, theirs in zip(keypoints(tmp_path / "upright.db"), expected, strict=True):
+        np.testing.assert_allclose(ours, [192, 128] - theirs, atol=1e-4)
 
 
 def test_every_with_existing_images(clip: Path, cut: list[np.ndarray], tmp_path: Path) -> None:
@@ -249,12 +339,24 @@ def test_every_with_existing_images(clip: Path, cut: list[np.ndarray], tmp_path:
         cv2.imwrite(str(folder / f"{number}.png"), cut[5 * number])
     options = MatchOptions(images=ImageOptions(every=5))
     assert match(tmp_path / "a.db", clip, image_path=folder, options=options).num_images == 4
-    with pytest.raises(ImageError, match="give another every"):
+    # One was sorted out: the numbers say which, where they start.
+    (folder / "2.png").unlink()
+    options = MatchOptions(images=ImageOptions(every=5, first_number=0))
+    assert match(tmp_path / "c.db", clip, image_path=folder, options=options).num_images == 3
+    all_four = keypoints(tmp_path / "a.db")
+    for ours, theirs in zip(
+        keypoints(tmp_path / "c.db"), [*all_four[:2], all_four[3]], strict=True
+    ):
+        assert set(map(tuple, ours)) <= set(map(tuple, theirs))
+    with pytest.raises(ImageError, match=r"3\.png: should show frame 10 of the video but"):
+        options = MatchOptions(images=ImageOptions(every=5))
+        match(tmp_path / "b.db", clip, image_path=folder, options=options)
+    with pytest.raises(ImageError, match="would be frame 18 .* give another every"):
         match(
             tmp_path / "b.db",
             clip,
             image_path=folder,
-            options=MatchOptions(images=ImageOptions(every=6)),
+            options=MatchOptions(images=ImageOptions(every=6, first_number=0)),
         )
     with pytest.raises(OptionError, match="num_images chooses new images"):
         match(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1 import cli
@@ -75,6 +75,7 @@ def with_clean_aperture(
     return bytes(grown)
 
 
+@settings(deadline=None)
 @given(
     st.sampled_from(TURNS),
     st.tuples(*[st.integers(0, 3)] * 4),
