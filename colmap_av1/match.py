@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import shlex
 import warnings
@@ -636,8 +637,11 @@ def _cameras(
             raise DatabaseError(f"{database}: image '{missing}' has no camera")
         return [cameras[camera_id[name]] for name in names], None
     camera = make_camera(options, *size, pixel_aspect)
-    each = [camera] * len(names)
-    return each, camera if options.single_camera else each
+    if options.single_camera:
+        return [camera] * len(names), camera
+    # Images share a camera where theirs are one object.
+    each = [copy.copy(camera) for _ in names]
+    return each, each
 
 
 def _camera_notes(cameras: Sequence[Any], listed: Sequence[Any], pixel_aspect: float) -> list[str]:

@@ -125,8 +125,9 @@ class VerifyOptions:
     min_e_f_inlier_ratio: float = 0.95
     # a pair is planar or panoramic where H has more than this share of the inliers
     max_h_inlier_ratio: float = 0.8
-    # matches the models are estimated on, spread over the image; all are then tested
-    max_samples: int = 500
+    # matches that models are searched on, spread over the image; more of them refine a model,
+    # all are tested
+    max_samples: int = 200
     # iterations of the robust estimators at most
     max_iterations: int = 10000
     # probability with which a robust estimator stops on an outlier-free sample

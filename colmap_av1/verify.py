@@ -1,10 +1,11 @@
 """Two-view geometry of image pairs: which matches agree with a rigid scene, and how.
 
 The models come from PoseLib's robust estimators on a sample of the matches that is spread
-over the image; every match is then tested against them. The decisions between the models
-and all thresholds are those COLMAP documents for its own geometric verification
+over the image; more matches refine them and all are tested against them. The decisions between
+the models and all thresholds are those of COLMAP 4.2's own geometric verification
 (`TwoViewGeometryOptions`), so a database filled here and one filled by COLMAP's matchers
-mean the same.
+mean the same. Nearly all matches of tracks are right, so few iterations are enough to find a
+model; where few are, the robust estimators go on by themselves.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -73,13 +74,14 @@ def verify_pairs(
 
     A pair of cameras with a focal length prior is CALIBRATED where the essential matrix
     explains nearly as many matches as the fundamental matrix, any other UNCALIBRATED; where
-    a homography explains them as well, PLANAR_OR_PANORAMIC; with too few inliers DEGENERATE.
+    a homography explains nearly as many, PLANAR_OR_PANORAMIC; with too few inliers DEGENERATE.
 
     Args:
         keypoints: the images' keypoints.
         pairs: int32 [m, 2] indices into `keypoints`.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
-        cameras: the camera of all images, or one for each.
+        cameras: the camera of all images, or one for each; images share a camera where theirs
+            are the same object.
         options: thresholds and effort; the defaults of VerifyOptions if None.
         progress: called with the number of pairs done so far, from this thread, in order.
 
@@ -97,7 +99,10 @@ def verify_pairs(
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):
         raise ValueError("give one camera for each image and one array of matches for each pair")
-    views = [_view(k, camera) for k, camera in zip(keypoints, cameras, strict=True)]
+    views = [
+        _view(k, camera, _seed(options.seed, index))
+        for index, (k, camera) in enumerate(zip(keypoints, cameras, strict=True))
+    ]
 
     def verify(index: int) -> TwoViewGeometry:
         i, j = (int(k) for k in pairs[index])
@@ -123,24 +128,28 @@ class _View:
     """Keypoints of an image as the estimators take them.
 
     Attributes:
-        pixels: float64 [n, 2] keypoints.
-        rays: float64 [n, 2] normalised, undistorted coordinates; None without a focal prior.
+        camera: the image's camera.
+        pixels: float64 [2, n] keypoints.
+        flat: float64 [2, n] undistorted keypoints in pixels from the principal point; None
+            without a focal length prior.
         focal: mean focal length in pixels.
-        camera: the pinhole camera, in PoseLib's words, whose pixels are `rays * focal`.
-        size: (width, height) in pixels.
+        pinhole: the camera of `flat`, in PoseLib's words.
+        place: int64 [n] place of each keypoint in an order that is spread over the image from
+            its beginning on.
     """
 
+    camera: pycolmap.Camera
     pixels: NDArray[np.float64]
-    rays: NDArray[np.float64] | None
+    flat: NDArray[np.float64] | None
     focal: float
-    camera: dict[str, Any]
-    size: tuple[int, int]
+    pinhole: dict[str, Any]
+    place: NDArray[np.int64]
 
 
-def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera) -> _View:
-    size = (int(camera.width), int(camera.height))
+def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _View:
+    width, height = int(camera.width), int(camera.height)
     pixels = keypoints.xy.astype(np.float64)
-    rays = None
+    flat = None
     focal = 1.0
     if camera.has_prior_focal_length:
         rays = np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
@@ -150,13 +159,61 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera) -> _View:
                 "camera: give a perspective or fisheye model and parameters in pixels"
             )
         focal = float(camera.mean_focal_length())
+        flat = np.ascontiguousarray(rays.T * focal)
     pinhole = {
         "model": "SIMPLE_PINHOLE",
-        "width": size[0],
-        "height": size[1],
+        "width": width,
+        "height": height,
         "params": [focal, 0.0, 0.0],
     }
-    return _View(pixels, rays, focal, pinhole, size)
+    place = _spread_order(pixels, (width, height), seed)
+    return _View(camera, np.ascontiguousarray(pixels.T), flat, focal, pinhole, place)
+
+
+def _spread_order(x: NDArray[np.float64], size: tuple[int, int], seed: int) -> NDArray[np.int64]:
+    """Order points so that any beginning of the order is spread over the image.
+
+    The image is divided into cells; every cell gives one random point before any gives its
+    second, and so on.
+
+    Args:
+        x: float64 [n, 2] points in pixels.
+        size: (width, height) of the image.
+        seed: seed of the random order within a cell.
+
+    Returns:
+        int64 [n] place of each point in the order.
+    """
+    edge = math.sqrt(size[0] * size[1] / _NUM_CELLS)
+    order = np.random.default_rng(seed).permutation(len(x))
+    cell = np.floor(x[order] / edge).astype(np.int64)
+    key = cell[:, 1] * (size[0] + 1) + cell[:, 0]
+    by_cell = np.argsort(key, kind="stable")
+    count = np.arange(len(x))
+    starts = np.diff(key[by_cell], prepend=-1) != 0
+    turn = np.empty(len(x), dtype=np.int64)
+    turn[by_cell] = count - np.maximum.accumulate(np.where(starts, count, 0))
+    place = np.empty(len(x), dtype=np.int64)
+    place[order[np.argsort(turn, kind="stable")]] = count
+    return place
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A model and the matches that agree with it.
+
+    Attributes:
+        matrix: float64 [3, 3] in the coordinates the matches were tested in; None where none
+            was found.
+        inliers: bool [n].
+        count: number of inliers.
+        pose: PoseLib's pose of an essential matrix.
+    """
+
+    matrix: NDArray[np.float64] | None
+    inliers: NDArray[np.bool_]
+    count: int
+    pose: Any = None
 
 
 def _verify_pair(
@@ -166,203 +223,343 @@ def _verify_pair(
     pair: tuple[int, int],
     options: VerifyOptions,
 ) -> TwoViewGeometry:
-    """Choose the model of one pair as COLMAP does (EstimateTwoViewGeometry's rules)."""
-    num_needed = options.min_num_inliers
-    if len(matches) < max(num_needed, _MIN_MATCHES):
+    """Choose the model of one pair as COLMAP 4.2 does (EstimateTwoViewGeometry's rules).
+
+    Its test for watermarks is left out: the matches of a wide picture that pans slowly pass
+    it, and the mapper would lose the pairs of neighbours that tracks are made of.
+    """
+    if len(matches) < max(options.min_num_inliers, _MIN_MATCHES):
         return _degenerate()
-    xa, xb = a.pixels[matches[:, 0]], b.pixels[matches[:, 1]]
-    seed = int(np.random.SeedSequence([options.seed, *pair]).generate_state(1)[0])
-    sample = _spread_sample(xa, a.size, options.max_samples, seed)
-    ransac = {
-        "max_epipolar_error": options.max_error,
-        "max_reproj_error": options.max_error,
-        "max_iterations": options.max_iterations,
-        "min_iterations": min(_MIN_ITERATIONS, options.max_iterations),
-        "success_prob": options.confidence,
-        "seed": seed,
-    }
-
-    E = pose = None
-    E_inliers = np.zeros(len(matches), dtype=bool)
-    if a.rays is not None and b.rays is not None:
-        ra, rb = a.rays[matches[:, 0]], b.rays[matches[:, 1]]
-        pose, E, E_inliers = _estimate_pose(
-            a, b, ra, rb, sample=sample, ransac=ransac, max_error=options.max_error
-        )
-    num_E = int(E_inliers.sum())
-
-    # F cannot have more inliers than there are matches: where E comes that close, the pair
-    # is calibrated whatever F says, and the search for it is the costliest part.
-    F = None
-    F_inliers = np.zeros(len(matches), dtype=bool)
-    if num_E < num_needed or num_E <= options.min_e_f_inlier_ratio * len(matches):
-        F = _usable(poselib.estimate_fundamental(xa[sample], xb[sample], ransac, {})[0])
-        F_inliers = _epipolar_inliers(F, xa, xb, options.max_error)
-    num_F = int(F_inliers.sum())
-
-    # A homography is only chosen where it explains this share of the matches; looking for
-    # a weaker one, until PoseLib gives up, would be the most expensive part of all.
-    num_rival = min((count for count in (num_E, num_F) if count > 0), default=0)
-    effort = _num_iterations(options.max_h_inlier_ratio * num_rival / len(matches), options)
-    H, _ = poselib.estimate_homography(
-        xa[sample], xb[sample], {**ransac, "max_iterations": effort}, {}
-    )
-    H = _usable(H)
-    H_inliers = _transfer_inliers(H, xa, xb, options.max_error)
-    num_H = int(H_inliers.sum())
-
-    calibrated = num_E >= num_needed and num_E > options.min_e_f_inlier_ratio * num_F
-    if calibrated:
-        config = TwoViewConfig.CALIBRATED
-        epipolar_inliers = E_inliers if num_E >= num_F else F_inliers
-    elif num_F >= num_needed:
-        config = TwoViewConfig.UNCALIBRATED
-        epipolar_inliers = F_inliers
-    elif num_H >= num_needed:
-        config = TwoViewConfig.PLANAR_OR_PANORAMIC
-        epipolar_inliers = H_inliers
-    else:
-        return _degenerate()
-    inliers = epipolar_inliers
-    if num_H > options.max_h_inlier_ratio * (num_E if calibrated else num_F):
-        config = TwoViewConfig.PLANAR_OR_PANORAMIC
-        if num_H > np.count_nonzero(inliers):
-            inliers = H_inliers
-
-    # A pose means nothing where a homography explains the matches as well.
-    qvec = tvec = None
-    if config == TwoViewConfig.CALIBRATED and pose is not None:
-        qvec = np.asarray(pose.q, dtype=np.float64).reshape(4)
-        tvec = np.asarray(pose.t, dtype=np.float64).reshape(3)
-    return TwoViewGeometry(
-        config=config,
-        inlier_matches=np.ascontiguousarray(matches[inliers], dtype=np.uint32),
-        E=E,
-        F=F,
-        H=H,
-        qvec=qvec,
-        tvec=tvec,
-    )
+    # A beginning of the order that was made for the whole image stays spread in its part.
+    places = a.place[matches[:, 0]]
+    num_refined = min(len(matches), max(_MAX_REFINED, options.max_samples))
+    nearest = np.argpartition(places, num_refined - 1)[:num_refined]
+    order = nearest[np.argsort(places[nearest])]
+    search = _Search(options, order, _seed(options.seed, *pair))
+    if a.flat is not None and b.flat is not None:
+        return _verify_calibrated(a, b, matches, search)
+    return _verify_uncalibrated(a, b, matches, search)
 
 
+@dataclass(frozen=True)
+class _Search:
+    """How the models of one pair are looked for.
+
+    Attributes:
+        options: thresholds and effort.
+        order: int64 [k] the first matches of an order that is spread over the image.
+        seed: seed of the robust estimators.
+    """
+
+    options: VerifyOptions
+    order: NDArray[np.int64]
+    seed: int
+
+    @property
+    def sample(self) -> NDArray[np.int64]:
+        """The matches that models are found on."""
+        return self.order[: self.options.max_samples]
+
+    def ransac(self, min_iterations: int) -> dict[str, Any]:
+        """PoseLib's words for it."""
+        return {
+            "max_epipolar_error": self.options.max_error,
+            "max_reproj_error": self.options.max_error,
+            "max_iterations": self.options.max_iterations,
+            "min_iterations": min(min_iterations, self.options.max_iterations),
+            "success_prob": self.options.confidence,
+            "seed": self.seed,
+        }
+
+
+# Cells of an image that one point each is taken from before any gives its second.
+_NUM_CELLS = 256
 # A fundamental matrix takes seven matches; an eighth is the first that can disagree.
 _MIN_MATCHES = 8
-_MIN_ITERATIONS = 100
+# Iterations of a robust estimator at least; more follow where few matches agree.
+_MIN_ITERATIONS = 15
 # Share of inliers below which COLMAP spends no more iterations on a model.
 _MIN_INLIER_RATIO = 0.25
+# Matches a model is refined on, and steps of refinement.
+_MAX_REFINED = 500
+_REFINEMENT = {"max_iterations": 5, "step_tol": 1e-4, "gradient_tol": 1e-6}
+# Where a quick fit's share of the inliers is this far from the one that decides, no search
+# would come to the other side of it.
+_CLOSE = 0.15
 
 
 def _degenerate() -> TwoViewGeometry:
     return TwoViewGeometry(TwoViewConfig.DEGENERATE, np.empty((0, 2), dtype=np.uint32))
 
 
-def _estimate_pose(
-    a: _View,
-    b: _View,
-    rays_a: NDArray[np.float64],
-    rays_b: NDArray[np.float64],
-    *,
-    sample: NDArray[np.int64],
-    ransac: dict[str, Any],
-    max_error: float,
-) -> tuple[Any, NDArray[np.float64] | None, NDArray[np.bool_]]:
-    """Estimate the relative pose on a sample and test it on all matches.
+def _seed(*words: int) -> int:
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
 
-    Returns:
-        PoseLib's pose and the essential matrix, both None where none was found, and bool [n]
-        inliers among all matches. Errors are measured in undistorted pixels.
+
+def _verify_calibrated(
+    a: _View, b: _View, matches: NDArray[np.uint32], search: _Search
+) -> TwoViewGeometry:
+    """The geometry of a pair whose focal lengths are known."""
+    options = search.options
+    num_needed = options.min_num_inliers
+    assert a.flat is not None
+    assert b.flat is not None
+    flat_a, flat_b = a.flat[:, matches[:, 0]], b.flat[:, matches[:, 1]]
+    # Some pixels of a wide lens have no ray in front of the camera.
+    finite = np.isfinite(flat_a[0, search.order] + flat_b[0, search.order])
+    search = replace(search, order=search.order[finite])
+    E = _find_pose(a, b, flat_a, flat_b, search)
+    pixels_a, pixels_b = a.pixels[:, matches[:, 0]], b.pixels[:, matches[:, 1]]
+
+    # F cannot have more inliers than there are matches: where E comes that close, the pair
+    # is calibrated whatever F says.
+    F = None
+    num_F = 0
+    if E.count < num_needed or E.count <= options.min_e_f_inlier_ratio * len(matches):
+        start = None
+        if E.matrix is not None and E.count > _TRUSTED_SHARE * len(matches):
+            start = _on_pixels(E.matrix, a, b)
+        F = _find_fundamental(pixels_a, pixels_b, search, start)
+        num_F = F.count
+
+    calibrated = E.count >= num_needed and E.count > options.min_e_f_inlier_ratio * num_F
+    rival = E if calibrated or F is None or num_F < num_needed else F
+    # A plane maps to a plane without distortion only.
+    H = _find_homography(flat_a, flat_b, search, rival.count)
+    if calibrated:
+        config = TwoViewConfig.CALIBRATED
+        chosen = F if F is not None and num_F > E.count else E
+    elif F is not None and num_F >= num_needed:
+        config = TwoViewConfig.UNCALIBRATED
+        chosen = F
+    elif H.count >= num_needed:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        chosen = H
+    else:
+        return _degenerate()
+    if H.count > options.max_h_inlier_ratio * rival.count:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        if H.count > chosen.count:
+            chosen = H
+
+    # A pose means nothing where a homography explains the matches as well.
+    qvec = tvec = None
+    if config == TwoViewConfig.CALIBRATED:
+        qvec = np.asarray(E.pose.q, dtype=np.float64).reshape(4)
+        tvec = np.asarray(E.pose.t, dtype=np.float64).reshape(3)
+    return TwoViewGeometry(
+        config=config,
+        inlier_matches=np.ascontiguousarray(matches[chosen.inliers], dtype=np.uint32),
+        E=None if E.matrix is None else _on_rays(E.matrix, a, b),
+        F=None if F is None else F.matrix,
+        H=None if H.matrix is None else _unit(np.linalg.inv(_to_flat(b)) @ H.matrix @ _to_flat(a)),
+        qvec=qvec,
+        tvec=tvec,
+    )
+
+
+def _verify_uncalibrated(
+    a: _View, b: _View, matches: NDArray[np.uint32], search: _Search
+) -> TwoViewGeometry:
+    """The geometry of a pair without known focal lengths.
+
+    Where both images have the same camera, COLMAP 4.2 looks for a relative pose with a shared
+    focal length. F has one degree of freedom more and is found in less time; what agrees with
+    one agrees with the other.
     """
-    xa, xb = rays_a * a.focal, rays_b * b.focal
-    sample = sample[np.isfinite(xa[sample]).all(axis=1) & np.isfinite(xb[sample]).all(axis=1)]
-    none = None, None, np.zeros(len(rays_a), dtype=bool)
+    options = search.options
+    xa, xb = a.pixels[:, matches[:, 0]], b.pixels[:, matches[:, 1]]
+    F = _find_fundamental(xa, xb, search)
+    shared = a.camera is b.camera
+    H = _find_homography(xa, xb, search, F.count)
+    if max(F.count, H.count) < options.min_num_inliers:
+        return _degenerate()
+    config, chosen = TwoViewConfig.UNCALIBRATED, F
+    if F.count < options.min_num_inliers or H.count > options.max_h_inlier_ratio * F.count:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        if shared or H.count >= F.count:
+            chosen = H
+    return TwoViewGeometry(
+        config=config,
+        inlier_matches=np.ascontiguousarray(matches[chosen.inliers], dtype=np.uint32),
+        F=F.matrix,
+        H=H.matrix,
+    )
+
+
+# Share of the matches that agree with E above which no other epipolar geometry is looked for.
+_TRUSTED_SHARE = 0.5
+
+
+def _find_pose(
+    a: _View, b: _View, xa: NDArray[np.float64], xb: NDArray[np.float64], search: _Search
+) -> _Model:
+    """The essential matrix of a pair, on undistorted pixels from the principal points."""
+    sample, wider = search.sample, search.order
     if len(sample) < _MIN_MATCHES:
-        return none
-    pose, _ = poselib.estimate_relative_pose(xa[sample], xb[sample], a.camera, b.camera, ransac, {})
+        return _no_model(xa)
+    ransac = search.ransac(_MIN_ITERATIONS)
+    pose, _ = poselib.estimate_relative_pose(
+        xa[:, sample].T, xb[:, sample].T, a.pinhole, b.pinhole, ransac, _REFINEMENT
+    )
+    found = _test(_epipolar_inliers, _on_flat(pose, a, b), xa, xb, search)
+    found = replace(found, pose=pose)
+    used = wider[found.inliers[wider]]
+    if len(used) < _MIN_MATCHES:
+        return found
+    pose, _ = poselib.refine_relative_pose(
+        xa[:, used].T, xb[:, used].T, pose, a.pinhole, b.pinhole, _REFINEMENT
+    )
+    refined = _test(_epipolar_inliers, _on_flat(pose, a, b), xa, xb, search)
+    refined = replace(refined, pose=pose)
+    return refined if refined.count >= found.count else found
+
+
+def _on_flat(pose: Any, a: _View, b: _View) -> NDArray[np.float64]:
+    """The essential matrix of a pose, for coordinates that are `flat` in a view."""
     R, t = np.asarray(pose.R), np.asarray(pose.t).reshape(3)
-    E = _usable(np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]]) @ R)
-    if E is None:
-        return none
-    on_pixels = E / np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0])
-    return pose, E, _epipolar_inliers(on_pixels, xa, xb, max_error)
+    E = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]]) @ R
+    return np.asarray(E / np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0]))
 
 
-def _spread_sample(
-    x: NDArray[np.float64], size: tuple[int, int], max_samples: int, seed: int
-) -> NDArray[np.int64]:
-    """Choose at most `max_samples` points that are spread over the image.
+def _find_fundamental(
+    xa: NDArray[np.float64],
+    xb: NDArray[np.float64],
+    search: _Search,
+    start: NDArray[np.float64] | None = None,
+) -> _Model:
+    """The fundamental matrix of a pair; from `start`, if given, without a search."""
+    sample, wider = search.sample, search.order
+    if len(sample) < _MIN_MATCHES:
+        return _no_model(xa)
+    F = start
+    if F is None:
+        ransac = search.ransac(_MIN_ITERATIONS)
+        F, _ = poselib.estimate_fundamental(xa[:, sample].T, xb[:, sample].T, ransac, _REFINEMENT)
+    found = _test(_epipolar_inliers, F, xa, xb, search)
+    used = wider[found.inliers[wider]]
+    if found.matrix is None or len(used) < _MIN_MATCHES:
+        return found
+    F, _ = poselib.refine_fundamental(xa[:, used].T, xb[:, used].T, found.matrix, _REFINEMENT)
+    refined = _test(_epipolar_inliers, F, xa, xb, search)
+    return refined if refined.count >= found.count else found
 
-    The image is divided into about as many cells as points are wanted; every cell gives one
-    random point before any gives its second, and so on.
+
+def _find_homography(
+    xa: NDArray[np.float64],
+    xb: NDArray[np.float64],
+    search: _Search,
+    num_rival: int,
+) -> _Model:
+    """The homography of a pair, as well as the decision between it and its rival needs it.
+
+    A search until no better one is found is the costliest part of all and seldom decides: a
+    quick fit shows whether the inliers come near the rival's.
 
     Args:
-        x: float64 [n, 2] points in pixels.
-        size: (width, height) of the image.
-        max_samples: number of points wanted.
-        seed: seed of the random order within a cell.
-
-    Returns:
-        int64 indices into `x`, ascending.
+        xa: float64 [2, n] points in the first image.
+        xb: float64 [2, n] points in the second image.
+        search: how to look for it.
+        num_rival: inliers of the model it competes with.
     """
-    if len(x) <= max_samples:
-        return np.arange(len(x))
-    edge = math.sqrt(size[0] * size[1] / max_samples)
-    order = np.random.default_rng(seed).permutation(len(x))
-    cell = np.floor(x[order] / edge).astype(np.int64)
-    key = cell[:, 1] * (size[0] + 1) + cell[:, 0]
-    by_cell = np.argsort(key, kind="stable")
-    starts = np.flatnonzero(np.diff(key[by_cell], prepend=key[by_cell[0]] - 1))
-    turn = np.empty(len(x), dtype=np.int64)
-    turn[by_cell] = np.arange(len(x)) - np.repeat(starts, np.diff(np.append(starts, len(x))))
-    return np.sort(order[np.argsort(turn, kind="stable")[:max_samples]])
+    sample = search.sample
+    if len(sample) < _MIN_MATCHES:
+        return _no_model(xa)
+    robust = {**_REFINEMENT, "loss_scale": search.options.max_error}
+    start = _affine_fit(xa[:, sample], xb[:, sample])
+    H, _ = poselib.refine_homography(xa[:, sample].T, xb[:, sample].T, start, robust)
+    found = _test(_transfer_inliers, H, xa, xb, search)
+    decisive = search.options.max_h_inlier_ratio * num_rival / xa.shape[1]
+    margin = found.count / xa.shape[1] - decisive
+    if abs(margin) > _CLOSE:
+        return found
+    ransac = search.ransac(_MIN_ITERATIONS)
+    ransac["max_iterations"] = _num_iterations(decisive, search.options)
+    H, _ = poselib.estimate_homography(xa[:, sample].T, xb[:, sample].T, ransac, _REFINEMENT)
+    return _test(_transfer_inliers, H, xa, xb, search)
 
 
 def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
-    """Iterations after which a homography with this share of inliers is found or absent."""
+    """Iterations after which a homography with this share of inliers is found or absent.
+
+    COLMAP searches no longer either, so a close case ends alike.
+    """
     clean = max(inlier_ratio, _MIN_INLIER_RATIO) ** 4
     if clean >= 1 or options.confidence >= 1:
         wanted = options.max_iterations if options.confidence >= 1 else 1
     else:
-        # Three times the textbook number, as COLMAP does: samples are noisy.
         wanted = math.ceil(3 * math.log(1 - options.confidence) / math.log(1 - clean))
     return min(max(wanted, _MIN_ITERATIONS), options.max_iterations)
 
 
-def _usable(model: Any) -> NDArray[np.float64] | None:
-    """The model scaled to unit norm, or None where the estimator found none."""
-    model = np.asarray(model, dtype=np.float64)
-    norm = float(np.linalg.norm(model))
-    return model / norm if math.isfinite(norm) and norm > 0 else None
+def _affine_fit(xa: NDArray[np.float64], xb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The affine map, as a 3x3 matrix, that takes `xa` to `xb` with the least squares."""
+    rows = np.column_stack([xa.T, np.ones(xa.shape[1])])
+    solution = np.linalg.lstsq(rows, xb.T, rcond=None)[0]
+    return np.vstack([solution.T, [0.0, 0.0, 1.0]])
+
+
+def _no_model(x: NDArray[np.float64]) -> _Model:
+    return _Model(None, np.zeros(x.shape[1], dtype=bool), 0)
+
+
+def _test(
+    inliers_of: Callable[..., NDArray[np.bool_]],
+    matrix: Any,
+    xa: NDArray[np.float64],
+    xb: NDArray[np.float64],
+    search: _Search,
+) -> _Model:
+    """The matrix at unit norm with its inliers; no model where an estimator found none."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    norm = float(np.linalg.norm(matrix))
+    if not (math.isfinite(norm) and norm > 0):
+        return _no_model(xa)
+    matrix = matrix / norm
+    inliers = inliers_of(matrix, xa, xb, search.options.max_error)
+    return _Model(matrix, inliers, int(np.count_nonzero(inliers)))
 
 
 def _epipolar_inliers(
-    F: NDArray[np.float64] | None,
-    xa: NDArray[np.float64],
-    xb: NDArray[np.float64],
-    max_error: float,
+    F: NDArray[np.float64], xa: NDArray[np.float64], xb: NDArray[np.float64], max_error: float
 ) -> NDArray[np.bool_]:
     """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
-    if F is None:
-        return np.zeros(len(xa), dtype=bool)
-    lines_b = xa @ F[:, :2].T + F[:, 2]
-    lines_a = xb @ F[:2] + F[2]
-    algebraic = np.einsum("ij,ij->i", xb, lines_b[:, :2]) + lines_b[:, 2]
-    gradient = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+    lines_b = F[:, :2] @ xa + F[:, 2:]
+    lines_a = F.T[:2, :2] @ xb + F.T[:2, 2:]
+    algebraic = xb[0] * lines_b[0] + xb[1] * lines_b[1] + lines_b[2]
+    gradient = lines_b[0] ** 2 + lines_b[1] ** 2 + lines_a[0] ** 2 + lines_a[1] ** 2
     return np.asarray(algebraic**2 <= max_error**2 * gradient)
 
 
 def _transfer_inliers(
-    H: NDArray[np.float64] | None,
-    xa: NDArray[np.float64],
-    xb: NDArray[np.float64],
-    max_error: float,
+    H: NDArray[np.float64], xa: NDArray[np.float64], xb: NDArray[np.float64], max_error: float
 ) -> NDArray[np.bool_]:
     """Matches that H maps to within `max_error` of their place in the second image."""
-    if H is None:
-        return np.zeros(len(xa), dtype=bool)
-    mapped = xa @ H[:, :2].T + H[:, 2]
+    mapped = H[:, :2] @ xa + H[:, 2:]
     # Multiplied out by the third coordinate, so no point at infinity divides by zero.
-    error = mapped[:, :2] - xb * mapped[:, 2:]
-    return np.asarray((error**2).sum(axis=1) <= (max_error * mapped[:, 2]) ** 2)
+    x = mapped[0] - xb[0] * mapped[2]
+    y = mapped[1] - xb[1] * mapped[2]
+    return np.asarray(x**2 + y**2 <= (max_error * mapped[2]) ** 2)
+
+
+def _on_pixels(E: NDArray[np.float64], a: _View, b: _View) -> NDArray[np.float64]:
+    """The fundamental matrix of a pair's pixels, but for distortion, from `_find_pose`'s."""
+    return np.asarray(_to_flat(b).T @ E @ _to_flat(a))
+
+
+def _to_flat(view: _View) -> NDArray[np.float64]:
+    """Takes pixels without distortion to pixels from the principal point at the mean focal."""
+    scale = np.diag([view.focal, view.focal, 1.0])
+    return np.asarray(scale @ np.linalg.inv(view.camera.calibration_matrix()))
+
+
+def _on_rays(E: NDArray[np.float64], a: _View, b: _View) -> NDArray[np.float64]:
+    """The essential matrix of normalised coordinates from `_find_pose`'s."""
+    return _unit(E * np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0]))
+
+
+def _unit(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(matrix / np.linalg.norm(matrix))
 
 
 def _num_cpus() -> int:
