@@ -263,7 +263,7 @@ def test_matches_of_listed_images_are_added_to_or_replaced(clip: Path, tmp_path:
 
 def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path) -> None:
     other = encode(make_frames(2, 96, 64), tmp_path / "other.mp4")
-    write_images(other, tmp_path / "frames", ["frame_000001.png"], [1])
+    write_images(other, tmp_path / "frames", ["frame_000000.png"], [0])
     with pytest.raises(ImageError, match="is 96x64, the video 192x128"):
         match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
     assert not (tmp_path / "a.db").exists()
