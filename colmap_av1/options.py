@@ -127,7 +127,7 @@ class VerifyOptions:
     max_h_inlier_ratio: float = 0.8
     # matches that models are searched on, spread over the image; more of them refine a model,
     # all are tested
-    max_samples: int = 200
+    max_samples: int = 128
     # iterations of the robust estimators at most
     max_iterations: int = 10000
     # probability with which a robust estimator stops on an outlier-free sample

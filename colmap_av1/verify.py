@@ -273,7 +273,7 @@ class _Search:
 
 
 # Cells of an image that one point each is taken from before any gives its second.
-_NUM_CELLS = 256
+_NUM_CELLS = 128
 # A fundamental matrix takes seven matches; an eighth is the first that can disagree.
 _MIN_MATCHES = 8
 # Iterations of a robust estimator at least; more follow where few matches agree.

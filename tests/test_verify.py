@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -85,6 +86,28 @@ def test_same_decisions_as_colmap(
     assert np.mean(same) >= 0.95
     assert np.mean(overlap) >= 0.95
     assert np.mean([g.config == config for g in ours]) >= 0.9
+
+
+def test_planar_pairs_of_two_cameras_keep_the_larger_set() -> None:
+    keypoints, pairs, matches = prepare(make_scene(flat=True, noise=0.5), outliers=0.1)
+    first, second = copy.copy(UNKNOWN), copy.copy(UNKNOWN)
+    cameras = [(first, second)[i % 2] for i in range(len(keypoints))]
+    for ours, shared in zip(
+        verify_pairs(keypoints, pairs, matches, cameras),
+        verify_pairs(keypoints, pairs, matches, UNKNOWN),
+        strict=True,
+    ):
+        if ours.config == shared.config == TwoViewConfig.PLANAR_OR_PANORAMIC:
+            assert len(ours.inlier_matches) >= len(shared.inlier_matches)
+    i, j = pairs[0]
+    first.camera_id, second.camera_id = 1, 2
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    xy = [keypoints[k].xy.astype(float) for k in (i, j)]
+    theirs = pycolmap.estimate_two_view_geometry(first, xy[0], second, xy[1], matches[0], options)
+    (ours,) = verify_pairs(keypoints, pairs[:1], matches[:1], cameras)
+    assert int(theirs.config) == ours.config
+    assert len(ours.inlier_matches) >= 0.98 * len(theirs.inlier_matches)
 
 
 def test_pose_against_truth() -> None:

@@ -1,0 +1,210 @@
+"""Measure the verification of image pairs beside COLMAP's, on the same pairs and matches.
+
+python examples/benchmarks/verification.py --cache benchmark_verification
+
+`match` fills a database for each video. Then `verify_pairs` and pycolmap's `verify_matches` take
+turns on it, each in a process of its own and with all CPUs, COLMAP with two seeds in turn: what it
+disagrees on with itself no other implementation can agree on. CPU times leave out imports and
+reading the database, COLMAP's holds its writing of the rows. The rendered clip is always there,
+the sequences lie in ../shared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sqlite3
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1 import CameraOptions, ColmapAv1Error, MatchOptions, match
+from colmap_av1.database import image_ids_from_pair_id
+from colmap_av1.evaluate import read_sequence
+from colmap_av1.evaluate.measure import run_measured
+from colmap_av1.options import DensityOptions, VerifyOptions
+from colmap_av1.pairs import ImageKeypoints
+from colmap_av1.verify import verify_pairs
+
+EXAMPLES = Path(__file__).resolve().parents[1]
+SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
+NAMES = ("scene", "street", "log_building", "ditch", "shelfbox")
+ENCODING = (
+    "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
+    "-pix_fmt yuv420p -an"
+)
+
+
+@dataclass(frozen=True)
+class Verified:
+    """CPU seconds of a verification, and by pair id the config and the inlier matches."""
+
+    cpu_seconds: float
+    geometries: dict[int, tuple[int, NDArray[np.uint32]]]
+
+
+def main() -> int:
+    """Fill the databases that are absent, verify each in turns, print a table."""
+    parser = argparse.ArgumentParser(
+        description="Measure verification beside COLMAP's.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument(
+        "--cache", type=Path, help="folder that keeps videos and databases; without, temporary"
+    )
+    parser.add_argument("--repeats", type=int, default=2, help="runs of each, in turns")
+    parser.add_argument(
+        "--preset", choices=["sparse", "default", "dense"], default="dense", help="tracks to match"
+    )
+    parser.add_argument(
+        "--sequences", nargs="+", choices=NAMES, default=NAMES, metavar="NAME", help=" ".join(NAMES)
+    )
+    arguments = parser.parse_args()
+    if arguments.repeats < 2:
+        parser.error("--repeats starts at 2: COLMAP is compared with itself")
+    failed = False
+    print(
+        "| clip | pairs | matches | ours, CPU s | COLMAP, CPU s | times | same config | "
+        "inlier Jaccard mean | >= 0.98 | COLMAP with itself: config | mean | >= 0.98 |"
+    )
+    print("|---|" + "---:|" * 11)
+    with ExitStack() as stack:
+        cache = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        cache.mkdir(parents=True, exist_ok=True)
+        for name in arguments.sequences:
+            if name != "scene" and not (SEQUENCES / name).is_dir():
+                print(f"{name}: not measured, {SEQUENCES / name} is absent", file=sys.stderr)
+                continue
+            try:
+                database = fill_database(name, arguments.preset, cache)
+                print(measure(name, database, arguments.repeats, cache), flush=True)
+            except ColmapAv1Error as error:
+                print(f"error: {name}: {error}", file=sys.stderr)
+                failed = True
+    return 1 if failed else 0
+
+
+def fill_database(name: str, preset: str, cache: Path) -> Path:
+    """The database of a clip, filled unless the cache holds it."""
+    database = cache / f"{name}_{preset}.db"
+    if database.exists():
+        return database
+    video, camera = EXAMPLES / "scene.mp4", CameraOptions()
+    if name != "scene":
+        sequence = read_sequence(SEQUENCES / name)
+        if sequence.camera is not None:
+            camera = CameraOptions(
+                camera_model=sequence.camera.model_name,
+                camera_params=",".join(map(str, sequence.camera.params)),
+            )
+        video = cache / f"{name}.mp4"
+        if not video.exists():
+            encode(sequence.source, sequence.fps, video)
+    options = MatchOptions(camera=camera, density=DensityOptions(preset=preset))
+    match(database, video, options=options)
+    return database
+
+
+def encode(source: Path, fps: float, video: Path) -> None:
+    """Encode a clip or a folder of numbered images as AV1."""
+    words = ["-i", str(source)]
+    if source.is_dir():
+        first = min(source.iterdir())
+        pattern = source / f"%0{len(first.stem)}d{first.suffix}"
+        words = ["-framerate", str(fps), "-start_number", first.stem, "-i", str(pattern)]
+    unfinished = video.with_suffix(".part.mp4")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *words, *ENCODING.split()]
+    subprocess.run([*command, str(unfinished)], check=True)
+    unfinished.replace(video)
+
+
+def measure(name: str, database: Path, repeats: int, cache: Path) -> str:
+    """A row of the table."""
+    log = cache / "log.txt"
+    ours, theirs = [], []
+    for turn in range(repeats):
+        ours.append(run_measured(verify_here, database, log=log).result)
+        theirs.append(run_measured(verify_with_colmap, database, turn % 2, log=log).result)
+    cpu = [statistics.median(run.cpu_seconds for run in runs) for runs in (ours, theirs)]
+    with sqlite3.connect(database) as connection:
+        pairs, matches = connection.execute("SELECT COUNT(*), SUM(rows) FROM matches").fetchone()
+    figures = [*agreement(ours[0], theirs[0]), *agreement(theirs[1], theirs[0])]
+    cells = [name, pairs, f"{matches:,}", *(f"{s:.2f}" for s in cpu), f"{cpu[1] / cpu[0]:.1f}"]
+    return "| " + " | ".join(map(str, [*cells, *(f"{figure:.4f}" for figure in figures)])) + " |"
+
+
+def verify_here(database: Path) -> Verified:
+    """Verify the matches of a database with `verify_pairs`; writes nothing."""
+    with pycolmap.Database.open(database) as db:
+        images = sorted(db.read_all_images(), key=lambda image: image.image_id)
+        cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+        keypoints = []
+        for image in images:
+            xy = np.asarray(db.read_keypoints(image.image_id), dtype=np.float32)[:, :2]
+            keypoints.append(ImageKeypoints(0, np.ascontiguousarray(xy), np.arange(len(xy))))
+        pair_ids, matches = db.read_all_matches()
+    index = {image.image_id: k for k, image in enumerate(images)}
+    pairs = np.array(
+        [[index[i] for i in image_ids_from_pair_id(int(pair_id))] for pair_id in pair_ids], np.int32
+    )
+    each = [cameras[image.camera_id] for image in images]
+    start = time.process_time()
+    geometries = verify_pairs(keypoints, pairs, matches, each, VerifyOptions())
+    used = time.process_time() - start
+    found = {
+        int(pair_id): (int(g.config), g.inlier_matches)
+        for pair_id, g in zip(pair_ids, geometries, strict=True)
+    }
+    return Verified(used, found)
+
+
+def verify_with_colmap(database: Path, seed: int) -> Verified:
+    """Verify the matches of a copy of a database with pycolmap's `verify_matches`."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy, list_of_pairs = Path(folder, "copy.db"), Path(folder, "pairs.txt")
+        shutil.copy(database, copy)
+        with sqlite3.connect(copy) as connection:
+            connection.execute("DELETE FROM two_view_geometries")
+            names = dict(connection.execute("SELECT image_id, name FROM images"))
+            pair_ids = [row[0] for row in connection.execute("SELECT pair_id FROM matches")]
+        named = [[names[i] for i in image_ids_from_pair_id(pair_id)] for pair_id in pair_ids]
+        list_of_pairs.write_text("".join(f"{a} {b}\n" for a, b in named))
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = seed
+        start = time.process_time()
+        pycolmap.verify_matches(copy, list_of_pairs, options)
+        used = time.process_time() - start
+        with sqlite3.connect(copy) as connection:
+            rows = connection.execute("SELECT pair_id, config, data FROM two_view_geometries")
+            found = {
+                pair_id: (config, np.frombuffer(data or b"", "<u4").reshape(-1, 2))
+                for pair_id, config, data in rows
+            }
+    return Verified(used, found)
+
+
+def agreement(a: Verified, b: Verified) -> tuple[float, float, float]:
+    """Share of pairs with the same config; mean Jaccard index; share of pairs at 0.98 or above."""
+    same, overlap = [], []
+    for pair_id, (config, inliers) in b.geometries.items():
+        other_config, other = a.geometries[pair_id]
+        same.append(config == other_config)
+        keys, other_keys = (x[:, 0].astype(np.uint64) << 32 | x[:, 1] for x in (inliers, other))
+        common = len(np.intersect1d(keys, other_keys))
+        union = len(keys) + len(other_keys) - common
+        overlap.append(common / union if union else 1.0)
+    return float(np.mean(same)), float(np.mean(overlap)), float(np.mean(np.array(overlap) >= 0.98))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
