@@ -80,7 +80,7 @@ BAD = [
     (["--single_camera", "maybe"], "neither 0 nor 1"),
     (["--no_such_option", "1"], "--no_such_option"),
     (["--image_path", "text.mp4"], "text.mp4: is a file"),
-    (["--image_path", "small"], "frame_000002.png: is 96x64, the video 192x128"),
+    (["--image_path", "small"], "small/frame_000002.png: shows no frame of the video"),
     (["--database", "text.mp4"], "not a COLMAP database"),
     (["--database", "absent/a.db"], "absent"),
 ]
