@@ -16,6 +16,13 @@ from colmap_av1.cli import main
 from colmap_av1.database import read_cameras, read_images
 
 COMMAND = [sys.executable, "-m", "colmap_av1"]
+# Shells let what they start in the background ignore interrupts, and Python then does, too.
+HEED_INTERRUPTS = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from colmap_av1.cli import main
+sys.exit(main())
+"""
 
 
 def read_table(text: str) -> dict[str, str]:
@@ -179,7 +186,11 @@ def test_interrupt_exits_with_130(encode: Encode, tmp_path: Path) -> None:
     words = ["match", "--database", "a.db", "--video", str(long), "--image_path", "frames"]
     words += ["--offsets", "1", "--growth", "1"]
     process = subprocess.Popen(
-        [*COMMAND, *words], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", HEED_INTERRUPTS, *words],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     while not (tmp_path / "frames").exists() and process.poll() is None:
         time.sleep(0.005)

@@ -14,6 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from conftest import Encode, Ffmpeg, make_frames
+from test_cli import HEED_INTERRUPTS
 
 from colmap_av1.cli import main
 from colmap_av1.encode import encode as encode_video
@@ -254,7 +255,8 @@ def test_interrupted_conversion_leaves_nothing(
     )
     words = ["encode", "--video", str(long), "--output", str(tmp_path / "out.mp4")]
     words += ["--encoder", "libaom", "--speed", "2"]
-    with subprocess.Popen([sys.executable, "-m", "colmap_av1", *words], cwd=tmp_path) as process:
+    command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
+    with subprocess.Popen(command, cwd=tmp_path) as process:
         deadline = time.monotonic() + 60
         while not list(tmp_path.glob(".out.mp4.*.partial")):
             assert time.monotonic() < deadline
