@@ -14,6 +14,14 @@ from typing import Any, Literal
 from colmap_av1.errors import ModelError
 from colmap_av1.progress import Progress
 
+# Not `-m`, nor with '' on the path: a checkout in the working folder would hide the package.
+_CHILD = """
+import json, sys
+sys.path[:] = filter(None, sys.path)
+from colmap_av1.mapper import run_child
+run_child(json.loads(sys.argv[1]))
+"""
+
 
 @dataclass(frozen=True)
 class MapperRun:
@@ -74,7 +82,7 @@ def map_poses(
     with (
         log.open("wb") as file,
         subprocess.Popen(
-            [sys.executable, "-m", "colmap_av1.mapper", json.dumps(settings)],
+            [sys.executable, "-c", _CHILD, json.dumps(settings)],
             stdout=subprocess.PIPE,
             stderr=file,
             env={**os.environ, "PYTHONPATH": path},
@@ -102,7 +110,7 @@ def map_poses(
     return MapperRun(tuple(sizes))
 
 
-def _main(settings: dict[str, Any]) -> None:
+def run_child(settings: dict[str, Any]) -> None:
     """Map in this process; what happens is told on standard output."""
     # The interrupt of a terminal reaches the parent, too, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -146,7 +154,3 @@ def _main(settings: dict[str, Any]) -> None:
         found[0].write_binary(output)
     channel.write(f"models {json.dumps([m.num_reg_images() for m in found])}\n")
     channel.close()
-
-
-if __name__ == "__main__":
-    _main(json.loads(sys.argv[1]))

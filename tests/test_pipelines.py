@@ -43,7 +43,9 @@ def tools(tmp_path: Path) -> Path:
     """A folder of commands: this package, this Python, an ffmpeg, stand-ins for others."""
     folder = tmp_path / "tools"
     folder.mkdir()
-    add_command(folder, "colmap-av1", f'exec "{sys.executable}" -m colmap_av1 "$@"')
+    # Without the working folder on the path: the checkout would hide the installed package.
+    program = "import sys; sys.path[:] = filter(None, sys.path); from colmap_av1.cli import main; sys.exit(main())"
+    add_command(folder, "colmap-av1", f'exec "{sys.executable}" -c "{program}" "$@"')
     add_command(folder, "python", f'exec "{sys.executable}" "$@"')
     add_command(folder, "ffmpeg", f'exec "{imageio_ffmpeg.get_ffmpeg_exe()}" "$@"')
     return folder

@@ -15,7 +15,7 @@ from colmap_av1 import view
 from colmap_av1.cli import main
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.match import match
-from colmap_av1.options import TrackOptions, ViewOptions
+from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
 
 
 @pytest.fixture(scope="session")
@@ -103,7 +103,8 @@ def test_bad_options_leave_nothing(
 
 
 def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
-    match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
+    options = MatchOptions(density=DensityOptions(preset="dense"))
+    match(tmp_path / "a.db", clip, image_path=tmp_path / "frames", options=options)
     before = (tmp_path / "a.db").read_bytes()
     for path in (tmp_path / "frames").iterdir():
         cv2.imwrite(str(path), np.zeros((128, 192, 3), np.uint8))
