@@ -44,7 +44,8 @@ def tools(tmp_path: Path) -> Path:
     folder = tmp_path / "tools"
     folder.mkdir()
     # Without the working folder on the path: the checkout would hide the installed package.
-    program = "import sys; sys.path[:] = filter(None, sys.path); from colmap_av1.cli import main; sys.exit(main())"
+    path = "import sys; sys.path[:] = filter(None, sys.path)"
+    program = f"{path}; from colmap_av1.cli import main; sys.exit(main())"
     add_command(folder, "colmap-av1", f'exec "{sys.executable}" -c "{program}" "$@"')
     add_command(folder, "python", f'exec "{sys.executable}" "$@"')
     add_command(folder, "ffmpeg", f'exec "{imageio_ffmpeg.get_ffmpeg_exe()}" "$@"')
