@@ -20,6 +20,12 @@ from colmap_av1.evaluate.mapping import (
 from colmap_av1.evaluate.measure import Measured, run_measured
 from colmap_av1.evaluate.poses import PoseErrors, model_poses, pose_errors
 from colmap_av1.evaluate.sequence import Sequence, read_sequence
+from colmap_av1.evaluate.splatting import (
+    Milestone,
+    share_of_time,
+    split_images,
+    train_gaussians,
+)
 from colmap_av1.evaluate.track_errors import SPANS, epipolar_errors, exact_errors, pairs_at_span
 from colmap_av1.evaluate.track_statistics import TrackStatistics, track_statistics
 
@@ -32,6 +38,7 @@ __all__ = [
     "MapperRun",
     "MapperSettings",
     "Measured",
+    "Milestone",
     "ModelFigures",
     "PoseErrors",
     "Sequence",
@@ -48,6 +55,9 @@ __all__ = [
     "read_sequence",
     "run_frontend",
     "run_measured",
+    "share_of_time",
+    "split_images",
     "track_statistics",
+    "train_gaussians",
     "triangulate_database",
 ]

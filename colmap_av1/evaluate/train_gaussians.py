@@ -1,0 +1,267 @@
+"""Train 3D Gaussians on a scene, as a program: torch must not share a process with pycolmap.
+
+    train_gaussians.py SCENE.npz OUTPUT ITERATIONS SEED MILESTONE [MILESTONE ...]
+
+SCENE.npz is what `colmap_av1.evaluate.splatting` writes and says. Standard output gets a JSON
+line for every hundredth iteration and every milestone; after a milestone `OUTPUT/ITERATION/`
+holds the renderings of the test images. Where packages or the GPU are missing, one line on
+standard error says so, with exit status 3. Imports nothing of the package.
+
+The recipe is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
+Rendering", ACM Transactions on Graphics 42 (2023), with gsplat's rasterizer and densification.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_NOT_HERE = 3
+_INSTALL = "pip install gsplat pytorch-msssim"
+
+try:
+    import cv2
+    import numpy as np
+    import torch
+    from gsplat.strategy import DefaultStrategy
+    from pytorch_msssim import ssim
+except ImportError as error:
+    print(f"3D Gaussians need the package {error.name}: {_INSTALL}", file=sys.stderr)
+    sys.exit(_NOT_HERE)
+
+_SH_DEGREE = 3
+# Value of the constant spherical harmonic.
+_SH_0 = 0.5 / math.sqrt(math.pi)
+_INITIAL_OPACITY = 0.1
+_SSIM_WEIGHT = 0.2
+_RATES = {
+    "means": 1.6e-4,  # times the size of the scene
+    "scales": 5e-3,
+    "quats": 1e-3,
+    "opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 2.5e-3 / 20,
+}
+# What the rate of the means falls to in the end.
+_LAST_RATE = 0.01
+# Iterations of the published schedule; shorter runs densify in their first half only.
+_DENSIFY_FROM, _DENSIFY_UNTIL, _RESET_EVERY, _DEGREE_EVERY = 500, 15_000, 3000, 1000
+_TELL_EVERY = 100
+
+Gaussians = dict[str, torch.nn.Parameter]
+# Renders (parameters, view, degree of the harmonics): [height, width, 3], and gsplat's `info`.
+Rasterizer = Callable[[Gaussians, "View", int], tuple[torch.Tensor, dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class View:
+    """An image and its camera.
+
+    Attributes:
+        name: file name without folder.
+        cam_from_world: float32 [4, 4].
+        K: float32 [3, 3] intrinsics, the first pixel's centre at (0.5, 0.5).
+        image: uint8 [height, width, 3] RGB.
+    """
+
+    name: str
+    cam_from_world: torch.Tensor
+    K: torch.Tensor
+    image: torch.Tensor
+
+
+def initial_gaussians(
+    points: torch.Tensor, colors: torch.Tensor, spacing: torch.Tensor
+) -> Gaussians:
+    """One round Gaussian for each point.
+
+    Args:
+        points: float32 [n, 3].
+        colors: float32 [n, 3], 0 to 1.
+        spacing: float32 [n] mean distance to the nearest other points.
+    """
+    n = len(points)
+    opacity = torch.logit(torch.full((n,), _INITIAL_OPACITY, device=points.device))
+    values = {
+        "means": points,
+        "scales": torch.log(spacing.clamp_min(1e-7))[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0, 0, 0], device=points.device).repeat(n, 1),
+        "opacities": opacity,
+        "sh0": ((colors - 0.5) / _SH_0)[:, None],
+        "shN": torch.zeros((n, (_SH_DEGREE + 1) ** 2 - 1, 3), device=points.device),
+    }
+    return {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
+
+
+def photometric_loss(rendered: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    """Weighted sum of absolute difference and 1 - SSIM of two [height, width, 3] images."""
+    difference = (rendered - image).abs().mean()
+    a, b = (x.permute(2, 0, 1)[None] for x in (rendered, image))
+    structure = 1 - ssim(a, b, data_range=1.0)
+    return (1 - _SSIM_WEIGHT) * difference + _SSIM_WEIGHT * structure
+
+
+def scene_size(views: list[View]) -> float:
+    """1.1 times the largest distance of a camera from their mean."""
+    poses = torch.stack([view.cam_from_world for view in views])
+    centres = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
+    size = 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())
+    return size if size > 0 else 1.0
+
+
+def train(
+    gaussians: Gaussians,
+    views: list[View],
+    rasterize: Rasterizer,
+    iterations: int,
+    seed: int,
+) -> Iterator[tuple[int, float]]:
+    """Optimise the Gaussians in place, and yield (iteration, loss) after each iteration.
+
+    Args:
+        gaussians: parameters by name, as of `initial_gaussians`.
+        views: images to train on; each is seen once before one is seen again.
+        rasterize: renders a view.
+        iterations: how many.
+        seed: of the order of the images.
+    """
+    size = scene_size(views)
+    optimizers = {
+        name: torch.optim.Adam([p], lr=_RATES[name] * (size if name == "means" else 1), eps=1e-15)
+        for name, p in gaussians.items()
+    }
+    falling = torch.optim.lr_scheduler.ExponentialLR(
+        optimizers["means"], _LAST_RATE ** (1 / iterations)
+    )
+    strategy = DefaultStrategy(
+        refine_start_iter=_DENSIFY_FROM,
+        refine_stop_iter=min(_DENSIFY_UNTIL, iterations // 2),
+        reset_every=_RESET_EVERY,
+    )
+    strategy.check_sanity(gaussians, optimizers)
+    state = strategy.initialize_state(scene_scale=size)
+    generator = torch.Generator().manual_seed(seed)
+    order: list[int] = []
+    for iteration in range(1, iterations + 1):
+        if not order:
+            order = torch.randperm(len(views), generator=generator).tolist()
+        view = views[order.pop()]
+        degree = min(_SH_DEGREE, iteration // _DEGREE_EVERY)
+        rendered, info = rasterize(gaussians, view, degree)
+        strategy.step_pre_backward(gaussians, optimizers, state, iteration, info)
+        loss = photometric_loss(rendered, view.image.to(rendered.device) / 255.0)
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        falling.step()
+        strategy.step_post_backward(gaussians, optimizers, state, iteration, info)
+        yield iteration, float(loss.detach())
+
+
+def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[View]]:
+    """The Gaussians to start with, the views to train on and those to test on."""
+    with np.load(path) as scene:
+        arrays = {name: scene[name] for name in scene.files}
+    views = []
+    for i, file in enumerate(arrays["files"].tolist()):
+        image = cv2.imread(file, cv2.IMREAD_COLOR)
+        if image is None:
+            raise FileNotFoundError(f"{file}: is missing or no image")
+        views.append(
+            View(
+                name=Path(file).name,
+                cam_from_world=torch.from_numpy(arrays["cam_from_world"][i]).to(device),
+                K=torch.from_numpy(arrays["K"][i]).to(device),
+                image=torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)),
+            )
+        )
+    start = (torch.from_numpy(arrays[name]).to(device) for name in ("points", "colors", "spacing"))
+    is_test = arrays["is_test"].tolist()
+    return (
+        initial_gaussians(*start),
+        [view for view, test in zip(views, is_test, strict=True) if not test],
+        [view for view, test in zip(views, is_test, strict=True) if test],
+    )
+
+
+def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: list[int]) -> None:
+    """Train, tell the progress, and render the test images at the milestones."""
+    iterations, seed, *milestones = numbers
+    gaussians, train_views, test_views = read_scene(scene, device)
+    seconds, started = 0.0, time.perf_counter()
+    for iteration, loss in train(gaussians, train_views, rasterize, iterations, seed):
+        is_milestone = iteration in milestones
+        if not is_milestone and iteration % _TELL_EVERY:
+            continue
+        if device == "cuda":
+            torch.cuda.synchronize()
+        seconds += time.perf_counter() - started
+        if is_milestone:
+            folder = output / str(iteration)
+            folder.mkdir(parents=True, exist_ok=True)
+            for view in test_views:
+                with torch.no_grad():
+                    rendered = rasterize(gaussians, view, _SH_DEGREE)[0]
+                pixels = (rendered.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+                path = (folder / view.name).with_suffix(".png")
+                cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        words = {
+            "iteration": iteration,
+            "seconds": seconds,
+            "num_gaussians": len(gaussians["means"]),
+            "loss": loss,
+            "milestone": is_milestone,
+        }
+        print(json.dumps(words), flush=True)
+        # The time of rendering the test images is not the training's.
+        started = time.perf_counter()
+
+
+def gsplat_rasterizer() -> Rasterizer:
+    """gsplat's, on a GPU."""
+    from gsplat import rasterization  # noqa: PLC0415 - needs CUDA
+
+    def rasterize(
+        gaussians: Gaussians, view: View, degree: int
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        height, width = view.image.shape[:2]
+        rendered, _, info = rasterization(
+            means=gaussians["means"],
+            quats=gaussians["quats"],
+            scales=torch.exp(gaussians["scales"]),
+            opacities=torch.sigmoid(gaussians["opacities"]),
+            colors=torch.cat([gaussians["sh0"], gaussians["shN"]], 1),
+            viewmats=view.cam_from_world[None],
+            Ks=view.K[None],
+            width=width,
+            height=height,
+            sh_degree=degree,
+            packed=False,
+        )
+        return rendered[0], info
+
+    return rasterize
+
+
+def main() -> int:
+    """Train on the scene named in the arguments."""
+    if not torch.cuda.is_available():
+        print(
+            "3D Gaussians are trained on an NVIDIA GPU with CUDA, and there is none here",
+            file=sys.stderr,
+        )
+        return _NOT_HERE
+    scene, output, *numbers = sys.argv[1:]
+    run(Path(scene), Path(output), gsplat_rasterizer(), "cuda", [int(n) for n in numbers])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
