@@ -40,6 +40,7 @@ from colmap_av1.images import (
 from colmap_av1.info import Structure, inspect
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import CameraOptions, MatchOptions, OnExisting
+from colmap_av1.overlays import remove_overlays
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.refine import refine_tracks
@@ -64,6 +65,8 @@ from colmap_av1.video import (
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 # The mapper's default limit for the translation along the axis of a first pair.
 _INIT_MAX_FORWARD_MOTION = 0.95
+# Of the tracks; fewer over the picture are left out without a word.
+_NOTABLE_SHARE = 0.01
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -419,7 +422,9 @@ def track_video(
         warnings.simplefilter("always")
         with clock.measure("tracks"):
             tracks = build_tracks(motion, options.tracks, count)
-            num_frames = tracks.num_frames
+            num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
+            tracks = remove_overlays(tracks)
+            share_over_picture = 1 - len(tracks.offsets) / num_tracks
             tracks = show_tracks(tracks, source.display, source.presented)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
@@ -436,6 +441,11 @@ def track_video(
                 )
             clock.seconds["refinement"] -= clock.seconds["decoding"]
     notes = [str(w.message) for w in caught]
+    if share_over_picture >= _NOTABLE_SHARE:
+        notes.append(
+            f"{share_over_picture:.0%} of the tracks stand still while the picture moves, as "
+            "logos and dashboards do: they are left out"
+        )
     # Of the whole file, so a rate that is found low is even lower.
     bits = 8 * source.stream.stat().st_size
     reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
