@@ -24,24 +24,26 @@ constexpr std::uint8_t kAbsent = 255;  // a syntax element that a block does not
 
 // One block (decode_block) under the specification's names.
 struct BlockInfo {
-  std::uint16_t mi_row = 0;
-  std::uint16_t mi_col = 0;
   std::array<Mv, 2> mv{};
-  std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
+  // fill_units() takes the fields up to warp_index at a time.
   std::uint8_t mi_size = 0;
   std::uint8_t y_mode = DC_PRED;
-  std::uint8_t uv_mode = kAbsent;
-  std::uint8_t partition = 0;
   bool is_inter = false;
   bool skip = false;
   bool skip_mode = false;
-  bool use_intrabc = false;
-  bool interintra = false;
-  bool use_filter_intra = false;
-  bool has_chroma = false;
   std::uint8_t segment_id = 0;
   std::uint8_t motion_mode = SIMPLE;
   std::uint8_t compound_type = kAbsent;
+  bool interintra = false;
+  bool use_intrabc = false;
+  std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
+  std::int32_t warp_index = -1;      // index of the frame's LocalWarp, -1 without a valid one
+  std::uint16_t mi_row = 0;
+  std::uint16_t mi_col = 0;
+  std::uint8_t uv_mode = kAbsent;
+  std::uint8_t partition = 0;
+  bool use_filter_intra = false;
+  bool has_chroma = false;
   std::array<std::uint8_t, 2> interp_filter{kAbsent, kAbsent};
   std::array<std::uint8_t, 2> palette_size{};  // PaletteSizeY, PaletteSizeUV
   std::uint8_t comp_group_idx = 0;

@@ -6,11 +6,9 @@
 #include <atomic>
 #include <exception>
 #include <thread>
-#include <type_traits>
 
 #include "av1/error.h"
 #include "av1/motion_field.h"
-#include "av1/spec_tables.h"
 
 namespace colmap_av1::av1 {
 namespace {
@@ -28,37 +26,6 @@ std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t&
     }
   }
   throw BitstreamError("OBU size is longer than the specification allows");
-}
-
-// Writes a block's values to the units it covers. A width known to the compiler makes single
-// stores of the small blocks' rows.
-template <typename Cols>
-void export_block(const BlockInfo& b, Cols cols, Event& event) {
-  const int stride = event.header.mi_cols;
-  const int rows = std::min<int>(kNum4x4BlocksHigh[b.mi_size], event.header.mi_rows - b.mi_row);
-  const std::ptrdiff_t first = std::ptrdiff_t{b.mi_row} * stride + b.mi_col;
-  const auto fill = [&](auto& units, auto value) {
-    auto* at = units.data() + first;
-    for (int row = 0; row < rows; ++row, at += stride) {
-      for (int col = 0; col < cols; ++col) at[col] = value;
-    }
-  };
-  Units& u = event.units;
-  fill(u.mv, b.mv);
-  fill(u.ref_frame, b.ref_frame);
-  fill(u.mi_size, b.mi_size);
-  fill(u.y_mode, b.y_mode);
-  fill(u.is_inter, std::uint8_t{b.is_inter});
-  fill(u.skip, std::uint8_t{b.skip});
-  fill(u.skip_mode, std::uint8_t{b.skip_mode});
-  fill(u.segment_id, b.segment_id);
-  fill(u.motion_mode, b.motion_mode);
-  fill(u.compound_type, b.compound_type);
-  fill(u.interintra, std::uint8_t{b.interintra});
-  fill(u.use_intrabc, std::uint8_t{b.use_intrabc});
-  const bool warped =
-      b.local_warp >= 0 && event.local_warps[static_cast<std::size_t>(b.local_warp)].valid;
-  fill(u.warp_index, warped ? b.local_warp : -1);
 }
 
 }  // namespace
@@ -385,15 +352,17 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
 // The local warps of all tiles in one array, and the blocks' places in it
 void Parser::collect_local_warps() {
   for (std::size_t tile = 0; tile < tile_local_warps_.size(); ++tile) {
+    const std::vector<LocalWarp>& warps = tile_local_warps_[tile];
+    if (warps.empty()) continue;
     const auto base = static_cast<std::int32_t>(event_->local_warps.size());
-    if (base > 0 && !tile_local_warps_[tile].empty()) {
-      BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
-      for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i) {
-        if (block[i].local_warp >= 0) block[i].local_warp += base;
-      }
+    BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
+    for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i) {
+      if (block[i].local_warp < 0) continue;
+      const bool valid = warps[static_cast<std::size_t>(block[i].local_warp)].valid;
+      block[i].local_warp += base;
+      if (valid) block[i].warp_index = block[i].local_warp;
     }
-    event_->local_warps.insert(event_->local_warps.end(), tile_local_warps_[tile].begin(),
-                               tile_local_warps_[tile].end());
+    event_->local_warps.insert(event_->local_warps.end(), warps.begin(), warps.end());
   }
 }
 
@@ -415,7 +384,8 @@ void Parser::finish_frame() {
         std::copy_n(context_.prev_segment_ids, units, state_->segment_ids.begin());
       }
     }
-    export_units(*event_);
+    fill_units(context_.grid, event_->units);
+    if (options_.keep_blocks) keep_blocks();
   }
   update_references(state_, header_.refresh_frame_flags);
   state_.reset();
@@ -446,33 +416,10 @@ void Parser::update_references(const std::shared_ptr<const FrameState>& state,
   }
 }
 
-void Parser::export_units(Event& event) const {
-  const std::size_t n = context_.grid.size();
-  Units& u = event.units;
-  u.mv.resize(n);
-  u.ref_frame.resize(n);
-  for (auto* field : {&u.mi_size, &u.y_mode, &u.is_inter, &u.skip, &u.skip_mode, &u.segment_id,
-                      &u.motion_mode, &u.compound_type, &u.interintra, &u.use_intrabc}) {
-    field->resize(n);
-  }
-  u.warp_index.resize(n);
-  for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {
-    const BlockInfo* block = context_.blocks.get() + tile_first_block_[tile];
-    for (std::size_t i = 0; i < tile_num_blocks_[tile]; ++i, ++block) {
-      const int cols = std::min<int>(kNum4x4BlocksWide[block->mi_size],
-                                     header_.mi_cols - block->mi_col);
-      switch (cols) {
-        case 1: export_block(*block, std::integral_constant<int, 1>{}, event); break;
-        case 2: export_block(*block, std::integral_constant<int, 2>{}, event); break;
-        case 4: export_block(*block, std::integral_constant<int, 4>{}, event); break;
-        default: export_block(*block, cols, event); break;
-      }
-    }
-  }
-  if (!options_.keep_blocks) return;
+void Parser::keep_blocks() {
   for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {
     const BlockInfo* first = context_.blocks.get() + tile_first_block_[tile];
-    event.blocks.insert(event.blocks.end(), first, first + tile_num_blocks_[tile]);
+    event_->blocks.insert(event_->blocks.end(), first, first + tile_num_blocks_[tile]);
   }
 }
 

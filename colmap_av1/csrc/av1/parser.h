@@ -9,6 +9,7 @@
 
 #include "av1/frame_state.h"
 #include "av1/tile_parser.h"
+#include "av1/units.h"
 
 namespace colmap_av1::av1 {
 
@@ -22,28 +23,6 @@ struct ParserOptions {
   int num_threads = 1;
   // Largest accepted frame in luma samples.
   std::int64_t max_frame_size = std::int64_t{1} << 28;
-};
-
-// Leaves new elements of a vector as they are: every one of them is written after.
-template <typename T>
-struct Uninitialized : std::allocator<T> {
-  template <typename U>
-  struct rebind {
-    using other = Uninitialized<U>;
-  };
-  template <typename U>
-  void construct(U*) noexcept {}
-};
-template <typename T>
-using UnitVector = std::vector<T, Uninitialized<T>>;
-
-// Block data of a frame per 4x4 luma unit, row after row.
-struct Units {
-  UnitVector<std::array<Mv, 2>> mv;
-  UnitVector<std::array<std::int8_t, 2>> ref_frame;
-  UnitVector<std::uint8_t> mi_size, y_mode, is_inter, skip, skip_mode, segment_id, motion_mode,
-      compound_type, interintra, use_intrabc;
-  UnitVector<std::int32_t> warp_index;  // into Event::local_warps, -1 without a valid warp
 };
 
 // A decoded frame or a show_existing_frame header, in bitstream order.
@@ -127,7 +106,7 @@ class Parser {
   void finish_frame();
   void show_existing_frame();
   void update_references(const std::shared_ptr<const FrameState>& state, int refresh_frame_flags);
-  void export_units(Event& event) const;
+  void keep_blocks();
   std::array<const FrameState*, TOTAL_REFS_PER_FRAME> references() const;
 
   ParserOptions options_;
