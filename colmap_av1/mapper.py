@@ -1,4 +1,4 @@
-"""COLMAP's mappers, each in a process of its own: it can be stopped, and its log kept apart."""
+"""COLMAP's mappers and adjustment, in processes of their own: to be stopped, logs kept apart."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from colmap_av1.errors import ModelError
 from colmap_av1.progress import Progress
+
+# Poses that are nearly right need no more steps; COLMAP's own limits take five times as long.
+_ADJUSTMENT_STEPS = 20
+_ADJUSTMENT_TOLERANCE = 1e-5
 
 # Not `-m`, nor with '' on the path: a checkout in the working folder would hide the package.
 _CHILD = """
@@ -66,19 +71,79 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = {
+        "task": mapper,
         "database": str(database),
-        "output": str(output),
-        "mapper": mapper,
+        "model": str(output),
         "refine_intrinsics": refine_intrinsics,
         "forward_motion": forward_motion,
         "seed": seed,
         "num_threads": num_threads or -1,
     }
     progress("poses", 0, num_images)
-    sizes: list[int] | None = None
+    sizes: list[int] = []
     placed = 0
+
+    def told(word: str, value: str) -> None:
+        nonlocal placed, sizes
+        if word == "placed":
+            placed += 1
+            progress("poses", min(placed, num_images), num_images)
+        elif word == "models":
+            sizes = json.loads(value)
+
+    _run_apart(
+        settings, told, log, failed=f"COLMAP's {mapper} mapper", hint="try the other --mapper"
+    )
+    progress("poses", num_images, num_images)
+    return MapperRun(tuple(sizes))
+
+
+def adjust_model(
+    model: Path,
+    *,
+    refine_intrinsics: bool,
+    loss_scale: float,
+    seed: int,
+    num_threads: int | None,
+    log: Path,
+) -> None:
+    """Adjust poses, points and, if asked to, intrinsics of a model together; it is overwritten.
+
+    Args:
+        model: folder of a COLMAP model.
+        refine_intrinsics: refine focal length and distortion.
+        loss_scale: reprojection error in pixels from which on an observation counts less
+            (Cauchy's loss).
+        seed: the random seed.
+        num_threads: threads; None: one per CPU.
+        log: file that gets what COLMAP prints.
+
+    Raises:
+        ModelError: the adjustment failed; the log says more.
+    """
+    settings = {
+        "task": "adjustment",
+        "model": str(model),
+        "refine_intrinsics": refine_intrinsics,
+        "loss_scale": loss_scale,
+        "seed": seed,
+        "num_threads": num_threads or -1,
+    }
+    _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
+
+
+def _run_apart(
+    settings: dict[str, Any],
+    told: Callable[[str, str], None] | None,
+    log: Path,
+    *,
+    failed: str,
+    hint: str,
+) -> None:
+    """Do what the settings say in a process; `told` gets the words and values it prints."""
     # The package is found where this one was.
     path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), *sys.path])
+    done = False
     with (
         log.open("wb") as file,
         subprocess.Popen(
@@ -93,25 +158,20 @@ def map_poses(
             assert process.stdout is not None
             for line in process.stdout:
                 word, _, value = line.strip().partition(" ")
-                if word == "placed":
-                    placed += 1
-                    progress("poses", min(placed, num_images), num_images)
-                elif word == "models":
-                    sizes = json.loads(value)
+                done = word == "done"
+                if told is not None:
+                    told(word, value)
         except BaseException:
             process.kill()
             raise
-    if sizes is None:
+    if not done:
         raise ModelError(
-            f"COLMAP's {mapper} mapper stopped with status {process.returncode}: {log} tells "
-            "where; try the other --mapper"
+            f"{failed} stopped with status {process.returncode}: {log} tells where; {hint}"
         )
-    progress("poses", num_images, num_images)
-    return MapperRun(tuple(sizes))
 
 
 def run_child(settings: dict[str, Any]) -> None:
-    """Map in this process; what happens is told on standard output."""
+    """Map or adjust in this process; what happens is told on standard output."""
     # The interrupt of a terminal reaches the parent, too, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = os.fdopen(os.dup(1), "w", buffering=1)
@@ -120,14 +180,25 @@ def run_child(settings: dict[str, Any]) -> None:
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
     import pycolmap  # noqa: PLC0415
 
+    pycolmap.set_random_seed(settings["seed"])
+    if settings["task"] == "adjustment":
+        _adjust(settings)
+    else:
+        _map(settings, channel)
+    channel.write("done\n")
+    channel.close()
+
+
+def _map(settings: dict[str, Any], channel: TextIO) -> None:
+    import pycolmap  # noqa: PLC0415 - after what run_child does first
+
     def placed() -> None:
         channel.write("placed\n")
 
-    pycolmap.set_random_seed(settings["seed"])
-    database, output = settings["database"], settings["output"]
+    database, output = settings["database"], settings["model"]
     refine = settings["refine_intrinsics"]
     common = {"random_seed": settings["seed"], "num_threads": settings["num_threads"]}
-    if settings["mapper"] == "incremental":
+    if settings["task"] == "incremental":
         options = pycolmap.IncrementalPipelineOptions(**common)
         options.extract_colors = False
         options.ba_refine_focal_length = refine
@@ -153,4 +224,20 @@ def run_child(settings: dict[str, Any]) -> None:
     if found:
         found[0].write_binary(output)
     channel.write(f"models {json.dumps([m.num_reg_images() for m in found])}\n")
-    channel.close()
+
+
+def _adjust(settings: dict[str, Any]) -> None:
+    import pycolmap  # noqa: PLC0415 - after what run_child does first
+
+    model = pycolmap.Reconstruction(settings["model"])
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = settings["refine_intrinsics"]
+    options.refine_extra_params = settings["refine_intrinsics"]
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = settings["loss_scale"]
+    solver = options.ceres.solver_options
+    solver.num_threads = settings["num_threads"]
+    solver.max_num_iterations = _ADJUSTMENT_STEPS
+    solver.function_tolerance = _ADJUSTMENT_TOLERANCE
+    pycolmap.bundle_adjustment(model, options)
+    model.write_binary(settings["model"])

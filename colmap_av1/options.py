@@ -224,6 +224,8 @@ class MapperOptions:
     pose_tracks_per_image: int = 600
     # width in pixels of the cells of an image that one of these tracks each is wanted in
     pose_spacing: float = 16.0
+    # adjust the poses once more on points of more tracks, and of all lengths
+    adjust: bool = True
 
 
 @dataclass(frozen=True)

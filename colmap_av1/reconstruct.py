@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,7 +21,7 @@ from colmap_av1.density import select_tracks
 from colmap_av1.errors import ModelError, OptionError
 from colmap_av1.files import whole_file
 from colmap_av1.images import size_of_images, write_images
-from colmap_av1.mapper import map_poses
+from colmap_av1.mapper import adjust_model, map_poses
 from colmap_av1.match import (
     MatchedImages,
     VideoSource,
@@ -56,6 +56,11 @@ _Image = NDArray[np.uint8]
 
 # Tracks that agree with the poses of a model of the same video, at least.
 _LEAST_AGREEING = 0.5
+# Tracks that the poses are adjusted on, and the error in pixels from which on they count less.
+_ADJUSTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
+)
+_LOSS_SCALE = 0.5
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
 
@@ -176,10 +181,11 @@ def reconstruct(
     tracks, chosen = _read_tracks(stages)
     matched = _match_stage(run, tracks, chosen, tracked)
     posed = _pose_stage(run, matched, len(chosen.names))
-    made = _model_stage(run, tracks, chosen, posed)
-
-    kept = {"tracks": tracked, "matches": matched, "poses": posed, "model": made}
-    facts = {**tracked.facts, **matched.facts, **posed.facts, **made.facts}
+    kept = {"tracks": tracked, "matches": matched, "poses": posed}
+    if options.mapping.adjust:
+        kept["adjustment"] = posed = _adjustment_stage(run, tracks, chosen, posed)
+    kept["model"] = _model_stage(run, tracks, chosen, posed)
+    facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     notes = [*facts.pop("warnings"), *_notes(facts)]
     reported: dict[str, Any] = {
         f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
@@ -419,6 +425,8 @@ def _match_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept)
         preset="sparse",
         max_tracks_per_image=options.mapping.pose_tracks_per_image,
         spacing=options.mapping.pose_spacing,
+        # What drifts still ties distant images together; poses bend without.
+        max_sigma=0.0,
     )
 
     def make(partial: Path) -> dict[str, Any]:
@@ -478,9 +486,7 @@ def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
     mapper = mapping.mapper
     if mapper == "auto":
         mapper = "incremental" if camera.camera_params is None else "global"
-    refine = mapping.refine_intrinsics
-    if refine is None:
-        refine = camera.camera_params is None
+    refine = _refines_intrinsics(options)
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("poses"):
@@ -505,6 +511,7 @@ def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
             "num_registered": mapped.num_images[0],
             "other_models": list(mapped.num_images[1:]),
             "mapper": mapper,
+            "poses": "poses",
         }
 
     given = (mapper, refine, forward, options.match.verify.seed, pycolmap.__version__)
@@ -516,6 +523,12 @@ def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
         products=["poses"],
         make=make,
     )
+
+
+def _refines_intrinsics(options: ReconstructOptions) -> bool:
+    if options.mapping.refine_intrinsics is not None:
+        return options.mapping.refine_intrinsics
+    return options.match.camera.camera_params is None
 
 
 def _why_no_start(facts: dict[str, Any], mapper: str, guessed: bool) -> str:
@@ -545,22 +558,109 @@ def _why_no_start(facts: dict[str, Any], mapper: str, guessed: bool) -> str:
     )
 
 
+def _adjustment_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
+    """Adjust the poses on more tracks than the mapper can take: long ones, spread over the images.
+
+    The mapper's own adjustments have no robust loss, and drop what drifts.
+    """
+    options = run.options
+    refine = _refines_intrinsics(options)
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = _read_placed(run, posed, chosen)
+        seen = keep_observations(tracks, np.isin(tracks.frame, placed.frames))
+        chosen_tracks = select_tracks(seen, _ADJUSTED)
+        with run.clock.measure("adjustment"):
+            seen, view = _seen_in(chosen_tracks, placed.frames)
+            points = _triangulate_all(
+                *(seen, view, [placed.camera] * len(placed.images)),
+                *([i.cam_from_world for i in placed.images], None),
+                options=TriangulateOptions(),
+                num_threads=options.match.verify.num_threads,
+                progress=no_progress,
+            )
+            _check_any_point(points)
+            folder = partial / "adjusted"
+            folder.mkdir()
+            black = np.zeros((len(points.xyz), 3), np.uint8)
+            xy = seen.xy[points.observation].astype(np.float64)
+            cameras = {int(placed.camera.camera_id): placed.camera}
+            write_model(folder, cameras, placed.images, _model_points(points, black, view, xy))
+            run.progress("adjustment", 0, 1)
+            adjust_model(
+                folder,
+                refine_intrinsics=refine,
+                loss_scale=_LOSS_SCALE,
+                seed=options.match.verify.seed,
+                num_threads=options.match.verify.num_threads,
+                log=run.stages / "adjustment.log",
+            )
+            run.progress("adjustment", 1, 1)
+        return {"poses": "adjusted"}
+
+    given = (_ADJUSTED, _LOSS_SCALE, refine, options.match.verify.seed, pycolmap.__version__)
+    return run_stage(
+        run.stages,
+        "adjustment",
+        [posed.key, given],
+        into=run.stages,
+        products=["adjusted"],
+        make=make,
+    )
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """The images that have a pose, of one camera.
+
+    Attributes:
+        images: the images, in display order.
+        frames: int32 [n] their frames.
+        camera: their pycolmap.Camera.
+    """
+
+    images: list[ModelImage]
+    frames: NDArray[np.int32]
+    camera: Any
+
+
+def _read_placed(run: _Run, posed: Kept, chosen: ChosenImages) -> _Placed:
+    poses = read_model(run.stages / posed.facts["poses"])
+    by_name = {i.name: i for i in poses.images.values() if i.has_pose}
+    index = [i for i, name in enumerate(chosen.names) if name in by_name]
+    names = [chosen.names[i] for i in index]
+    camera = poses.cameras[by_name[names[0]].camera_id]
+    images = [
+        ModelImage(
+            i + 1,
+            name,
+            int(camera.camera_id),
+            np.asarray(by_name[name].cam_from_world().matrix()),
+        )
+        for i, name in enumerate(names)
+    ]
+    return _Placed(images, chosen.frames[index], camera)
+
+
+def _check_any_point(points: Points) -> None:
+    if len(points.xyz) == 0:
+        raise ModelError(
+            f"none of the {points.num_tracks} tracks agrees with the poses: try the other "
+            "--mapper, or give --camera_params"
+        )
+
+
 def _model_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
     options, clock, progress = run.options, run.clock, run.progress
     source = run.source
     num_threads = options.match.verify.num_threads
 
     def make(partial: Path) -> dict[str, Any]:
-        poses = read_model(run.stages / "poses")
-        by_name = {i.name: i for i in poses.images.values() if i.has_pose}
-        index = [i for i, name in enumerate(chosen.names) if name in by_name]
-        names, frames = [chosen.names[i] for i in index], chosen.frames[index]
-        distorted = poses.cameras[by_name[names[0]].camera_id]
+        placed = _read_placed(run, posed, chosen)
+        distorted, frames = placed.camera, placed.frames
         camera = pinhole_camera(distorted)
-        images = [
-            ModelImage(i + 1, name, 1, np.asarray(by_name[name].cam_from_world().matrix()))
-            for i, name in enumerate(names)
-        ]
+        images = [replace(image, camera_id=1) for image in placed.images]
+        names = [image.name for image in images]
         seen, view = _seen_in(tracks, frames)
         with clock.measure("points"):
             points = _triangulate_all(
@@ -570,11 +670,7 @@ def _model_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -
                 num_threads=num_threads,
                 progress=progress,
             )
-        if len(points.xyz) == 0:
-            raise ModelError(
-                f"none of the {points.num_tracks} tracks agrees with the poses: try the other "
-                "--mapper, or give --camera_params"
-            )
+        _check_any_point(points)
         colours = _Colours(seen, view, points, len(images))
         undistort = undistortion(distorted, camera)
         image_of_frame = {int(frame): i for i, frame in enumerate(frames)}

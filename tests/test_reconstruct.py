@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import importlib
 import json
+import shutil
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -273,7 +274,7 @@ def test_report(made: ReconstructReport) -> None:
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:
     files = {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")}
     again = reconstruct(SCENE, made.output, options=OPTIONS)
-    assert again.resumed == ("tracks", "matches", "poses", "model")
+    assert again.resumed == ("tracks", "matches", "poses", "adjustment", "model")
     assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
     assert replace(again, resumed=(), seconds=made.seconds) == made
 
@@ -282,7 +283,7 @@ def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> No
     before = (made.output / "sparse" / "0" / "points3D.bin").read_bytes()
     strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
     fewer = reconstruct(SCENE, made.output, options=strict)
-    assert fewer.resumed == ("tracks", "matches", "poses")
+    assert fewer.resumed == ("tracks", "matches", "poses", "adjustment")
     assert fewer.num_points < made.num_points
     assert reconstruct(SCENE, made.output, options=OPTIONS).num_points == made.num_points
     assert (made.output / "sparse" / "0" / "points3D.bin").read_bytes() == before
@@ -352,6 +353,46 @@ def test_mapper_that_fails(tmp_path: Path) -> None:
             progress=lambda *_: None,
         )
     assert (tmp_path / "log").stat().st_size > 0
+
+
+def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
+    model = read_model(made.output / ".stages" / "adjusted")
+    rng = np.random.default_rng(0)
+    for frame in model.frames.values():
+        pose = frame.rig_from_world
+        turn = pycolmap.Rotation3d(rng.normal(0.0, 0.004, 3)) * pose.rotation
+        frame.rig_from_world = pycolmap.Rigid3d(turn, pose.translation + rng.normal(0.0, 0.02, 3))
+    bent = pose_errors(model_poses(model, 60), truth.cam_from_world)
+    focal_length = model.cameras[1].mean_focal_length()
+    model.write_binary(tmp_path)
+    mapper_module.adjust_model(
+        tmp_path,
+        refine_intrinsics=False,
+        loss_scale=0.5,
+        seed=0,
+        num_threads=1,
+        log=tmp_path / "log",
+    )
+    adjusted = read_model(tmp_path)
+    errors = pose_errors(model_poses(adjusted, 60), truth.cam_from_world)
+    before = pose_errors(
+        model_poses(read_model(made.output / "sparse" / "0"), 60), truth.cam_from_world
+    )
+    assert errors.rotation < min(bent.rotation / 3, before.rotation + 0.05)
+    assert errors.ate < min(bent.ate / 3, before.ate * 1.5)
+    assert adjusted.cameras[1].mean_focal_length() == focal_length
+
+
+def test_without_adjustment(made: ReconstructReport, tmp_path: Path) -> None:
+    shutil.copytree(made.output, tmp_path / "plain")
+    options = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
+    plain = reconstruct(SCENE, tmp_path / "plain", options=options)
+    assert plain.resumed == ("tracks", "matches", "poses")
+    mapped = read_model(plain.output / ".stages" / "poses")
+    poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
+    np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
+    adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
+    assert np.nanmax(np.abs(poses - adjusted)) > 1e-4
 
 
 def test_folder_of_others(tmp_path: Path) -> None:
@@ -513,7 +554,7 @@ def test_command_line(
     assert main(words) == 0
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
-    assert "finished before\ttracks, matches, poses, model" in told.out
+    assert "finished before\ttracks, matches, poses, adjustment, model" in told.out
     model = made.output / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
