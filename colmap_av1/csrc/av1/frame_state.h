@@ -77,6 +77,7 @@ struct LocalWarp {
 struct SavedMotion {
   Mv mv;
   std::int8_t ref_frame = NONE;
+  friend bool operator==(const SavedMotion&, const SavedMotion&) = default;
 };
 
 // What stays of a decoded frame (7.20).

@@ -6,14 +6,17 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// 7.9.4 Get block position process, one coordinate; false when offset too far
-bool project_position(int v8, int delta, int dst_sign, int max8, int max_off8, int& position) {
-  const int base8 = (v8 >> 3) << 3;
+// 7.9.4 Get block position process, one coordinate: by how many 8x8 areas a projected vector moves
+int position_offset(int delta, int dst_sign) {
   constexpr int kShift = 3 + 1 + MI_SIZE_LOG2;
-  const int offset8 = delta >= 0 ? delta >> kShift : -((-delta) >> kShift);
-  position = v8 + dst_sign * offset8;
-  return position >= 0 && position < max8 && position >= base8 - max_off8 &&
-         position < base8 + 8 + max_off8;
+  return dst_sign * (delta >= 0 ? delta >> kShift : -((-delta) >> kShift));
+}
+
+// Whether a position is in the frame, and not too far from where it was projected from
+bool is_position_valid(int position, int v8, int max8, int max_off8) {
+  const int base8 = v8 & ~7;
+  return position >= std::max(0, base8 - max_off8) &&
+         position < std::min(max8, base8 + 8 + max_off8);
 }
 
 // 7.9.2 Projection process
@@ -39,15 +42,25 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
     }
   }
   const SavedMotion* saved = source->saved_motion.data();
+  // Neighbours often have the same motion, which moves them alike.
+  SavedMotion last;
+  int offset_y8 = 0;
+  int offset_x8 = 0;
   for (int y8 = 0; y8 < h8; ++y8) {
     for (int x8 = 0; x8 < w8; ++x8, ++saved) {
       if (saved->ref_frame <= INTRA_FRAME) continue;
       const int ref_offset = ref_offsets[saved->ref_frame];
       if (ref_offset == 0) continue;
-      const Mv projected = project_mv(saved->mv, factors[saved->ref_frame]);
-      int pos_y8, pos_x8;
-      if (!project_position(y8, projected.row, dst_sign, h8, MAX_OFFSET_HEIGHT, pos_y8) ||
-          !project_position(x8, projected.col, dst_sign, w8, MAX_OFFSET_WIDTH, pos_x8)) {
+      if (*saved != last) {
+        last = *saved;
+        const Mv projected = project_mv(last.mv, factors[last.ref_frame]);
+        offset_y8 = position_offset(projected.row, dst_sign);
+        offset_x8 = position_offset(projected.col, dst_sign);
+      }
+      const int pos_y8 = y8 + offset_y8;
+      const int pos_x8 = x8 + offset_x8;
+      if (!is_position_valid(pos_y8, y8, h8, MAX_OFFSET_HEIGHT) ||
+          !is_position_valid(pos_x8, x8, w8, MAX_OFFSET_WIDTH)) {
         continue;
       }
       motion_field[static_cast<std::size_t>(pos_y8) * static_cast<std::size_t>(w8) +

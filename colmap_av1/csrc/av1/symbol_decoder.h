@@ -41,12 +41,16 @@ class SymbolDecoder {
     } else {
       // Decoded symbols are close to random, so the search runs without branches: every bound
       // is computed, and the symbol is the number of bounds above the value.
-      std::uint16_t bounds[kLanes<N> + 1];
-      const int symbol = find_symbol<N>(icdf, bounds + 1);
-      bounds[0] = static_cast<std::uint16_t>(range_);
-      renormalize(static_cast<std::uint32_t>(bounds[symbol] - bounds[symbol + 1]),
-                  bounds[symbol + 1]);
-      return symbol;
+      if constexpr (kVectors && N <= 4) {
+        return symbol_by_words<N>(icdf);
+      } else {
+        std::uint16_t bounds[kLanes<N> + 1];
+        const int symbol = find_symbol<N>(icdf, bounds + 1);
+        bounds[0] = static_cast<std::uint16_t>(range_);
+        renormalize(static_cast<std::uint32_t>(bounds[symbol] - bounds[symbol + 1]),
+                    bounds[symbol + 1]);
+        return symbol;
+      }
     }
   }
 
@@ -134,6 +138,29 @@ class SymbolDecoder {
   }
 
  private:
+  // Each symbol waits for the one before, and vectors take long to enter and to leave. So the few
+  // bounds of a small array are found in words, at the top of 64 bits as SymbolValue is, and
+  // vectors, which find them once more, only adapt the array.
+  template <int N>
+  int symbol_by_words(std::uint16_t* icdf) {
+    const std::uint64_t r = range_ >> 8;
+    std::uint64_t bounds[N + 1];
+    bounds[0] = std::uint64_t{range_} << 48;
+    std::size_t symbol = 0;
+    for (std::size_t i = 0; i < N - 1; ++i) {
+      const std::uint64_t f = icdf[i];
+      bounds[i + 1] = (((r * (f >> 6)) >> 1) + 4 * (N - 1 - i)) << 48;
+      symbol += window_ < bounds[i + 1];
+    }
+    bounds[N] = 0;
+    std::uint16_t unused[kLanes<N>];
+    find_symbol<N>(icdf, unused);
+    const std::uint64_t range = bounds[symbol] - bounds[symbol + 1];
+    renormalize(static_cast<std::uint32_t>(range >> 48),
+                static_cast<std::uint32_t>(bounds[symbol + 1] >> 48));
+    return static_cast<int>(symbol);
+  }
+
   // Entries that find_symbol writes: whole vectors, of 4 lanes at least.
   template <int N>
   static constexpr int kLanes = N <= 4 ? 4 : N <= 8 ? 8 : 16;
@@ -147,20 +174,22 @@ class SymbolDecoder {
   }
 
 #if defined(__SSE2__) || defined(_M_X64)
+  static constexpr bool kVectors = true;
+
   // Bounds of all symbols into `bounds`, the symbol as result, and the adaptation of the array.
   // Lanes behind the last symbol are read and written back unchanged (CdfContext has room behind
   // its last array).
   template <int N>
   int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
-    constexpr int kVectors = N <= 8 ? 1 : 2;
+    constexpr int kParts = N <= 8 ? 1 : 2;
     // (((r >> 8) * (f >> 6)) >> 1) as the upper half of ((r >> 8) << 8) * ((f >> 6) << 7)
     const __m128i r = broadcast<N>(_mm_cvtsi32_si128(static_cast<int>(range_ & 0xFF00)));
     const __m128i value = broadcast<N>(_mm_cvtsi32_si128(static_cast<int>(window_ >> 48)));
     const __m128i lane = _mm_set_epi16(7, 6, 5, 4, 3, 2, 1, 0);
-    __m128i f[kVectors];
-    __m128i from_symbol[kVectors];  // all ones in the lanes of the symbol and behind
+    __m128i f[kParts];
+    __m128i from_symbol[kParts];  // all ones in the lanes of the symbol and behind
     unsigned mask = 0;
-    for (int k = 0; k < kVectors; ++k) {
+    for (int k = 0; k < kParts; ++k) {
       f[k] = load<N>(icdf + 8 * k);
       const __m128i scaled = _mm_slli_epi16(_mm_srli_epi16(f[k], 6), 7);
       const __m128i least = _mm_slli_epi16(
@@ -175,7 +204,7 @@ class SymbolDecoder {
     if (update_) {
       const int count = icdf[N];
       const __m128i rate = _mm_cvtsi32_si128(adaptation_rate(count, N));
-      for (int k = 0; k < kVectors; ++k) {
+      for (int k = 0; k < kParts; ++k) {
         // v + ((32768 - v) >> rate) before the symbol; from it on v - (v >> rate), which is
         // v + 1 + ((-1 - v) >> rate). Entries stay between 1 and 32767.
         const __m128i target =
@@ -218,6 +247,8 @@ class SymbolDecoder {
     }
   }
 #else
+  static constexpr bool kVectors = false;
+
   template <int N>
   int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
     const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
