@@ -22,6 +22,8 @@ _CHUNK = 200_000
 # Two rays that a first guess is made of, by their place in the track from 0 to 1.
 _GUESSES = ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75))
 _ITERATIONS = 4
+# A step that leaves more than this share of a track's cost is its last.
+_CONVERGED = 0.999
 # Error in pixels at which an observation counts half.
 _SOFT_ERROR = 1.0
 # Error in pixels that an observation has however sure its motion is.
@@ -42,6 +44,11 @@ class Views:
 
     cam_from_world: _Floats
     focal: _Floats
+
+    def centres(self) -> _Floats:
+        """Camera centres in the world, float64 [n, 3]."""
+        rotation, translation = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
+        return np.asarray(-np.einsum("nji,nj->ni", rotation, translation))
 
 
 @dataclass(frozen=True)
@@ -203,9 +210,7 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
         if len(left) == 0:
             break
         starts = np.flatnonzero(np.diff(track[left], prepend=-1))
-        group = _Group(
-            starts, sightings.view[left], sightings.rays[left], sightings.sigma[left], views
-        )
+        group = _group(starts, sightings, left, views)
         xyz, kept, error, agrees = _solve(group, options)
         if attempt == 0:
             num_tried, num_agreeing = len(starts), int(agrees.sum())
@@ -228,42 +233,78 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
     return _Part(xyz[order], error[order], sizes[order], observation, num_agreeing, num_tried)
 
 
+@dataclass(frozen=True)
 class _Group:
-    """Observations of some tracks, each with its camera."""
+    """Observations of some tracks, each with its camera.
 
-    def __init__(
-        self,
-        starts: NDArray[np.int64],
-        view: NDArray[np.int64],
-        rays: _Floats,
-        sigma: NDArray[np.float32],
-        views: Views,
-    ) -> None:
-        self.starts = starts
-        self.lengths = np.diff(np.append(starts, len(view)))
-        self.track = np.repeat(np.arange(len(starts)), self.lengths)
-        pose = views.cam_from_world[view]
-        self.rotation = pose[:, :, :3]
-        self.translation = pose[:, :, 3]
-        self.rays = rays
-        self.focal = views.focal[view]
-        rotation = views.cam_from_world[:, :, :3]
-        centres = -np.einsum("nji,nj->ni", rotation, views.cam_from_world[:, :, 3])
-        self.centre = centres[view]
-        direction = np.einsum(
-            "nji,nj->ni", self.rotation, np.column_stack([rays, np.ones(len(rays))])
+    Attributes:
+        starts: int64 [num_tracks] first observation of each track.
+        track: int64 [n] track of each observation.
+        view: int64 [n] its view.
+        rays: float64 [2, n] as in `Sightings`, by coordinate.
+        weight: float64 [n] inverse expected variance.
+        pose: float64 [3, 4, n] pose of its view.
+        focal: float64 [2, n] focal lengths of its view.
+        views: all views.
+    """
+
+    starts: NDArray[np.int64]
+    track: NDArray[np.int64]
+    view: NDArray[np.int64]
+    rays: _Floats
+    weight: _Floats
+    pose: _Floats
+    focal: _Floats
+    views: Views
+
+    def part(self, chosen: NDArray[np.bool_]) -> _Group:
+        """Some of the tracks."""
+        own = np.flatnonzero(chosen[self.track])
+        track = (np.cumsum(chosen) - 1)[self.track[own]]
+        return _Group(
+            starts=np.flatnonzero(np.diff(track, prepend=-1)),
+            track=track,
+            view=self.view[own],
+            rays=self.rays[:, own],
+            weight=self.weight[own],
+            pose=self.pose[:, :, own],
+            focal=self.focal[:, own],
+            views=self.views,
         )
-        self.direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        self.weight = 1.0 / (_SIGMA_FLOOR**2 + sigma.astype(np.float64) ** 2)
 
-    def project(self, xyz: _Floats) -> tuple[_Floats, _Floats]:
-        """Points of the tracks in the cameras, and squared errors in px^2; inf behind them."""
-        in_camera = np.einsum("nij,nj->ni", self.rotation, xyz[self.track]) + self.translation
+    def project(self, xyz: _Floats) -> tuple[_Floats, _Floats, _Floats]:
+        """Points of the tracks in the cameras.
+
+        Returns:
+            float64 [2, n] (x / z, y / z), and [n] depth, and [n] squared error in px^2, which is
+            inf behind the camera.
+        """
+        x, y, z = xyz[self.track].T
+        u, v, depth = (r[0] * x + r[1] * y + r[2] * z + r[3] for r in self.pose)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            off = (in_camera[:, :2] / in_camera[:, 2:] - self.rays) * self.focal
-            error = np.einsum("ni,ni->n", off, off)
-        error[~(in_camera[:, 2] > 0) | ~np.isfinite(error)] = np.inf
-        return in_camera, error
+            projected = np.stack([u, v]) / depth
+            off = (projected - self.rays) * self.focal
+            error = off[0] ** 2 + off[1] ** 2
+        error[~(depth > 0) | ~np.isfinite(error)] = np.inf
+        return projected, depth, error
+
+
+def _group(
+    starts: NDArray[np.int64], sightings: Sightings, rows: NDArray[np.int64], views: Views
+) -> _Group:
+    """Some rows of the sightings; a track begins at each of `starts` among them."""
+    view = sightings.view[rows]
+    pose = np.ascontiguousarray(views.cam_from_world.transpose(1, 2, 0))
+    return _Group(
+        starts=starts,
+        track=np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows)))),
+        view=view,
+        rays=np.ascontiguousarray(sightings.rays[rows].T),
+        weight=1.0 / (_SIGMA_FLOOR**2 + sightings.sigma[rows].astype(np.float64) ** 2),
+        pose=pose[:, :, view],
+        focal=np.ascontiguousarray(views.focal.T)[:, view],
+        views=views,
+    )
 
 
 def _solve(
@@ -272,59 +313,84 @@ def _solve(
     """Points of the tracks; which observations agree, their errors; which tracks do."""
     limit = options.max_reprojection_error**2
     xyz = np.zeros((len(group.starts), 3))
-    best = np.full(len(xyz), np.inf)
+    cost = np.full(len(xyz), np.inf)
     for one, two in _GUESSES:
         guess = _midpoint(group, one, two)
-        cost = np.add.reduceat(np.minimum(group.project(guess)[1], limit), group.starts)
-        better = cost < best
-        xyz[better], best[better] = guess[better], cost[better]
+        now = np.add.reduceat(np.minimum(group.project(guess)[2], limit), group.starts)
+        better = now < cost
+        xyz[better], cost[better] = guess[better], now[better]
 
+    moving, part = np.arange(len(xyz)), group
     for _ in range(_ITERATIONS):
-        in_camera, error = group.project(xyz)
-        kept = error <= limit
-        weight = np.where(kept, group.weight / (1.0 + error / _SOFT_ERROR**2), 0.0)
-        depth = np.where(kept, in_camera[:, 2], 1.0)
-        in_camera = np.where(kept[:, None], in_camera, 0.0)
-        projected = in_camera[:, :2] / depth[:, None]
-        residual = np.where(kept[:, None], (projected - group.rays) * group.focal, 0.0)
-        # Derivative of the projection with respect to the point in the world.
-        jacobian = group.rotation[:, :2] - projected[:, :, None] * group.rotation[:, 2:3]
-        jacobian *= (group.focal / depth[:, None])[:, :, None]
-        weighted = jacobian * weight[:, None, None]
-        normal = np.add.reduceat(np.einsum("nki,nkj->nij", weighted, jacobian), group.starts)
-        gradient = np.add.reduceat(np.einsum("nki,nk->ni", weighted, residual), group.starts)
-        trace = np.trace(normal, axis1=1, axis2=2)
-        solvable = np.isfinite(trace) & (np.linalg.det(normal) > _SINGULAR * trace**3)
-        step = np.zeros_like(xyz)
-        step[solvable] = np.linalg.solve(normal[solvable], gradient[solvable, :, None])[..., 0]
-        moved = xyz - step
+        moved = xyz[moving] - _step(part, xyz[moving], limit)
+        then = np.add.reduceat(np.minimum(part.project(moved)[2], limit), part.starts)
         # A step that makes things worse is not taken.
-        now = np.add.reduceat(np.minimum(error, limit), group.starts)
-        then = np.add.reduceat(np.minimum(group.project(moved)[1], limit), group.starts)
-        better = then < now
-        xyz[better] = moved[better]
-        if not better.any():
+        better = then < cost[moving]
+        going_on = then < _CONVERGED * cost[moving]
+        xyz[moving[better]], cost[moving[better]] = moved[better], then[better]
+        moving, part = moving[going_on], part.part(going_on)
+        if len(moving) == 0:
             break
-    error = group.project(xyz)[1]
+    error = group.project(xyz)[2]
     kept = error <= limit
     agrees = np.add.reduceat(kept.astype(np.int64), group.starts) >= options.min_observations
     return xyz, kept, np.sqrt(np.where(kept, error, 0.0)), agrees
 
 
+def _step(group: _Group, xyz: _Floats, limit: float) -> _Floats:
+    """Gauss-Newton steps of the points, float64 [num_tracks, 3]; zero where there is none."""
+    projected, depth, error = group.project(xyz)
+    kept = error <= limit
+    weight = np.where(kept, group.weight / (1.0 + np.where(kept, error, 0.0) / _SOFT_ERROR**2), 0.0)
+    projected = np.where(kept, projected, 0.0)
+    scale = group.focal / np.where(kept, depth, 1.0)
+    residual = (projected - group.rays) * group.focal
+    # Derivative of the projection with respect to the point in the world: [2][3] arrays.
+    jacobian = [
+        [scale[k] * (group.pose[k, i] - projected[k] * group.pose[2, i]) for i in range(3)]
+        for k in range(2)
+    ]
+    weighted = [[weight * j for j in row] for row in jacobian]
+    normal = np.empty((len(xyz), 3, 3))
+    gradient = np.empty((len(xyz), 3))
+    for i in range(3):
+        gradient[:, i] = np.add.reduceat(
+            weighted[0][i] * residual[0] + weighted[1][i] * residual[1], group.starts
+        )
+        for j in range(i, 3):
+            entry = weighted[0][i] * jacobian[0][j] + weighted[1][i] * jacobian[1][j]
+            normal[:, i, j] = normal[:, j, i] = np.add.reduceat(entry, group.starts)
+    trace = np.trace(normal, axis1=1, axis2=2)
+    solvable = np.isfinite(trace) & (np.linalg.det(normal) > _SINGULAR * trace**3)
+    step = np.zeros_like(xyz)
+    step[solvable] = np.linalg.solve(normal[solvable], gradient[solvable, :, None])[..., 0]
+    return step
+
+
 def _midpoint(group: _Group, one: float, two: float) -> _Floats:
     """The point midway between two rays of each track, where they come closest."""
-    last = group.lengths - 1
+    last = np.bincount(group.track, minlength=len(group.starts)) - 1
     a = group.starts + np.floor(one * last).astype(np.int64)
     b = group.starts + np.ceil(two * last).astype(np.int64)
-    da, db = group.direction[a], group.direction[b]
-    between = group.centre[b] - group.centre[a]
+    da, db = _directions(group, a), _directions(group, b)
+    centre = group.views.centres()
+    ca, cb = centre[group.view[a]], centre[group.view[b]]
+    between = cb - ca
     cosine = np.einsum("ni,ni->n", da, db)
     along_a = np.einsum("ni,ni->n", da, between)
     along_b = np.einsum("ni,ni->n", db, between)
     sine2 = np.maximum(1.0 - cosine**2, _SINGULAR)
-    on_a = group.centre[a] + da * ((along_a - cosine * along_b) / sine2)[:, None]
-    on_b = group.centre[b] + db * ((cosine * along_a - along_b) / sine2)[:, None]
+    on_a = ca + da * ((along_a - cosine * along_b) / sine2)[:, None]
+    on_b = cb + db * ((cosine * along_a - along_b) / sine2)[:, None]
     return np.asarray((on_a + on_b) / 2)
+
+
+def _directions(group: _Group, rows: NDArray[np.int64]) -> _Floats:
+    """Unit vectors of some rays in the world, float64 [n, 3]."""
+    rays = np.column_stack([group.rays[:, rows].T, np.ones(len(rows))])
+    rotation = group.views.cam_from_world[group.view[rows], :, :3]
+    direction = np.einsum("nji,nj->ni", rotation, rays)
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
 def _wide_enough(
@@ -334,15 +400,16 @@ def _wide_enough(
 
     Measured against the first and the last of them, so at most a little less than the widest.
     """
-    ray = xyz[group.track] - group.centre
-    norm = np.linalg.norm(ray, axis=1, keepdims=True)
-    ray = ray / np.where(norm > 0, norm, 1.0)
+    ray = np.ascontiguousarray((xyz[group.track] - group.views.centres()[group.view]).T)
+    norm = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+    ray /= np.where(norm > 0, norm, 1.0)
     index = np.arange(len(kept))
     first = np.minimum.reduceat(np.where(kept, index, len(kept) - 1), group.starts)
     last = np.maximum.reduceat(np.where(kept, index, 0), group.starts)
     narrowest = np.ones(len(xyz))
     for end in (first, last):
-        cosine = np.einsum("ni,ni->n", ray, ray[end][group.track])
+        x, y, z = ray[:, end][:, group.track]
+        cosine = ray[0] * x + ray[1] * y + ray[2] * z
         narrowest = np.minimum(
             narrowest, np.minimum.reduceat(np.where(kept, cosine, 1.0), group.starts)
         )
