@@ -2,6 +2,7 @@
 #pragma once
 
 #include <array>
+#include <bit>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -17,7 +18,9 @@ namespace colmap_av1::av1 {
 struct Mv {
   std::int16_t row = 0;
   std::int16_t col = 0;
-  friend bool operator==(const Mv&, const Mv&) = default;
+  friend bool operator==(Mv a, Mv b) {  // one comparison
+    return std::bit_cast<std::uint32_t>(a) == std::bit_cast<std::uint32_t>(b);
+  }
 };
 
 constexpr std::uint8_t kAbsent = 255;  // a syntax element that a block does not have

@@ -168,11 +168,20 @@ void TileParser::scan_point(int delta_row, int delta_col, bool is_compound) {
 // 7.10.2.5 Temporal scan process
 void TileParser::temporal_scan(bool is_compound) {
   temporal_index_ = -1;
+  const auto entries = [&](int row) {
+    return frame_->motion_field.data() +
+           static_cast<std::ptrdiff_t>(row >> 1) * (header_->mi_cols >> 1);
+  };
   const int step_w4 = bw4_ >= 16 ? 4 : 2;
   const int step_h4 = bh4_ >= 16 ? 4 : 2;
-  for (int delta_row = 0; delta_row < std::min(bh4_, 16); delta_row += step_h4) {
-    for (int delta_col = 0; delta_col < std::min(bw4_, 16); delta_col += step_w4) {
-      temporal_sample(delta_row, delta_col, is_compound);
+  const int end_row = std::min(b_->mi_row + std::min(bh4_, 16), mi_row_end_);
+  const int end_col = std::min(b_->mi_col + std::min(bw4_, 16), mi_col_end_);
+  zero_mv_context_ = 1;
+  for (int row = b_->mi_row; row < end_row; row += step_h4) {
+    const MotionFieldEntry* row_entries = entries(row);
+    for (int col = b_->mi_col; col < end_col; col += step_w4) {
+      const bool first = row == b_->mi_row && col == b_->mi_col;
+      temporal_sample(row_entries[col >> 1], first, is_compound);
     }
   }
   const bool allow_extension = bh4_ >= 2 && bh4_ < 16 && bw4_ >= 2 && bw4_ < 16;
@@ -181,26 +190,21 @@ void TileParser::temporal_scan(bool is_compound) {
   for (const auto& [delta_row, delta_col] : positions) {
     const int row = (b_->mi_row & 15) + delta_row;  // check_sb_border( )
     const int col = (b_->mi_col & 15) + delta_col;
-    if (row >= 0 && row < 16 && col >= 0 && col < 16) {
-      temporal_sample(delta_row, delta_col, is_compound);
+    if (row < 0 || row >= 16 || col < 0 || col >= 16) continue;
+    const int mi_row = b_->mi_row + delta_row;
+    const int mi_col = b_->mi_col + delta_col;
+    if (is_inside(mi_row, mi_col)) {
+      temporal_sample(entries(mi_row)[mi_col >> 1], false, is_compound);
     }
   }
 }
 
-// 7.10.2.6 Temporal sample process
-void TileParser::temporal_sample(int delta_row, int delta_col, bool is_compound) {
-  const int row = (b_->mi_row + delta_row) | 1;
-  const int col = (b_->mi_col + delta_col) | 1;
-  if (!is_inside(row, col)) return;
-  const bool first = delta_row == 0 && delta_col == 0;
-  if (first) zero_mv_context_ = 1;
-  const MotionFieldEntry& entry =
-      frame_->motion_field[static_cast<std::size_t>(row >> 1) *
-                               static_cast<std::size_t>(header_->mi_cols >> 1) +
-                           static_cast<std::size_t>(col >> 1)];
+// 7.10.2.6 Temporal sample process, of the sample for a unit in the tile. Tiles end at even units,
+// so the odd one that is asked for is in the tile as well.
+void TileParser::temporal_sample(const MotionFieldEntry& entry, bool first, bool is_compound) {
   if (entry.ref_offset == 0) return;
   // Neighbours often hold the same motion: it projects to the same vectors.
-  if (temporal_index_ >= 0 && !first && entry == temporal_entry_) {
+  if (temporal_index_ >= 0 && entry == temporal_entry_) {
     stack_[temporal_index_].weight += 2;
     return;
   }

@@ -94,7 +94,7 @@ class TileParser {
   void scan_col(int delta_col, bool is_compound);
   void scan_point(int delta_row, int delta_col, bool is_compound);
   void temporal_scan(bool is_compound);
-  void temporal_sample(int delta_row, int delta_col, bool is_compound);
+  void temporal_sample(const MotionFieldEntry& entry, bool first, bool is_compound);
   void add_ref_mv_candidate(const BlockInfo& candidate, bool is_compound, int weight);
   // Returns the entry's index, -1 where the stack is full.
   int add_to_stack(Mv mv0, Mv mv1, bool is_compound, int weight);
