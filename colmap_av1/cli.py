@@ -23,6 +23,7 @@ from rich.progress import Progress as ProgressBars
 from rich.table import Table
 
 from colmap_av1.check import CheckReport, check
+from colmap_av1.compare import compare
 from colmap_av1.encode import encode
 from colmap_av1.errors import ColmapAv1Error, OptionError
 from colmap_av1.export import export_hloc
@@ -32,11 +33,13 @@ from colmap_av1.match import MatchReport, match
 from colmap_av1.motion_file import export_motion
 from colmap_av1.options import (
     CameraOptions,
+    CompareOptions,
     DensifyOptions,
     DensityOptions,
     EncodeOptions,
     ExportOptions,
     ImageOptions,
+    LearnedOptions,
     MapperOptions,
     MatchOptions,
     PairOptions,
@@ -222,6 +225,48 @@ def _make_parser() -> argparse.ArgumentParser:
     for kind in (MapperOptions, CameraOptions, PairOptions):
         del stages[kind]
     _add_options(command, stages, without=("on_existing",))
+    _add_quiet(command)
+
+    command = _add_command(
+        commands, "compare", _run_compare, "compare with SIFT and others on a video, with a report"
+    )
+    _add_video(command, "a video; one that is not AV1 is converted first")
+    command.add_argument(
+        "--output",
+        "--output_path",
+        required=True,
+        metavar="PATH",
+        help="folder for the report; that of an earlier run is gone on with",
+    )
+    command.add_argument(
+        "--image_path",
+        metavar="PATH",
+        help="folder of images that exist or are to be written [within the output]",
+    )
+    command.add_argument(
+        "--reference",
+        metavar="PATH",
+        help="given truth: a COLMAP model, or a file with lines of 'name tx ty tz qx qy qz qw', "
+        "camera to world [the model of sift-exhaustive]",
+    )
+    _add_options(
+        command,
+        {
+            CompareOptions: "comparison",
+            LearnedOptions: "learned features",
+            TriangulateOptions: "points of all tracks",
+            ImageOptions: "images",
+            MatchOptions: "stream",
+            CameraOptions: "camera",
+            TrackOptions: "tracks",
+            RefineOptions: "refinement",
+            PairOptions: "pairs",
+            VerifyOptions: "two-view geometry",
+            ReadOptions: "bitstream",
+            EncodeOptions: "encoding of a video that is not AV1",
+        },
+        without=("on_existing", "refine", "single_camera"),
+    )
     _add_quiet(command)
 
     command = _add_command(commands, "encode", _run_encode, "convert a video to a good AV1 stream")
@@ -531,6 +576,42 @@ def _run_densify(namespace: argparse.Namespace) -> None:
             ("reprojection error", f"{result.mean_error:.3f} px"),
         ]
         _print_summary([*rows, *_seconds_rows(result.seconds)])
+
+
+def _run_compare(namespace: argparse.Namespace) -> None:
+    options = _given(
+        namespace,
+        CompareOptions,
+        match=_match_options(namespace),
+        learned=_given(namespace, LearnedOptions),
+        triangulate=_given(namespace, TriangulateOptions),
+    )
+    with _progress(namespace.quiet) as report:
+        result = compare(
+            namespace.video,
+            namespace.output,
+            image_path=namespace.image_path,
+            reference=namespace.reference,
+            options=options,
+            progress=report,
+        )
+    for column in result.columns:
+        if column.error:
+            _print_warning(f"{column.name}: {column.error}")
+    for warning in result.warnings:
+        _print_warning(warning)
+    if not namespace.quiet:
+        rows = []
+        for column in result.columns:
+            told = "no model"
+            if column.model is not None:
+                told = (
+                    f"{column.model.num_registered} of {result.num_images} images, "
+                    f"{column.model.num_points} points, {column.model.mean_error:.3f} px, "
+                    f"{sum(column.cpu_seconds.values()):.1f} s of CPU time"
+                )
+            rows.append((column.name, told))
+        _print_summary([*rows, ("report", str(result.output / "report.html"))])
 
 
 def _seconds_rows(seconds: dict[str, float]) -> _Rows:

@@ -246,6 +246,18 @@ class DensifyOptions:
 
 
 @dataclass(frozen=True)
+class LearnedOptions:
+    """How learned features are found and matched for a comparison."""
+
+    # keypoints of an image at most
+    max_keypoints: int = 2048
+    # images are scaled down to this many pixels along the longer side
+    max_image_size: int = 1024
+    # images after each that it is matched with; none: all, up to 30 images, else 4
+    neighbours: int | None = None
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """What is written of a database for other programs."""
 
@@ -253,6 +265,21 @@ class ExportOptions:
     format: Literal["hloc"] = "hloc"
     # only matches that agree with their pair's two-view geometry
     verified: bool = True
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Everything `compare` can be told; of `match`, all but the density and rows applies."""
+
+    match: MatchOptions = MatchOptions()
+    learned: LearnedOptions = LearnedOptions()
+    triangulate: TriangulateOptions = TriangulateOptions()
+    # what is compared, in this order: av1, av1-sparse, av1-dense, the same as av1-refined...,
+    # sift-exhaustive, sift-sequential, disk-lightglue, aliked-lightglue, and what other programs
+    # wrote in hloc's layout as NAME=FEATURES.h5:MATCHES.h5
+    frontends: tuple[str, ...] = ("av1", "av1-refined", "sift-exhaustive", "sift-sequential")
+    # beside each of this package's models one of all its tracks on the same poses
+    all_tracks: bool = True
 
 
 @dataclass(frozen=True)

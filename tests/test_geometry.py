@@ -220,6 +220,8 @@ def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
     assert exact.num_poses == 60
     assert exact.ate < 1e-9
     assert exact.max_rotation < 1e-5
+    assert exact.relative_translation < 1e-9
+    assert exact.relative_rotation < 1e-5
 
     # One camera 0.3 m off, one turned by 2 degrees, one missing.
     off = truth.copy()
@@ -232,6 +234,9 @@ def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
     assert errors.ate == pytest.approx(0.3 / np.sqrt(59), rel=0.1)
     assert errors.max_rotation == pytest.approx(2, rel=0.05)
     assert errors.rotation < 0.05
+    # Both motions that meet in the turned camera are wrong; 58 lead from a pose to the next.
+    assert errors.relative_rotation == pytest.approx(2 * np.sqrt(2 / 58), rel=0.01)
+    assert errors.relative_translation == pytest.approx(0.3 * np.sqrt(2 / 58), rel=0.3)
     centres = -np.einsum("nij,ni->nj", truth[:, :, :3], truth[:, :, 3])
     assert errors.extent == pytest.approx(np.linalg.norm(np.ptp(centres, axis=0)), rel=0.01)
 

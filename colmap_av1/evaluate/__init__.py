@@ -1,18 +1,19 @@
 """What tracks, models and front-ends are worth: one module for each family of metrics."""
 
 from colmap_av1.evaluate.database_tracks import database_tracks
+from colmap_av1.evaluate.footage import Footage, choose_footage, prepare_footage
 from colmap_av1.evaluate.frontends import (
     FRONTENDS,
-    Footage,
     Frontend,
     FrontendRun,
-    prepare_footage,
+    make_frontends,
     run_frontend,
 )
 from colmap_av1.evaluate.mapping import (
     MapperRun,
     MapperSettings,
     ModelFigures,
+    densify_model,
     map_database,
     model_figures,
     triangulate_database,
@@ -43,9 +44,12 @@ __all__ = [
     "PoseErrors",
     "Sequence",
     "TrackStatistics",
+    "choose_footage",
     "database_tracks",
+    "densify_model",
     "epipolar_errors",
     "exact_errors",
+    "make_frontends",
     "map_database",
     "model_figures",
     "model_poses",

@@ -1,12 +1,11 @@
-"""Distances between point clouds, after the similarity that brings their cameras together."""
+"""Distances between point clouds in the same coordinates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import pycolmap
+import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
@@ -61,38 +60,7 @@ def cloud_distances(
     )
 
 
-def aligned_points(model: Any, reference: Any) -> NDArray[np.float64] | None:
-    """Points of a model, moved by the similarity that fits its camera centres to another's.
-
-    Args:
-        model: pycolmap.Reconstruction.
-        reference: the other; images with the same name are the same.
-
-    Returns:
-        float64 [n, 3] in the reference's coordinates; None where fewer than three images are
-        in both, or where their centres determine no similarity.
-    """
-    centres, wanted = _centres(model), _centres(reference)
-    shared = sorted(centres.keys() & wanted.keys())
-    if len(shared) < 3:
-        return None
-    similarity = pycolmap.estimate_sim3d(
-        np.array([centres[name] for name in shared]), np.array([wanted[name] for name in shared])
-    )
-    if similarity is None:
-        return None
-    turn = np.asarray(similarity.rotation.matrix())
-    return np.asarray(
-        similarity.scale * model_points(model) @ turn.T + np.asarray(similarity.translation)
-    )
-
-
 def model_points(model: Any) -> NDArray[np.float64]:
     """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)
-
-
-def _centres(model: Any) -> dict[str, NDArray[np.float64]]:
-    images = (model.images[i] for i in model.reg_image_ids())
-    return {image.name: np.asarray(image.projection_center()) for image in images}

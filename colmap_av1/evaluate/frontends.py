@@ -9,48 +9,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
-from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.database import make_camera, write_matches
+from colmap_av1.errors import EvaluationError, HlocError, OptionError
+from colmap_av1.evaluate.footage import Footage, frame_list
+from colmap_av1.evaluate.learned import PROGRAM, extract_and_match
 from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
-from colmap_av1.images import image_names, write_images
+from colmap_av1.export import HlocMatches, read_hloc
 from colmap_av1.match import match
 from colmap_av1.options import (
-    CameraOptions,
-    DensityOptions,
     ImageOptions,
+    LearnedOptions,
     MatchOptions,
-    RefineOptions,
 )
+from colmap_av1.pairs import ImageKeypoints
 from colmap_av1.progress import Clock
 
 Preset = Literal["sparse", "default", "dense"]
-
-
-@dataclass(frozen=True)
-class Footage:
-    """What every front-end is given.
-
-    Attributes:
-        video: an AV1 video.
-        image_path: folder that holds the images, decoded from the video or what it was made of.
-        frames: the video's frames that are images, every `image_step`-th.
-        image_step: distance between the frames that are images.
-        camera: the camera of all images.
-    """
-
-    video: Path
-    image_path: Path
-    frames: tuple[int, ...]
-    image_step: int
-    camera: CameraOptions
-
-    @property
-    def names(self) -> list[str]:
-        """The images' file names, in display order."""
-        return image_names(ImageOptions().image_name, self.frames)
 
 
 @dataclass(frozen=True)
@@ -86,54 +64,31 @@ class Frontend:
     depends_on: Callable[[Footage], tuple[str, ...]]
 
 
-def prepare_footage(
-    video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
-) -> Footage:
-    """Write the video's frames as the images that every front-end gets.
-
-    Args:
-        video: an AV1 video.
-        folder: gets `images/`; what is there of the same video is kept.
-        num_frames: number of frames of the video.
-        image_step: distance between the frames that are images.
-        camera: the camera of all images.
-
-    Raises:
-        VideoError: the video cannot be read.
-        ImageError: the video has fewer frames.
-    """
-    frames = tuple(range(0, num_frames, image_step))
-    footage = Footage(video, folder / "images", frames, image_step, camera)
-
-    def work() -> dict[str, Any]:
-        footage.image_path.mkdir()
-        write_images(video, footage.image_path, footage.names, frames)
-        return {}
-
-    kept(folder, (content_of(video), frames), work)
-    return footage
-
-
-def run_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
+def run_frontend(
+    name: str, footage: Footage, folder: Path, frontend: Frontend | None = None
+) -> FrontendRun:
     """Fill a database and measure what it takes; a finished run is not repeated.
 
     Args:
-        name: one of FRONTENDS.
+        name: one of FRONTENDS, or the name of `frontend`.
         footage: video and images.
         folder: gets `database.db`, `log.txt` and the figures.
+        frontend: the front-end, where it is none of FRONTENDS.
 
     Raises:
         OptionError: there is no such front-end.
         ColmapAv1Error: the front-end refuses the footage.
         EvaluationError: it failed.
     """
-    if name not in FRONTENDS:
-        raise OptionError(f"front-end '{name}': give one of {', '.join(FRONTENDS)}")
-    frontend = FRONTENDS[name]
+    if frontend is None:
+        if name not in FRONTENDS:
+            raise OptionError(f"front-end '{name}': give one of {', '.join(FRONTENDS)}")
+        frontend = FRONTENDS[name]
+    run = frontend.run
     database = folder / "database.db"
 
     def work() -> dict[str, Any]:
-        measured = run_measured(frontend.run, footage, database, log=folder / "log.txt")
+        measured = run_measured(run, footage, database, log=folder / "log.txt")
         return {
             "seconds": measured.result,
             "cpu_seconds": measured.cpu_seconds,
@@ -148,13 +103,24 @@ def run_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
 
 
 def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
-    options = replace(options, camera=footage.camera, images=ImageOptions(every=footage.image_step))
+    # The images exist: a database that lists them says so.
+    nothing = (np.empty((0, 2), np.float32), np.empty(0, np.int64))
+    write_matches(
+        database,
+        footage.names,
+        make_camera(footage.camera, *footage.size, footage.pixel_aspect),
+        [ImageKeypoints(frame, *nothing) for frame in footage.frames],
+        pairs=np.empty((0, 2), np.int32),
+        matches=(),
+        geometries=(),
+    )
+    images = ImageOptions(frame_list=frame_list(footage, database.with_name("frames.txt")))
+    options = replace(options, camera=footage.camera, images=images, on_existing="error")
     return match(database, footage.video, options=options).seconds
 
 
-def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> dict[str, float]:
-    clock = Clock()
-    pycolmap.set_random_seed(0)
+def _list_images(footage: Footage, database: Path) -> None:
+    """Make a database of the images, as COLMAP does."""
     reader = pycolmap.ImageReaderOptions()
     if footage.camera.camera_model is not None:
         reader.camera_model = footage.camera.camera_model
@@ -165,6 +131,12 @@ def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> 
     pycolmap.import_images(
         database, footage.image_path, mode, image_names=footage.names, options=reader
     )
+
+
+def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> dict[str, float]:
+    clock = Clock()
+    pycolmap.set_random_seed(0)
+    _list_images(footage, database)
     with clock.measure("extraction"):
         pycolmap.extract_features(database, footage.image_path, footage.names)
     with clock.measure("matching"):
@@ -172,16 +144,92 @@ def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> 
     return clock.seconds
 
 
-def _own_frontend(refine: Literal["none", "lk"], preset: Preset) -> Frontend:
-    options = MatchOptions(
-        refine=RefineOptions(refine=refine), density=DensityOptions(preset=preset)
+def _learned(
+    features: str, options: LearnedOptions, footage: Footage, database: Path
+) -> dict[str, float]:
+    files = database.with_name("features.h5"), database.with_name("matches.h5")
+    seconds = extract_and_match(features, footage.image_path, footage.names, files, options)
+    return {**seconds, **_import(*files, footage, database)}
+
+
+def _import(features: Path, matches: Path, footage: Footage, database: Path) -> dict[str, float]:
+    clock = Clock()
+    pycolmap.set_random_seed(0)
+    with clock.measure("import"):
+        found = read_hloc(features, matches)
+        missing = next((name for name in footage.names if name not in found.names), None)
+        if missing is not None:
+            raise HlocError(
+                f"{features}: lacks image '{missing}': extract the features of the images in "
+                f"{footage.image_path}"
+            )
+        _list_images(footage, database)
+        pairs = _write_hloc(found, set(footage.names), database)
+    with clock.measure("verification"):
+        listing = database.with_name("pairs.txt")
+        listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        pycolmap.verify_matches(database, listing)
+    return clock.seconds
+
+
+def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> list[tuple[str, str]]:
+    """Write keypoints and matches of some images; returns the pairs."""
+    pairs = []
+    with pycolmap.Database.open(database) as rows:
+        ids = {image.name: image.image_id for image in rows.read_all_images()}
+        for name, xy in zip(found.names, found.keypoints, strict=True):
+            if name in names:
+                rows.write_keypoints(ids[name], xy)
+        for (i, j), between in zip(found.pairs, found.matches, strict=True):
+            pair = found.names[i], found.names[j]
+            if names.issuperset(pair):
+                rows.write_matches(ids[pair[0]], ids[pair[1]], between)
+                pairs.append(pair)
+    return pairs
+
+
+def own_frontend(
+    refine: Literal["none", "lk"], preset: Preset, options: MatchOptions | None = None
+) -> Frontend:
+    """This package's `match`, with the given refinement and preset in some options."""
+    options = options if options is not None else MatchOptions()
+    given = replace(
+        options,
+        refine=replace(options.refine, refine=refine),
+        density=replace(options.density, preset=preset),
     )
-    return Frontend(partial(_match, options), lambda _: (repr(options), own_code()))
+    return Frontend(partial(_match, given), lambda _: (repr(given), own_code()))
 
 
 def _sift_frontend(pairing: Callable[[Path], None]) -> Frontend:
     return Frontend(
         partial(_sift, pairing), lambda footage: (pycolmap.__version__, _content_of_images(footage))
+    )
+
+
+def learned_frontend(features: str, options: LearnedOptions | None = None) -> Frontend:
+    """Learned features and LightGlue, see `learned`."""
+    given = options if options is not None else LearnedOptions()
+    return Frontend(
+        partial(_learned, features, given),
+        lambda footage: (
+            repr(given),
+            content_of(PROGRAM),
+            pycolmap.__version__,
+            _content_of_images(footage),
+        ),
+    )
+
+
+def imported_frontend(features: Path, matches: Path) -> Frontend:
+    """What other programs wrote in hloc's layout, verified by COLMAP."""
+    return Frontend(
+        partial(_import, features, matches),
+        lambda footage: (
+            *(content_of(path) if path.is_file() else None for path in (features, matches)),
+            pycolmap.__version__,
+            _content_of_images(footage),
+        ),
     )
 
 
@@ -198,14 +246,28 @@ def _pair_exhaustively(database: Path) -> None:
     pycolmap.match_exhaustive(database)
 
 
-FRONTENDS: dict[str, Frontend] = {
-    # What a mapper gets from the bitstream alone; with `-refined` after a look at the pictures.
-    "av1": _own_frontend("none", "default"),
-    "av1-sparse": _own_frontend("none", "sparse"),
-    "av1-dense": _own_frontend("none", "dense"),
-    "av1-refined": _own_frontend("lk", "default"),
-    "av1-refined-sparse": _own_frontend("lk", "sparse"),
-    "av1-refined-dense": _own_frontend("lk", "dense"),
-    "sift-sequential": _sift_frontend(_pair_sequentially),
-    "sift-exhaustive": _sift_frontend(_pair_exhaustively),
-}
+def make_frontends(
+    match: MatchOptions | None = None, learned: LearnedOptions | None = None
+) -> dict[str, Frontend]:
+    """All front-ends by their names.
+
+    Args:
+        match: options of this package's; refinement and preset are those of the name.
+        learned: options of the learned ones.
+    """
+    return {
+        # What a mapper gets from the bitstream alone; `-refined` after a look at the pictures.
+        "av1": own_frontend("none", "default", match),
+        "av1-sparse": own_frontend("none", "sparse", match),
+        "av1-dense": own_frontend("none", "dense", match),
+        "av1-refined": own_frontend("lk", "default", match),
+        "av1-refined-sparse": own_frontend("lk", "sparse", match),
+        "av1-refined-dense": own_frontend("lk", "dense", match),
+        "sift-sequential": _sift_frontend(_pair_sequentially),
+        "sift-exhaustive": _sift_frontend(_pair_exhaustively),
+        "disk-lightglue": learned_frontend("disk", learned),
+        "aliked-lightglue": learned_frontend("aliked", learned),
+    }
+
+
+FRONTENDS = make_frontends()

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
+from colmap_av1.evaluate.footage import Footage, frame_list
 from colmap_av1.evaluate.measure import run_measured
-from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.model import read_model
+from colmap_av1.options import DensifyOptions, ImageOptions
+from colmap_av1.reconstruct import densify
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,44 @@ def triangulate_database(
     return MapperRun(output, **kept(folder, (inputs, seed, pycolmap.__version__), work))
 
 
+def densify_model(
+    model: Path, footage: Footage, folder: Path, options: DensifyOptions | None = None
+) -> MapperRun:
+    """Triangulate every track of the video on the poses of a model, as `densify` does.
+
+    A finished run is not repeated.
+
+    Args:
+        model: folder of the model.
+        footage: video and images.
+        folder: gets the model, `log.txt` and the figures.
+        options: as of `densify`; the images are those of the footage.
+
+    Raises:
+        ColmapAv1Error: as `densify` says.
+    """
+    options = options if options is not None else DensifyOptions()
+    output = folder / "model"
+
+    def work() -> dict[str, Any]:
+        registered = {image.name for image in read_model(model).images.values() if image.has_pose}
+        images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt", registered))
+        given = replace(options, match=replace(options.match, images=images))
+        measured = run_measured(
+            _densify, model, footage.video, output, given, log=folder / "log.txt"
+        )
+        return {
+            "num_models": 1,
+            "seconds": measured.seconds,
+            "cpu_seconds": measured.cpu_seconds,
+            "peak_memory": measured.peak_memory,
+        }
+
+    inputs = [content_of(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
+    key = (inputs, footage.names, footage.frames, repr(options), own_code())
+    return MapperRun(output, **kept(folder, key, work))
+
+
 def model_figures(model: Any) -> ModelFigures:
     """Figures of a pycolmap.Reconstruction, or of the model in a folder.
 
@@ -175,6 +216,10 @@ def _map(database: Path, image_path: Path, output: Path, settings: MapperSetting
         # The mapper may leave a bogus model of two images beside the real one.
         max(models.values(), key=lambda m: m.num_reg_images()).write(output)
     return len(models)
+
+
+def _densify(model: Path, video: Path, output: Path, options: DensifyOptions) -> None:
+    densify(model, video, output, options=options)
 
 
 def _triangulate(database: Path, model: Path, image_path: Path, output: Path, seed: int) -> int:

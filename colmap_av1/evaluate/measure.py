@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -26,8 +28,8 @@ class Measured(Generic[_Result]):
         result: what it returned.
         seconds: wall time.
         cpu_seconds: CPU time of all its threads and of the processes it waited for.
-        peak_memory: largest resident memory of its process in bytes, the interpreter and its
-            libraries included; None where the system does not tell.
+        peak_memory: largest resident memory of its process, or of one it waited for, in bytes,
+            the interpreter and its libraries included; None where the system does not tell.
     """
 
     result: _Result
@@ -59,7 +61,7 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
     except EOFError:
         outcome = None
     except BaseException:
-        process.terminate()
+        _end(process)
         raise
     finally:
         process.join()
@@ -72,9 +74,19 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
     return outcome
 
 
+def _end(process: BaseProcess) -> None:
+    """End a process, and those it started."""
+    if hasattr(os, "killpg") and process.pid is not None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGTERM)
+    process.terminate()
+
+
 def _call(
     sender: Connection, log: Path, function: Callable[..., Any], args: tuple[Any, ...]
 ) -> None:
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)
     with log.open("ab") as file:
         # Libraries write to the descriptors, not to sys.stdout and sys.stderr.
         os.dup2(file.fileno(), 1)
@@ -105,9 +117,17 @@ def _peak_memory() -> int | None:
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+                # A process it waited for counts from this one's size at its start, not below.
+                return max(int(line.split()[1]), _peak_of_children()) * 1024
     if sys.platform == "darwin":
         import resource  # noqa: PLC0415 - there is none on Windows
 
-        return int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        own = int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        return max(own, _peak_of_children())
     return None
+
+
+def _peak_of_children() -> int:
+    import resource  # noqa: PLC0415 - there is none on Windows
+
+    return int(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,10 @@ class PoseErrors:
         rotation: median angle between estimated and true camera orientations, in degrees, under
             the one turn of the world that fits the orientations best.
         max_rotation: the largest of these angles.
+        relative_translation: relative pose error: RMS distance between estimated and true motion
+            from a pose to the next, in the truth's unit.
+        relative_rotation: RMS angle between estimated and true turn from a pose to the next, in
+            degrees.
     """
 
     num_poses: int
@@ -34,6 +39,61 @@ class PoseErrors:
     extent: float
     rotation: float
     max_rotation: float
+    relative_translation: float
+    relative_rotation: float
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A move to other coordinates, x' = scale * rotation x + translation.
+
+    Attributes:
+        scale: the scale.
+        rotation: float64 [3, 3].
+        translation: float64 [3].
+    """
+
+    scale: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def move(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [n, 3] in the other coordinates."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def move_poses(self, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses [n, 3, 4] of the same cameras in the other coordinates."""
+        rotation = cam_from_world[:, :, :3] @ self.rotation.T
+        centres = self.move(camera_centres(cam_from_world))
+        return np.dstack([rotation, -np.einsum("nij,nj->ni", rotation, centres)])
+
+
+def fit_similarity(
+    cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
+) -> Similarity | None:
+    """The similarity that fits the centres of poses best to those of others (Umeyama).
+
+    Args:
+        cam_from_world: float64 [n, 3, 4] poses, NaN where there is none.
+        truth: float64 [n, 3, 4] the others, NaN where unknown.
+
+    Returns:
+        What brings the first to the second; None where fewer than three poses are in both or
+        where their centres determine no similarity.
+
+    Raises:
+        ValueError: the two differ in their number of poses.
+    """
+    both = _in_both(cam_from_world, truth)
+    if both.sum() < 3:
+        return None
+    found = pycolmap.estimate_sim3d(
+        camera_centres(cam_from_world[both]), camera_centres(truth[both])
+    )
+    if found is None:
+        return None
+    turn = np.asarray(found.rotation.matrix())
+    return Similarity(float(found.scale), turn, np.asarray(found.translation))
 
 
 def pose_errors(
@@ -52,20 +112,14 @@ def pose_errors(
     Raises:
         ValueError: the two differ in their number of frames.
     """
-    if cam_from_world.shape != truth.shape:
-        raise ValueError(f"{len(cam_from_world)} estimated poses, {len(truth)} true ones")
-    both = np.isfinite(cam_from_world).all((1, 2)) & np.isfinite(truth).all((1, 2))
-    if both.sum() < 3:
-        return None
-    estimated, truth = cam_from_world[both], truth[both]
-    centres, true_centres = camera_centres(estimated), camera_centres(truth)
-    similarity = pycolmap.estimate_sim3d(centres, true_centres)
+    similarity = fit_similarity(cam_from_world, truth)
     if similarity is None:
         return None
-    turn = np.asarray(similarity.rotation.matrix())
-    aligned = similarity.scale * centres @ turn.T + np.asarray(similarity.translation)
-    distance = np.linalg.norm(aligned - true_centres, axis=1)
-    angle = _rotation_errors(estimated[:, :, :3], truth[:, :, :3])
+    both = _in_both(cam_from_world, truth)
+    aligned, true_centres = similarity.move_poses(cam_from_world[both]), camera_centres(truth[both])
+    distance = np.linalg.norm(camera_centres(aligned) - true_centres, axis=1)
+    angle = _rotation_errors(cam_from_world[both][:, :, :3], truth[both][:, :, :3])
+    relative = _relative_errors(aligned, truth[both])
     return PoseErrors(
         num_poses=int(both.sum()),
         ate=float(np.sqrt(np.mean(distance**2))),
@@ -73,6 +127,8 @@ def pose_errors(
         extent=float(np.linalg.norm(np.ptp(true_centres, axis=0))),
         rotation=float(np.median(angle)),
         max_rotation=float(angle.max()),
+        relative_translation=relative[0],
+        relative_rotation=relative[1],
     )
 
 
@@ -80,6 +136,21 @@ def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
     rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
+
+
+def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
+    """Poses of a model's images: float64 [n, 3, 4] cam_from_world, NaN without one.
+
+    Args:
+        model: pycolmap.Reconstruction.
+        names: names of the images.
+    """
+    found = {image.name: image for image in model.images.values() if image.has_pose}
+    cam_from_world = np.full((len(names), 3, 4), np.nan)
+    for i, name in enumerate(names):
+        if name in found:
+            cam_from_world[i] = found[name].cam_from_world().matrix()
+    return cam_from_world
 
 
 def model_poses(model: Any, num_frames: int) -> NDArray[np.float64]:
@@ -100,6 +171,29 @@ def model_poses(model: Any, num_frames: int) -> NDArray[np.float64]:
         if image.has_pose:
             cam_from_world[frame_number(image.name)] = image.cam_from_world().matrix()
     return cam_from_world
+
+
+def _in_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
+    if a.shape != b.shape:
+        raise ValueError(f"{len(a)} estimated poses, {len(b)} true ones")
+    return np.asarray(np.isfinite(a).all((1, 2)) & np.isfinite(b).all((1, 2)))
+
+
+def _relative_errors(
+    aligned: NDArray[np.float64], truth: NDArray[np.float64]
+) -> tuple[float, float]:
+    """RMS errors of the motion from each pose to the next: of the translation, of the turn."""
+    translation, turn = zip(*map(_motions, (aligned, truth)), strict=True)
+    distance = np.linalg.norm(translation[0] - translation[1], axis=1)
+    angle = np.degrees((turn[0] * turn[1].inv()).magnitude())
+    return float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(angle**2)))
+
+
+def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
+    """Translation, in the first camera's axes, and turn from each pose to the next."""
+    rotation, step = cam_from_world[:, :, :3], np.diff(camera_centres(cam_from_world), axis=0)
+    turn = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
+    return np.einsum("nij,nj->ni", rotation[:-1], step), turn
 
 
 def _rotation_errors(

@@ -24,8 +24,11 @@ def kept(folder: Path, key: Any, work: Callable[[], dict[str, Any]]) -> dict[str
     path = folder / "result.json"
     name = repr(key)
     if path.is_file():
-        before = json.loads(path.read_text())
-        if before["key"] == name:
+        try:
+            before = json.loads(path.read_text())
+        except ValueError:
+            before = {}
+        if before.get("key") == name:
             result: dict[str, Any] = before["result"]
             return result
     shutil.rmtree(folder, ignore_errors=True)

@@ -83,7 +83,7 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
         height=height,
         fps=float(about["fps"]),
         camera=camera,
-        cam_from_world=_read_poses(truth, int(about["frames"])) if truth.is_file() else None,
+        cam_from_world=read_poses(truth, int(about["frames"])) if truth.is_file() else None,
     )
 
 
@@ -99,16 +99,37 @@ def frame_number(name: str) -> int:
     return int(numbers[-1])
 
 
-def _read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
+def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
+    """Read true poses, one line a frame: `name tx ty tz qx qy qz qw`, see `read_sequence`.
+
+    Args:
+        path: the file.
+        num_frames: number of frames of the video.
+
+    Returns:
+        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a line.
+
+    Raises:
+        ImageError: the file cannot be read, or names a frame that the video lacks.
+    """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
-    for line in path.read_text().splitlines():
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageError(f"{path}: holds no poses that can be read: {error}") from error
+    for line in lines:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         frame = frame_number(words[0])
         if frame >= num_frames:
             raise ImageError(f"{path}: '{words[0]}' is none of the {num_frames} frames")
-        values = np.array(words[1:], dtype=np.float64)
-        rotation = Rotation.from_quat(values[3:]).as_matrix().T
+        try:
+            values = np.array(words[1:], dtype=np.float64)
+            rotation = Rotation.from_quat(values[3:7]).as_matrix().T
+        except ValueError as error:
+            raise ImageError(
+                f"{path}: '{line}' is no pose: give lines of 'name tx ty tz qx qy qz qw'"
+            ) from error
         cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
     return cam_from_world

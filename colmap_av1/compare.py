@@ -1,0 +1,324 @@
+"""The published comparison: front-ends on one video, their clouds, poses and costs, a report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ColmapAv1Error, EvaluationError, ModelError, OptionError
+from colmap_av1.evaluate.clouds import cloud_distances, model_points
+from colmap_av1.evaluate.footage import Footage, choose_footage
+from colmap_av1.evaluate.frontends import Frontend, imported_frontend, make_frontends, run_frontend
+from colmap_av1.evaluate.mapping import (
+    MapperSettings,
+    densify_model,
+    map_database,
+    model_figures,
+)
+from colmap_av1.evaluate.poses import fit_similarity, image_poses, pose_errors
+from colmap_av1.evaluate.results import Cloud, Column, CompareReport
+from colmap_av1.evaluate.sequence import read_poses
+from colmap_av1.model import read_model
+from colmap_av1.options import CompareOptions, DensifyOptions
+from colmap_av1.progress import Progress, no_progress
+from colmap_av1.stages import open_stages
+
+# Its cloud and its poses stand for the truth where none is given.
+PSEUDO_TRUTH = "sift-exhaustive"
+ALL_TRACKS = " + all tracks"
+_OWN = "av1"
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """What is measured against.
+
+    Attributes:
+        poses: float64 [num_images, 3, 4], NaN where unknown; None where all are.
+        points: float64 [n, 3] in the same coordinates; None without a cloud.
+        pose_source: whose poses these are.
+        cloud_source: whose points these are.
+        is_truth: the poses are a given truth.
+    """
+
+    poses: NDArray[np.float64] | None = None
+    points: NDArray[np.float64] | None = None
+    pose_source: str = ""
+    cloud_source: str = ""
+    is_truth: bool = False
+
+
+def compare(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    image_path: str | os.PathLike[str] | None = None,
+    reference: str | os.PathLike[str] | None = None,
+    options: CompareOptions | None = None,
+    progress: Progress | None = None,
+) -> CompareReport:
+    """Compare this package's matches with those of other front-ends on one video.
+
+    Every front-end gets the same images and camera and fills a database, each of these is
+    mapped by COLMAP's incremental mapper with the same settings, and the models are measured.
+    The folder gets `report.html`, `report.md` and `results.json`, and keeps what every stage
+    made: another run does only what is missing or depends on what has changed. A front-end that
+    fails leaves a line in its column; the others stand.
+
+    Args:
+        video: a video; one that is not AV1 is converted first.
+        output: the folder; new, empty, or that of an earlier run.
+        image_path: folder of images that exist or are to be written; None: within the output.
+        reference: given truth: folder of a COLMAP model with images of the same names, or a
+            file of poses, see `read_poses`. None: the model of "sift-exhaustive" where it is
+            compared.
+        options: options of every stage.
+        progress: called with a stage's name, what is done, and of how much where known.
+
+    Raises:
+        VideoError: the video cannot be read.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: images cannot be chosen or written, or the reference fits none.
+        ModelError: the reference is no readable model.
+        OptionError: an option has a value that cannot work, or the folder holds other things.
+        EvaluationError: matplotlib is missing.
+    """
+    options = options if options is not None else CompareOptions()
+    progress = progress if progress is not None else no_progress
+    video, output = Path(video), Path(output)
+    write_report = _report_writer()
+    frontends = _chosen_frontends(options)
+    open_stages(output)
+    try:
+        footage = choose_footage(
+            video,
+            output / "footage",
+            options=options.match,
+            image_path=Path(image_path) if image_path is not None else None,
+            progress=progress,
+        )
+        given = _read_reference(Path(reference), footage) if reference is not None else None
+        settings = MapperSettings(
+            fixed_intrinsics=footage.camera.camera_params is not None,
+            forward_motion=footage.forward_motion,
+        )
+        columns: list[Column] = []
+        for name, frontend in frontends.items():
+            columns += _run_column(
+                name,
+                frontend,
+                footage,
+                output / "frontends" / name,
+                settings=settings,
+                options=options,
+                progress=progress,
+            )
+        found = given if given is not None else _Reference()
+        found = _with_pseudo_truth(found, columns, footage)
+        measured = [_measure(column, found, footage) for column in columns]
+        report = CompareReport(
+            output=output,
+            video=video,
+            num_frames=footage.num_frames,
+            num_images=len(footage.names),
+            size=footage.size,
+            fixed_intrinsics=settings.fixed_intrinsics,
+            forward_motion=settings.forward_motion,
+            cloud_reference=found.cloud_source,
+            pose_reference=found.pose_source,
+            is_truth=found.is_truth,
+            columns=tuple(column for column, _ in measured),
+            warnings=footage.warnings,
+        )
+        clouds = {column.name: cloud for column, cloud in measured if cloud is not None}
+        write_report(report, clouds, footage)
+    except OSError as error:
+        raise OptionError(
+            f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
+            "run the same command again once that is mended"
+        ) from error
+    return report
+
+
+def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:
+    try:
+        from colmap_av1.evaluate.report import write_report  # noqa: PLC0415 - of an extra
+    except ImportError as error:
+        raise EvaluationError(
+            f"the report needs the package {error.name}: pip install 'colmap-av1[evaluate]'"
+        ) from error
+    return write_report
+
+
+def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
+    known = make_frontends(options.match, options.learned)
+    chosen: dict[str, Frontend] = {}
+    for word in options.frontends:
+        name, equals, files = word.partition("=")
+        if equals:
+            features, colon, matches = files.rpartition(":")
+            if not (colon and features and matches):
+                raise OptionError(f"front-end '{word}': give NAME=FEATURES.h5:MATCHES.h5")
+            if name in known or not name or Path(name).name != name:
+                raise OptionError(f"front-end '{word}': give it a name of its own")
+            frontend = imported_frontend(Path(features), Path(matches))
+        elif name in known:
+            frontend = known[name]
+        else:
+            raise OptionError(
+                f"front-end '{name}': give one of {', '.join(known)}, or "
+                "NAME=FEATURES.h5:MATCHES.h5"
+            )
+        if name in chosen:
+            raise OptionError(f"front-end '{name}' is given twice: leave one out")
+        chosen[name] = frontend
+    if not chosen:
+        raise OptionError(f"no front-end is given: give one of {', '.join(known)}")
+    return chosen
+
+
+def _run_column(
+    name: str,
+    frontend: Frontend,
+    footage: Footage,
+    folder: Path,
+    *,
+    settings: MapperSettings,
+    options: CompareOptions,
+    progress: Progress,
+) -> list[Column]:
+    """The columns of a front-end: its model as mapped and, of this package's, all tracks."""
+    own = name.startswith(f"{_OWN}-") or name == _OWN
+    total = 3 if own and options.all_tracks else 2
+    column = Column(name)
+    progress(name, 0, total)
+    try:
+        run = run_frontend(name, footage, folder / "matches", frontend)
+        column = replace(
+            column,
+            seconds=run.seconds,
+            cpu_seconds={"matching": run.cpu_seconds},
+            peak_memory=run.peak_memory,
+        )
+        progress(name, 1, total)
+        mapped = map_database(run.database, footage.image_path, folder / "mapped", settings)
+        column = replace(
+            column,
+            seconds={**run.seconds, "mapping": mapped.seconds},
+            cpu_seconds={**column.cpu_seconds, "mapping": mapped.cpu_seconds},
+            peak_memory=_larger(run.peak_memory, mapped.peak_memory),
+            num_models=mapped.num_models,
+            model_path=mapped.model,
+        )
+        progress(name, 2, total)
+    except ColmapAv1Error as error:
+        return [replace(column, error=str(error))]
+    if column.model_path is None:
+        return [replace(column, error="no image is registered: the mapper finds no start")]
+    if not (own and options.all_tracks):
+        return [column]
+    dense = replace(column, name=f"{name}{ALL_TRACKS}", num_models=1)
+    try:
+        densify = DensifyOptions(match=options.match, triangulate=options.triangulate)
+        made = densify_model(column.model_path, footage, folder / "all-tracks", densify)
+        dense = replace(
+            dense,
+            seconds={**column.seconds, "all tracks": made.seconds},
+            cpu_seconds={**column.cpu_seconds, "all tracks": made.cpu_seconds},
+            peak_memory=_larger(column.peak_memory, made.peak_memory),
+            model_path=made.model,
+        )
+    except ColmapAv1Error as error:
+        dense = replace(dense, error=str(error), model_path=None)
+    progress(name, 3, total)
+    return [column, dense]
+
+
+def _larger(a: int | None, b: int | None) -> int | None:
+    return None if a is None or b is None else max(a, b)
+
+
+def _read_reference(path: Path, footage: Footage) -> _Reference:
+    if path.is_dir():
+        model = read_model(path)
+        poses, points = image_poses(model, footage.names), model_points(model)
+    else:
+        poses = read_poses(path, footage.num_frames)[list(footage.frames)]
+        points = np.empty((0, 3))
+    known = int(np.isfinite(poses).all((1, 2)).sum())
+    if known < 3:
+        raise ModelError(
+            f"{path}: has poses of {known} of the {len(footage.names)} images, named "
+            f"{footage.names[0]} and on: give the truth of this video"
+        )
+    return _Reference(
+        poses,
+        points if len(points) else None,
+        pose_source=str(path),
+        cloud_source=str(path) if len(points) else "",
+        is_truth=True,
+    )
+
+
+def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footage) -> _Reference:
+    """The same, with SIFT's exhaustive model for what is not given."""
+    column = next((c for c in columns if c.name == PSEUDO_TRUTH), None)
+    if given.points is not None or column is None or column.model_path is None:
+        return given
+    model = read_model(column.model_path)
+    poses, points = image_poses(model, footage.names), model_points(model)
+    if given.poses is None:
+        return _Reference(poses, points, PSEUDO_TRUTH, PSEUDO_TRUTH)
+    similarity = fit_similarity(poses, given.poses)
+    if similarity is None:
+        return given
+    return replace(given, points=similarity.move(points), cloud_source=PSEUDO_TRUTH)
+
+
+def _measure(
+    column: Column, reference: _Reference, footage: Footage
+) -> tuple[Column, Cloud | None]:
+    """The column with the figures of its model, and what is drawn of it."""
+    if column.model_path is None:
+        return column, None
+    model = read_model(column.model_path)
+    poses, points = image_poses(model, footage.names), model_points(model)
+    # A point may lie at several keypoints of an image.
+    lengths = [len({e.image_id for e in p.track.elements}) for p in model.points3D.values()]
+    counts = np.bincount(np.array(lengths, dtype=np.int64))
+    column = replace(
+        column,
+        model=model_figures(model),
+        track_lengths={i: int(n) for i, n in enumerate(counts) if n},
+    )
+    similarity = None
+    if reference.poses is not None:
+        similarity = fit_similarity(poses, reference.poses)
+    if similarity is not None:
+        points = similarity.move(points)
+        if reference.points is not None and reference.cloud_source != column.name:
+            column = replace(column, cloud=cloud_distances(points, reference.points))
+        assert reference.poses is not None
+        if reference.pose_source != column.name:
+            column = replace(column, poses=pose_errors(poses, reference.poses))
+        poses = similarity.move_poses(poses)
+    cloud = Cloud(
+        points, _colours(model), poses, _focal_length(model), is_aligned=similarity is not None
+    )
+    return column, cloud
+
+
+def _colours(model: Any) -> NDArray[np.uint8]:
+    """Colours of the points, in the order of their ids."""
+    colours = [model.points3D[i].color for i in sorted(model.points3D)]
+    return np.array(colours, dtype=np.uint8).reshape(-1, 3)
+
+
+def _focal_length(model: Any) -> float:
+    return float(next(iter(model.cameras.values())).mean_focal_length())

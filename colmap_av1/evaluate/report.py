@@ -1,0 +1,394 @@
+"""The report of a comparison: report.html, report.md with its pictures, results.json."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import html
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pycolmap
+
+from colmap_av1.evaluate.footage import Footage
+from colmap_av1.evaluate.pictures import (
+    bar_charts,
+    cost_chart,
+    draw_perspective,
+    draw_plan,
+    length_chart,
+    view_of,
+)
+from colmap_av1.evaluate.results import Cloud, Column, CompareReport
+from colmap_av1.files import whole_file
+
+PICTURES = "pictures"
+_NONE = "-"
+_LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
+_CSS = """
+body { font: 15px/1.5 system-ui, "Helvetica Neue", Arial, sans-serif; color: #1f2937;
+  max-width: 1120px; margin: 2.5em auto; padding: 0 1.5em; }
+h1 { font-size: 1.6em; margin: 0 0 .2em; }
+h2 { font-size: 1.15em; margin: 2.2em 0 .5em; border-bottom: 1px solid #e5e7eb; }
+p.about { color: #4b5563; margin: .3em 0 1em; }
+table { border-collapse: collapse; font-size: 13px; margin: .6em 0; }
+th { text-align: right; font-weight: 600; border-bottom: 2px solid #9ca3af; padding: .3em .7em;
+  vertical-align: bottom; }
+td { text-align: right; border-bottom: 1px solid #e5e7eb; padding: .3em .7em;
+  font-variant-numeric: tabular-nums; white-space: nowrap; }
+table.cost td:last-child, table.cost th:last-child { text-align: left; white-space: normal; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+.clouds { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 14px; }
+.clouds.upright { grid-template-columns: repeat(auto-fill, minmax(210px, 1fr)); }
+figure { margin: 0; }
+figcaption { font-size: 13px; margin: .25em 0 .6em; }
+figure img, .chart { width: 100%; display: block; }
+figure img { border-radius: 3px; }
+ul.notes { padding-left: 1.2em; }
+footer { color: #6b7280; font-size: 12px; margin-top: 3em; }
+"""
+
+
+@dataclass(frozen=True)
+class _Table:
+    title: str
+    about: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class _Figure:
+    """A picture and the file it is kept in."""
+
+    name: str
+    caption: str
+    content: bytes
+
+    @property
+    def uri(self) -> str:
+        kind = {".svg": "image/svg+xml", ".png": "image/png"}[Path(self.name).suffix]
+        return f"data:{kind};base64,{base64.b64encode(self.content).decode()}"
+
+
+def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage) -> None:
+    """Write `report.html`, `report.md` with its `pictures/`, and `results.json`.
+
+    The HTML file needs no other and no network.
+
+    Args:
+        report: what was measured.
+        clouds: points and cameras of each column that has a model.
+        footage: the images.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    figures = {
+        "bars": [_Figure("figures.svg", "Main figures", bar_charts(report))],
+        "clouds": _cloud_figures(report, clouds, footage),
+        "lengths": [_Figure("track_lengths.svg", "Track lengths", length_chart(report.columns))],
+        "cost": [_Figure("cpu_time.svg", "CPU time", cost_chart(report.columns))],
+    }
+    folder = report.output / PICTURES
+    folder.mkdir(exist_ok=True)
+    for figure in (figure for group in figures.values() for figure in group):
+        _write(folder / figure.name, figure.content)
+    tables = {"models": _models_table(report), "cost": _cost_table(report.columns)}
+    tables["lengths"] = _lengths_table(report.columns)
+    _write(report.output / "report.md", _markdown(report, tables, figures).encode())
+    _write(report.output / "report.html", _html(report, tables, figures).encode())
+    _write(report.output / "results.json", _json(report).encode())
+
+
+def _write(path: Path, content: bytes) -> None:
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
+
+
+def _json(report: CompareReport) -> str:
+    def plain(value: Any) -> Any:
+        """JSON knows neither paths nor numbers that are none."""
+        if isinstance(value, dict):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        if isinstance(value, float) and not math.isfinite(value):
+            return None
+        return str(value) if isinstance(value, Path) else value
+
+    facts = plain(dataclasses.asdict(report))
+    for column, result in zip(report.columns, facts["columns"], strict=True):
+        if column.cloud is not None:
+            result["cloud"]["chamfer"] = column.cloud.chamfer
+    facts["versions"] = _versions()
+    return json.dumps(facts, indent=1) + "\n"
+
+
+def _versions() -> dict[str, str]:
+    try:
+        own = version("colmap-av1")
+    except PackageNotFoundError:
+        own = "of a checkout"
+    return {"colmap-av1": own, "pycolmap": pycolmap.__version__}
+
+
+def _models_table(report: CompareReport) -> _Table:
+    base = next((c.model for c in report.columns if c.name == "sift-exhaustive"), None)
+    header = ["front-end", "images", "points"]
+    header += ["x SIFT exhaustive"] * (base is not None)
+    header += ["track length", "error px, mean / median"]
+    header += ["ATE", "relative pose error"] * bool(report.pose_reference)
+    header += ["Chamfer", "Hausdorff (95 %)"] * bool(report.cloud_reference)
+    rows = []
+    for column in report.columns:
+        model = column.model
+        if model is None:
+            rows.append([column.name, *[_NONE] * (len(header) - 1)])
+            continue
+        row = [column.name, f"{model.num_registered} of {report.num_images}"]
+        row.append(f"{model.num_points:,}")
+        if base is not None:
+            row.append(f"{model.num_points / base.num_points:.1f}" if base.num_points else _NONE)
+        row.append(f"{model.mean_track_length:.2f}")
+        row.append(f"{_number(model.mean_error)} / {_number(model.median_error)}")
+        if report.pose_reference:
+            row += _pose_cells(column, report)
+        if report.cloud_reference:
+            row += _cloud_cells(column, report)
+        rows.append(row)
+    return _Table("Clouds and poses", _about_models(report), header, rows)
+
+
+def _about_models(report: CompareReport) -> str:
+    told = "Error: reprojection error of the points, as COLMAP states it."
+    if report.pose_reference:
+        whose = _whose(report.pose_reference, report.is_truth)
+        told += (
+            f" Poses against {whose}: ATE is the RMS distance of the camera centres after "
+            "similarity alignment, as a share of the path's extent; the relative pose error is "
+            "that of the motion from an image to the next, RMS, translation as a share of the "
+            "extent, and turn."
+        )
+        if report.is_truth:
+            told += " Before the share, the distance in the truth's unit."
+    if report.cloud_reference:
+        whose = _whose(
+            report.cloud_reference,
+            report.is_truth and report.cloud_reference == report.pose_reference,
+        )
+        told += (
+            f" Distances to the cloud of {whose}, as a share of the extent of its middle 90 %: "
+            "Chamfer is the mean distance to the nearest point, averaged over both directions; "
+            "Hausdorff the larger of the 95 % quantiles, with the largest distance behind it. A "
+            "cloud that is denser than the one it is measured against has points where that one "
+            "has none."
+        )
+    return told
+
+
+def _whose(source: str, is_truth: bool) -> str:
+    return f"the given truth ({Path(source).name})" if is_truth else f"{source} as pseudo truth"
+
+
+def _pose_cells(column: Column, report: CompareReport) -> list[str]:
+    poses = column.poses
+    if poses is None:
+        return ["reference" if column.name == report.pose_reference else _NONE, _NONE]
+    ate = f"{poses.ate / poses.extent:.3%}"
+    if report.is_truth:
+        ate = f"{poses.ate:.4f}, {ate}"
+    relative = f"{poses.relative_translation / poses.extent:.3%}, {poses.relative_rotation:.3f}°"
+    return [ate, relative]
+
+
+def _cloud_cells(column: Column, report: CompareReport) -> list[str]:
+    cloud = column.cloud
+    if cloud is None:
+        return ["reference" if column.name == report.cloud_reference else _NONE, _NONE]
+    share = [value / cloud.extent for value in (cloud.chamfer, cloud.robust_hausdorff)]
+    return [f"{share[0]:.2%}", f"{share[1]:.1%} ({cloud.hausdorff / cloud.extent:.1f}x)"]
+
+
+def _cost_table(columns: Sequence[Column]) -> _Table:
+    header = ["front-end", "matching: CPU s", "mapping: CPU s", "all tracks: CPU s", "in all"]
+    header += ["memory", "wall s of each stage"]
+    rows = []
+    for column in columns:
+        cpu = column.cpu_seconds
+        row = [column.name]
+        row += [
+            f"{cpu[s]:.1f}" if s in cpu else _NONE for s in ("matching", "mapping", "all tracks")
+        ]
+        row.append(f"{sum(cpu.values()):.1f}" if cpu else _NONE)
+        memory = column.peak_memory
+        row.append(f"{memory / 2**20:,.0f} MB" if memory is not None else _NONE)
+        row.append(", ".join(f"{k} {v:.1f}" for k, v in column.seconds.items()) or _NONE)
+        rows.append(row)
+    about = (
+        "Every stage ran in a process of its own; matching holds reading or extraction, matching "
+        "and verification. Where other work runs beside it, wall time means little: read the CPU "
+        "time."
+    )
+    return _Table("What it takes", about, header, rows)
+
+
+def _lengths_table(columns: Sequence[Column]) -> _Table:
+    bounds = [*_LENGTH_CLASSES, math.inf]
+    spans = list(itertools.pairwise(bounds))
+    header = ["points seen by"]
+    for low, high in spans:
+        one = high == low + 1
+        header.append(f"{low}" if one else f"{low}+" if high == math.inf else f"{low}-{high - 1}")
+    header[-1] += " images"
+    rows = []
+    for column in columns:
+        lengths = column.track_lengths
+        counts = [sum(n for k, n in lengths.items() if low <= k < high) for low, high in spans]
+        rows.append([column.name, *(f"{n:,}" if lengths else _NONE for n in counts)])
+    return _Table("Track lengths", "", header, rows)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else _NONE
+
+
+def _cloud_figures(
+    report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage
+) -> list[_Figure]:
+    """Each cloud from two viewpoints that are the same for all."""
+    like = clouds.get(report.cloud_reference) or next(
+        (cloud for cloud in clouds.values() if cloud.is_aligned), None
+    )
+    figures = []
+    for column in report.columns:
+        cloud = clouds.get(column.name)
+        if cloud is None:
+            continue
+        model = like if like is not None and cloud.is_aligned else cloud
+        drawn = {
+            "view": draw_perspective(cloud, view_of(model), footage.size),
+            "plan": draw_plan(cloud, model, (640, 480)),
+        }
+        told = f"{column.name}: {len(cloud.points):,} points"
+        if like is not None and not cloud.is_aligned:
+            told += ", in its own coordinates"
+        for kind, picture in drawn.items():
+            _, encoded = cv2.imencode(".png", picture)
+            name = f"{column.name.replace(' ', '')}_{kind}.png"
+            figures.append(_Figure(name, told, encoded.tobytes()))
+    return figures
+
+
+def _facts(report: CompareReport) -> str:
+    known = "intrinsics given and kept" if report.fixed_intrinsics else "intrinsics unknown"
+    told = (
+        f"{report.num_images} images of {report.num_frames} frames, "
+        f"{report.size[0]}x{report.size[1]}; {known}; COLMAP's incremental mapper with the same "
+        "settings for every front-end"
+    )
+    if report.forward_motion:
+        told += ", which may start with images that lie behind each other"
+    return f"{told}."
+
+
+def _notes(report: CompareReport) -> list[str]:
+    notes = [f"{column.name}: {column.error}" for column in report.columns if column.error]
+    for column in report.columns:
+        if column.num_models > 1:
+            notes.append(
+                f"{column.name}: the mapper made {column.num_models} models, the one with the "
+                "most images is measured"
+            )
+        if column.model is not None and column.model.num_registered < report.num_images:
+            missing = report.num_images - column.model.num_registered
+            notes.append(f"{column.name}: {missing} images have no pose")
+    if not report.pose_reference:
+        notes.append(
+            "no poses or cloud to measure against: give --reference, or compare sift-exhaustive"
+        )
+    return [*notes, *report.warnings]
+
+
+def _markdown(
+    report: CompareReport, tables: Mapping[str, _Table], figures: Mapping[str, list[_Figure]]
+) -> str:
+    def picture(figure: _Figure) -> str:
+        return f"![{figure.caption}]({PICTURES}/{figure.name})"
+
+    def table(one: _Table) -> list[str]:
+        lines = [one.header, ["---", *["---:"] * (len(one.header) - 1)], *one.rows]
+        rows = [f"| {' | '.join(line)} |" for line in lines]
+        return [f"## {one.title}", "", *([one.about, ""] if one.about else []), *rows, ""]
+
+    views = [f for f in figures["clouds"] if f.name.endswith("_view.png")]
+    plans = [f for f in figures["clouds"] if f.name.endswith("_plan.png")]
+    parts = [f"# Front-ends compared on {report.video.name}", "", _facts(report), ""]
+    parts += [*[f"- {note}" for note in _notes(report)], ""]
+    parts += [*table(tables["models"]), picture(figures["bars"][0]), ""]
+    parts += ["## Clouds from one viewpoint", ""]
+    for figure in (*views, *plans):
+        parts += [figure.caption, "", picture(figure), ""]
+    parts += [*table(tables["lengths"]), picture(figures["lengths"][0]), ""]
+    parts += [*table(tables["cost"]), picture(figures["cost"][0]), ""]
+    return "\n".join(parts)
+
+
+def _html(
+    report: CompareReport, tables: Mapping[str, _Table], figures: Mapping[str, list[_Figure]]
+) -> str:
+    def table(kind: str) -> str:
+        one = tables[kind]
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in one.header)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>"
+            for row in one.rows
+        )
+        about = f'<p class="about">{html.escape(one.about)}</p>' if one.about else ""
+        return (
+            f"<h2>{html.escape(one.title)}</h2><table class='{kind}'><thead><tr>{head}</tr></thead>"
+            f"<tbody>{rows}</tbody></table>{about}"
+        )
+
+    def chart(figure: _Figure) -> str:
+        return f'<img class="chart" alt="{html.escape(figure.caption)}" src="{figure.uri}">'
+
+    def grid(kind: str) -> str:
+        each = "".join(
+            f'<figure><img alt="{html.escape(f.caption)}" src="{f.uri}">'
+            f"<figcaption>{html.escape(f.caption)}</figcaption></figure>"
+            for f in figures["clouds"]
+            if f.name.endswith(f"_{kind}.png")
+        )
+        upright = " upright" if kind == "view" and report.size[1] > report.size[0] else ""
+        return f'<div class="clouds{upright}">{each}</div>'
+
+    title = html.escape(f"Front-ends compared on {report.video.name}")
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in _notes(report))
+    versions = ", ".join(f"{name} {number}" for name, number in _versions().items())
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_CSS}</style></head><body>"
+        f'<h1>{title}</h1><p class="about">{html.escape(_facts(report))}</p>'
+        + (f'<ul class="notes">{notes}</ul>' if notes else "")
+        + table("models")
+        + chart(figures["bars"][0])
+        + "<h2>Clouds from one viewpoint</h2>"
+        + '<p class="about">Behind and above the middle camera; below, from above. Red: the '
+        + "camera's path.</p>"
+        + grid("view")
+        + grid("plan")
+        + table("lengths")
+        + chart(figures["lengths"][0])
+        + table("cost")
+        + chart(figures["cost"][0])
+        + f"<footer>{html.escape(versions)}</footer></body></html>\n"
+    )

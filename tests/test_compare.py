@@ -1,0 +1,261 @@
+"""The comparison of front-ends as one command: its columns, report, resume and refusals."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import PROJECT
+
+from colmap_av1 import compare as compare_module
+from colmap_av1.cli import main
+from colmap_av1.compare import compare
+from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
+from colmap_av1.export import export_hloc
+from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
+
+pytest.importorskip("matplotlib")
+
+CAMERA = CameraOptions("PINHOLE", "260,260,160,90")
+OPTIONS = MatchOptions(images=ImageOptions(every=6), camera=CAMERA)
+
+
+@pytest.fixture(scope="module")
+def video(ffmpeg, tmp_path_factory):
+    """The rendered clip at half its size: 48 frames 320x180."""
+    words = "-frames:v 48 -vf scale=320:180 -c:v libaom-av1 -usage realtime -cpu-used 6 -crf 20"
+    scene = PROJECT / "examples" / "scene.mp4"
+    output = tmp_path_factory.mktemp("video") / "small.mp4"
+    return ffmpeg("-i", scene, *words.split(), "-b:v", "0", "-lag-in-frames", "0", output)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """The clip's true poses as a file."""
+    path = tmp_path_factory.mktemp("truth") / "poses.txt"
+    with np.load(PROJECT / "examples" / "scene_truth.npz") as known:
+        poses = known["cam_from_world"][:48]
+    lines = ["# frame, camera to world"]
+    for i, pose in enumerate(poses):
+        world = pycolmap.Rigid3d(pose).inverse()
+        values = [*world.translation, *world.rotation.quat]
+        lines.append(f"{i:06d}.png {' '.join(map(str, values))}")
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.fixture(scope="module")
+def compared(video, truth, tmp_path_factory):
+    """The folder of a comparison in which one of the front-ends fails, made by the command."""
+    output = tmp_path_factory.mktemp("compared") / "report"
+    words = ["--frontends", "av1,sift-exhaustive,broken=no.h5:none.h5", "--every", "6"]
+    words += ["--camera_model", "PINHOLE", "--camera_params", CAMERA.camera_params]
+    given = ["--video", str(video), "--output", str(output), "--reference", str(truth)]
+    assert main(["compare", *given, *words, "--quiet"]) == 0
+    return output
+
+
+def run_again(video, output, truth, *frontends):
+    names = frontends or ("av1", "sift-exhaustive", "broken=no.h5:none.h5")
+    options = CompareOptions(match=OPTIONS, frontends=names)
+    return compare(video, output, reference=truth, options=options)
+
+
+def times(output):
+    """When the results that are kept were written."""
+    return {str(p): p.stat().st_mtime_ns for p in (output / "frontends").glob("*/*/result.json")}
+
+
+@pytest.mark.slow
+def test_columns_hold_what_their_models_say(compared):
+    results = json.loads((compared / "results.json").read_text())
+    assert (results["num_images"], results["num_frames"], results["size"]) == (8, 48, [320, 180])
+    assert results["is_truth"]
+    columns = {column["name"]: column for column in results["columns"]}
+    assert list(columns) == ["av1", "av1 + all tracks", "sift-exhaustive", "broken"]
+    for name in ("av1", "av1 + all tracks", "sift-exhaustive"):
+        column = columns[name]
+        model = pycolmap.Reconstruction(column["model_path"])
+        assert column["error"] == ""
+        assert column["model"]["num_registered"] == model.num_reg_images() == 8
+        assert column["model"]["num_points"] == model.num_points3D() > 200
+        assert sum(column["track_lengths"].values()) == model.num_points3D()
+        assert max(map(int, column["track_lengths"])) <= 8
+        assert column["poses"]["num_poses"] == 8
+        assert 0 < column["poses"]["ate"] < 0.02 * column["poses"]["extent"]
+        assert column["poses"]["relative_rotation"] < 0.5
+        assert column["cpu_seconds"]["matching"] > 0
+        assert column["cpu_seconds"]["mapping"] > 0
+        assert column["seconds"]["mapping"] > 0
+    assert columns["sift-exhaustive"]["cloud"] is None
+    assert 0 < columns["av1"]["cloud"]["chamfer"] < 0.1 * columns["av1"]["cloud"]["extent"]
+    assert (
+        columns["av1 + all tracks"]["model"]["num_points"] > columns["av1"]["model"]["num_points"]
+    )
+    assert columns["broken"]["error"].startswith("no.h5: no such file")
+    assert columns["broken"]["model"] is None
+
+
+@pytest.mark.slow
+def test_the_report_needs_no_other_file(compared):
+    html = (compared / "report.html").read_text()
+    sources = re.findall(r'src="([^"]*)"', html)
+    assert len(sources) == 3 + 2 * 3
+    assert all(source.startswith("data:image/") for source in sources)
+    assert not re.search(r'(href|src)="(?!data:)|@import|url\(', html)
+    for told in ("broken: no.h5: no such file", "8 of 8", "the given truth (poses.txt)"):
+        assert told in html
+    markdown = (compared / "report.md").read_text()
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", markdown)
+    assert len(pictures) == len(sources)
+    assert all((compared / picture).stat().st_size > 1000 for picture in pictures)
+    rows = [line for line in markdown.splitlines() if line.startswith("| av1 + all tracks |")]
+    assert len(rows) == 3
+    clouds = {p: p.read_bytes() for p in (compared / "pictures").glob("*_view.png")}
+    assert len(set(clouds.values())) == 3
+
+
+@pytest.mark.slow
+def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path):
+    output = tmp_path / "report"
+    shutil.copytree(compared, output)
+    before = times(output)
+    first = json.loads((output / "results.json").read_text())
+    assert len(before) == 5
+    run_again(video, output, truth)
+    assert times(output) == before
+    again = json.loads((output / "results.json").read_text())
+    assert [c["seconds"] for c in again["columns"]] == [c["seconds"] for c in first["columns"]]
+
+    # SIFT's features and matches as other programs would hand them in: a new column.
+    export_hloc(
+        output / "frontends" / "sift-exhaustive" / "matches" / "database.db", tmp_path / "h"
+    )
+    given = f"theirs={tmp_path / 'h' / 'features.h5'}:{tmp_path / 'h' / 'matches.h5'}"
+    report = run_again(video, output, truth, "sift-exhaustive", given)
+    assert set(before.items()) <= set(times(output).items())
+    sift, theirs = report.columns
+    assert theirs.name == "theirs"
+    assert theirs.model.num_registered == 8
+    assert theirs.model.num_points == pytest.approx(sift.model.num_points, rel=0.1)
+    assert {"import", "verification", "mapping"} == set(theirs.seconds)
+
+    # Other images are another input of every stage.
+    (output / "footage" / "images" / "frame_000006.png").write_bytes(
+        (output / "footage" / "images" / "frame_000012.png").read_bytes()
+    )
+    run_again(video, output, truth, "sift-exhaustive")
+    changed = {name for name, time in times(output).items() if before.get(name, time) != time}
+    assert {name.split("/")[-3] for name in changed} == {"sift-exhaustive"}
+    assert len(changed) == 2
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeypatch):
+    output = tmp_path / "report"
+    shutil.copytree(compared, output)
+    for name in ("mapped", "all-tracks"):
+        shutil.rmtree(output / "frontends" / "av1" / name)
+    kept = times(output)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(compare_module, "map_database", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_again(video, output, truth)
+    assert times(output) == kept
+    report = run_again(video, output, truth)
+    assert report.columns[1].model.num_registered == 8
+    assert set(kept.items()) < set(times(output).items())
+    assert len(times(output)) == 5
+
+
+@pytest.mark.slow
+def test_images_that_exist_and_nothing_to_measure_against(compared, video, tmp_path):
+    images = tmp_path / "pictures"
+    images.mkdir()
+    for i, path in enumerate(sorted((compared / "footage" / "images").iterdir())):
+        shutil.copy(path, images / f"shot{i + 1}.png")
+    options = CompareOptions(match=OPTIONS, frontends=("av1",), all_tracks=False)
+    report = compare(video, tmp_path / "report", image_path=images, options=options)
+    (column,) = report.columns
+    names = {i.name for i in pycolmap.Reconstruction(column.model_path).images.values()}
+    assert names == {f"shot{i + 1}.png" for i in range(8)}
+    assert (column.poses, column.cloud, report.pose_reference) == (None, None, "")
+    assert "no poses or cloud to measure against" in (report.output / "report.md").read_text()
+    assert not (report.output / "footage" / "images").exists()
+
+
+def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
+    output = tmp_path / "report"
+    given = ["compare", "--video", str(video), "--output", str(output)]
+    refused = {
+        "av1,surf": "front-end 'surf': give one of av1,",
+        "av1,av1": "front-end 'av1' is given twice",
+        "mine=features.h5": "give NAME=FEATURES.h5:MATCHES.h5",
+        "av1=a.h5:b.h5": "give it a name of its own",
+        "../x=a.h5:b.h5": "give it a name of its own",
+    }
+    for frontends, told in refused.items():
+        assert main([*given, "--frontends", frontends]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert told in error
+    assert not output.exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").touch()
+    with pytest.raises(OptionError, match="is not empty and not the output of an earlier run"):
+        compare(video, tmp_path / "mine")
+    with pytest.raises(ImageError, match="1 of 48 frames become images"):
+        compare(
+            video,
+            tmp_path / "one",
+            options=CompareOptions(match=MatchOptions(images=ImageOptions(every=48))),
+        )
+
+
+def test_a_reference_of_other_images_is_refused(video, tmp_path):
+    poses = tmp_path / "poses.txt"
+    poses.write_text("0.png 0 0 0 0 0 0 1\n1.png 1 0 0 0 0 0 1\n")
+    options = CompareOptions(match=OPTIONS)
+    with pytest.raises(ModelError, match="has poses of 1 of the 8 images"):
+        compare(video, tmp_path / "report", reference=poses, options=options)
+    poses.write_text("0.png 0 0 here\n")
+    with pytest.raises(ImageError, match=r"'0.png 0 0 here' is no pose"):
+        compare(video, tmp_path / "report", reference=poses, options=options)
+    with pytest.raises(ImageError, match="holds no poses that can be read"):
+        compare(video, tmp_path / "report", reference=tmp_path / "none", options=options)
+
+
+def test_learned_features_without_their_extra(tmp_path):
+    program = PROJECT / "colmap_av1" / "evaluate" / "lightglue_matches.py"
+    (tmp_path / "torch.py").write_text("raise ImportError(name='torch')")
+    run = subprocess.run(
+        [sys.executable, program],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        input="{}",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 3
+    assert run.stderr == (
+        "learned features need the package torch: pip install 'colmap-av1[learned]'\n"
+    )
+
+
+def test_without_matplotlib(video, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for name in ("report", "pictures"):
+        monkeypatch.delitem(sys.modules, f"colmap_av1.evaluate.{name}", raising=False)
+    with pytest.raises(EvaluationError, match=r"pip install 'colmap-av1\[evaluate\]'"):
+        compare(video, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
