@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ import av.error
 import imageio_ffmpeg
 
 from colmap_av1.errors import BitstreamError, EncodeError, NotAv1Error, OptionError, VideoError
-from colmap_av1.files import whole_file
+from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.options import EncodeOptions
 from colmap_av1.progress import Progress, no_progress
 from colmap_av1.video import VideoFacts, count_frames, open_stream, video_facts
@@ -40,6 +41,15 @@ _KEPT_FORMATS = (".mp4", ".mkv", ".webm")
 _TALK = ("-hide_banner", "-nostats", "-v", "level+info")
 _MESSAGE_SOURCE = re.compile(r"^(\[[^\]]+\] )+")
 _GRAVE = re.compile(r"\[(error|fatal|panic)\]")
+# A program that becomes ffmpeg. Linux ends it with the process that started it, even where that is
+# killed and cannot.
+_BOUND = """
+import ctypes, os, signal, sys
+starter, *command = sys.argv[1:]
+ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+if os.getppid() == int(starter):
+    os.execv(command[0], command)
+"""
 _NEW_SIZE = re.compile(r"Reconfiguring filter graph.* changed to .*, (\d+)x(\d+)")
 
 
@@ -186,6 +196,7 @@ def encode(
         raise EncodeError(f"{output}: the folder does not exist: make it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
+    remove_leftovers(output)
     facts = video_facts(video)
     name, ffmpeg = find_encoder(options)
     encoder = _ENCODERS[name]
@@ -409,6 +420,8 @@ def _run(
 @contextmanager
 def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen[str]]:
     """A running ffmpeg that does not outlive what waits for it."""
+    if sys.platform == "linux" and sys.executable:
+        command = [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,

@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import av
@@ -245,28 +247,60 @@ def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None
     assert not list(tmp_path.glob("*out*"))
 
 
+@contextmanager
+def long_conversion(ffmpeg: Ffmpeg, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is converting long.mp4 of a folder to out.mp4, for some time yet."""
+    long = ffmpeg(
+        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
+        *("-c:v", "libx264", "-preset", "ultrafast", folder / "long.mp4"),
+    )
+    words = ["encode", "--video", str(long), "--output", str(folder / "out.mp4")]
+    words += ["--encoder", "libaom", "--speed", "2"]
+    command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
+    with subprocess.Popen(command, cwd=folder) as process:
+        deadline = time.monotonic() + 60
+        while not list(folder.glob(".out.mp4.*.partial")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        yield process
+
+
+def is_converted(video: Path) -> bool:
+    running = subprocess.run(
+        ["ps", "-ww", "-eo", "args"], capture_output=True, text=True, check=True
+    )
+    return str(video) in running.stdout
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_conversion_leaves_nothing(
     ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int
 ) -> None:
-    long = ffmpeg(
-        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
-        *("-c:v", "libx264", "-preset", "ultrafast", tmp_path / "long.mp4"),
-    )
-    words = ["encode", "--video", str(long), "--output", str(tmp_path / "out.mp4")]
-    words += ["--encoder", "libaom", "--speed", "2"]
-    command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
-    with subprocess.Popen(command, cwd=tmp_path) as process:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob(".out.mp4.*.partial")):
-            assert time.monotonic() < deadline
-            assert process.poll() is None
-            time.sleep(0.05)
+    with long_conversion(ffmpeg, tmp_path) as process:
         process.send_signal(number)
         assert process.wait(30) == status
     assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
-    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
-    assert str(long) not in running.stdout
+    assert not is_converted(tmp_path / "long.mp4")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
+def test_killed_conversion_ends_and_is_cleaned_up_after(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    with long_conversion(ffmpeg, tmp_path) as process:
+        process.kill()
+        process.wait(30)
+    deadline = time.monotonic() + 10
+    while is_converted(tmp_path / "long.mp4"):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert list(tmp_path.glob(".out.mp4.*.partial"))
+    others = [f".out.mp4.{os.getppid()}.partial", ".out.mp4.backup.partial", ".in.mp4.1.partial"]
+    for name in others:
+        (tmp_path / name).touch()
+    encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
+    assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "out.mp4", *others}
 
 
 def fake_ffmpeg(folder: Path, script: str) -> Path:
