@@ -55,6 +55,7 @@ class TrackBuilder:
         smoothness: float,
         border: float,
         interpolation: float,
+        bridge: float,
     ) -> None: ...
     def add(self, **frame: Any) -> None: ...
     def finish(

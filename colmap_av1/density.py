@@ -16,6 +16,9 @@ from colmap_av1.tracks import Tracks, keep_observations
 # Error in pixels that an observation has however sure its motion is; keeps one sure
 # observation from outweighing many good ones.
 _SIGMA_FLOOR = 0.3
+# What an observation tells of the cameras is its motion beside its error: one that moved far may
+# be less sure, as the wide views that poses need are where the camera moves quickly.
+_MAX_ERROR_SHARE = 1 / 30
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,10 @@ _PRESETS = {
 def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
     """Choose tracks that are long, sure and spread over every image.
 
-    Observations less sure than `max_sigma`, against the first one of their track, are left out.
-    Then tracks are taken best first, the
-    weight of an observation being its inverse expected variance. One is used where at least
-    half of its observations lie in images that are not full, and there in cells, `spacing`
+    Observations less sure than `max_sigma`, against the first one of their track, are left out
+    unless the error is a thirtieth of the way from there or less. Then tracks are taken best
+    first, the weight of an observation being its inverse expected variance. One is used where at
+    least half of its observations lie in images that are not full, and there in cells, `spacing`
     wide, that no better track lies in; it loses the observations in full images.
 
     Args:
@@ -64,7 +67,8 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         max_variance = limits.max_sigma**2
         if options.max_sigma is None:
             max_variance *= _frames_between_images(tracks)
-        sure = variance <= max_variance
+        allowed = np.maximum(max_variance, _MAX_ERROR_SHARE**2 * _squared_way_since_first(tracks))
+        sure = variance <= allowed
         tracks, variance = keep_observations(tracks, sure), variance[sure]
     weight = 1.0 / (_SIGMA_FLOOR**2 + variance)
     total = np.concatenate([[0.0], np.cumsum(weight)])
@@ -87,6 +91,12 @@ def _variance_since_first(tracks: Tracks) -> NDArray[np.float64]:
     variance = tracks.sigma.astype(np.float64) ** 2
     first = np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
     return np.asarray(np.maximum(variance - first, 0.0), np.float64)
+
+
+def _squared_way_since_first(tracks: Tracks) -> NDArray[np.float64]:
+    """Squared distance of each observation to the first of its track that is left, in px^2."""
+    first = np.repeat(tracks.xy[tracks.offsets[:-1]], np.diff(tracks.offsets), axis=0)
+    return np.asarray(((tracks.xy - first).astype(np.float64) ** 2).sum(1), np.float64)
 
 
 def _frames_between_images(tracks: Tracks) -> float:

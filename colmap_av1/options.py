@@ -52,7 +52,7 @@ class TrackOptions:
     # below it has no direction to test
     cosine_scale: float = 1.0
     # longest step a displacement may take, in shown frames; None: any
-    max_interval: int | None = 4
+    max_interval: int | None = 16
     # largest block whose motion is trusted, in px^2; None: any
     max_block_area: int | None = 1024
     # the same for blocks without coded residual, which the encoder never corrected
@@ -66,6 +66,10 @@ class TrackOptions:
     # let motion vary within a block, towards blocks beside it whose displacements differ by
     # less than this many pixels; None: move a block as one
     interpolation: float | None = 1.5
+    # carry tracks over blocks without motion, such as intra ones, and over gaps that blocks leave
+    # between them, where the motion on either side differs by less than this many pixels; None:
+    # end them there
+    bridge: float | None = 2.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,8 @@ class DensityOptions:
     spacing: float | None = None
     # images a track is seen in at least
     min_length: int | None = None
-    # largest expected error of a position against its track's first, in pixels; 0: any
+    # largest expected error of a position against its track's first, in pixels, where it moved
+    # little: a thirtieth of the way is allowed, too; 0: any
     max_sigma: float | None = None
 
 

@@ -57,11 +57,13 @@ def build_tracks(
     The motion of a block holds for each of its 4x4 units. A unit carries on the track
     found where its displacement lands in the referenced frame, to the sub-pixel place
     that moves exactly onto it, and a track moves with its unit into a reference shown
-    later. Frames are chained in display order and links to the nearest frame come first,
-    so a frame that was coded far ahead is reached by the short steps between; frames that
-    are never shown are chained through last. A unit without one starts a track at its centre. No
-    unit holds two tracks, no frame sees a track twice. Frames are consumed one
-    by one; beyond a few frames of motion, memory grows with the observations only.
+    later. Where two tracks want one unit the longer goes on. Frames are chained in display order
+    and links to the nearest frame come first, so a frame that was coded far ahead is reached by
+    the short steps between; frames that are never shown are chained through last. A unit without
+    motion of its own moves as those on either side of it do, where these agree. A unit without a
+    track starts one at its centre. No unit holds two tracks, no frame sees a track twice. Frames
+    are consumed one by one; beyond a few frames of motion, memory grows with the observations
+    only.
 
     Args:
         motion: the coded frames of one video, in bitstream order.
@@ -92,6 +94,7 @@ def build_tracks(
         smoothness=_or_off(options.smoothness),
         border=_or_off(options.border),
         interpolation=_or_off(options.interpolation),
+        bridge=_or_off(options.bridge),
     )
     for count, frame in enumerate(motion, start=1):
         builder.add(
@@ -214,7 +217,7 @@ def _check_options(options: TrackOptions) -> None:
         raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
     limits = (
         *("max_interval", "max_block_area", "max_uncoded_block_area"),
-        *("smoothness", "border", "interpolation"),
+        *("smoothness", "border", "interpolation", "bridge"),
     )
     for name in limits:
         value = getattr(options, name)

@@ -115,6 +115,20 @@ def test_presets_follow_the_distance_of_images() -> None:
     assert len(select_tracks(late, DensityOptions(**ANY | {"max_sigma": 0.2})).frame) > 0
 
 
+def test_errors_are_held_against_the_way() -> None:
+    tracks = random_tracks()
+    options = DensityOptions(**ANY | {"max_sigma": 0.5})
+    near = select_tracks(tracks, options)
+    # Half of the tracks move by 40 px a frame, by far more than thirty times their error.
+    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    moves = track % 2 == 0
+    step = np.arange(len(track)) - tracks.offsets[:-1][track]
+    xy = tracks.xy + np.float32([40, 0]) * (step * moves)[:, None].astype(np.float32)
+    quick = select_tracks(replace(tracks, xy=xy), options)
+    assert len(near.frame) < 0.9 * len(tracks.frame)
+    assert len(quick.frame) == moves.sum() + ((tracks.sigma <= 0.5) & ~moves).sum()
+
+
 def test_kept_observations_stay_with_their_tracks() -> None:
     tracks = random_tracks(50)
     kept = np.random.default_rng(1).random(len(tracks.frame)) < 0.3

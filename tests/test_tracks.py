@@ -34,6 +34,7 @@ OPEN = TrackOptions(
     smoothness=None,
     border=None,
     interpolation=None,
+    bridge=None,
 )
 # The rules of trust that do not depend on how large the picture is.
 SMALL_PICTURES = TrackOptions(border=None)
@@ -444,7 +445,7 @@ def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
     hole.ref_frame[2:6, 3:7] = (0, -1)
     hole.is_inter[2:6, 3:7] = 0
     hole.mv[2:6, 3:7] = 0
-    tracks = build_tracks(frames, SMALL_PICTURES)
+    tracks = build_tracks(frames, replace(SMALL_PICTURES, bridge=None))
     check_invariants(tracks, 4)
     counts = {}
     for shown, xy in split(tracks):
@@ -453,6 +454,66 @@ def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
             counts.get((inside, int(shown[0]), int(shown[-1])), 0) + 1
         )
     assert counts == {(False, 0, 8): 16 * 12 - 16, (True, 0, 3): 16, (True, 4, 8): 16}
+
+
+@pytest.mark.parametrize(("jump", "goes_on"), [(0.0, True), (1.5, True), (3.0, False)])
+def test_tracks_cross_intra_blocks_where_both_sides_move_alike(jump: float, goes_on: bool) -> None:
+    mv = np.zeros((12, 16, 2), np.int16)
+    mv[:, 7:, 1] = round(8 * jump)
+    frames = low_delay([(0.0, 0.0)] * 3 + [mv] + [(0.0, 0.0)] * 4)
+    hole = frames[4]
+    hole.ref_frame[:, 3:7] = (0, -1)
+    hole.is_inter[:, 3:7] = 0
+    tracks = build_tracks(frames, replace(OPEN, min_length=1, bridge=2.0))
+    check_invariants(tracks, 1)
+    whole = [xy for shown, xy in split(tracks) if len(shown) == 9 and 12 <= xy[0, 0] < 28]
+    assert (len(whole) == 4 * 12) == goes_on
+    assert (len(whole) == 0) == (not goes_on)
+    for xy in whole:
+        # From the left side's motion to that of the right side, by the distance to both.
+        share = ((xy[0, 0] - 2) / 4 - 2) / 5
+        np.testing.assert_allclose(xy[3, 0] - xy[4, 0], share * jump, atol=1e-5)
+        np.testing.assert_array_equal(xy[:, 1], xy[0, 1])
+    # They are less sure than those beside that have motion of their own.
+    if jump and goes_on:
+        bridged = tracks.sigma[tracks.frame == 4].reshape(12, 16)
+        assert (bridged[:, 3:7] > bridged[:, :3].max()).all()
+
+
+def test_tracks_in_the_gap_between_blocks_go_on() -> None:
+    # The tracks of columns 0 to 8 come to lie half a pixel from the left edges of their units.
+    shift = np.zeros((12, 16, 2), np.int16)
+    shift[:, :9, 1] = round(8 * 1.5)
+    # Then the right half comes from a pixel further right, and no vector leads to x = 32.5.
+    apart = np.zeros((12, 16, 2), np.int16)
+    apart[:, 8:, 1] = 8
+    frames = low_delay([shift, apart])
+
+    def carried(bridge: float | None) -> int:
+        tracks = build_tracks(frames, replace(OPEN, min_length=2, bridge=bridge))
+        check_invariants(tracks, 2)
+        paths = [xy for shown, xy in split(tracks) if shown[-1] == 2 and xy[-2, 0] == 32.5]
+        assert all(len(xy) == 3 and xy[-1, 0] == 32.5 for xy in paths)
+        return len(paths)
+
+    assert (carried(None), carried(0.5), carried(2.0)) == (0, 0, 12)
+
+
+def test_of_two_tracks_the_longer_goes_on() -> None:
+    # Column 0 seeds tracks in frame 1 that come to x = 3.5; those of column 1 are from frame 0 and
+    # lie at 5.5. In frame 3 one unit finds both, the young one nearer to its centre.
+    steps = np.zeros((3, 12, 16, 2), np.int16)
+    steps[0, :, 1, 1] = round(8 * 0.5)
+    steps[1, :, 0, 1] = round(8 * -1.5)
+    steps[2, :, 0, 1] = 8 * 2
+    frames = low_delay(list(steps))
+    for index, col in ((1, 0), (3, 1)):
+        frames[index].ref_frame[:, col] = (0, -1)
+        frames[index].is_inter[:, col] = 0
+    tracks = build_tracks(frames, replace(OPEN, min_length=2))
+    check_invariants(tracks, 2)
+    paths = [xy[:, 0].tolist() for shown, xy in split(tracks) if shown[-1] == 3 and xy[-1, 0] < 4]
+    assert paths == [[6.0, 5.5, 5.5, 3.5]] * 12
 
 
 def test_one_track_goes_to_one_unit_the_best_one() -> None:
@@ -777,6 +838,7 @@ any_options = st.builds(
     cosine=st.sampled_from([None, 0.5, 0.95]),
     cosine_relative_to=st.sampled_from(["dominant", "none"]),
     max_interval=st.sampled_from([None, 1, 4]),
+    bridge=st.sampled_from([None, 2.0]),
     max_block_area=st.sampled_from([None, 1024]),
     max_uncoded_block_area=st.sampled_from([None, 256]),
     smoothness=st.sampled_from([None, 1.5]),

@@ -195,7 +195,7 @@ void bind_tracks(nb::module_& m) {
           "__init__",
           [](TrackBuilder* self, int min_length, double cosine, bool cosine_relative_to_dominant,
              double cosine_scale, int max_interval, int max_block_area, int max_uncoded_block_area,
-             double smoothness, double border, double interpolation) {
+             double smoothness, double border, double interpolation, double bridge) {
             TrackBuilderOptions options;
             options.min_length = min_length;
             options.cosine = cosine;
@@ -206,13 +206,14 @@ void bind_tracks(nb::module_& m) {
             options.max_uncoded_block_area = max_uncoded_block_area;
             options.smoothness = smoothness;
             options.border = border;
+            options.bridge = bridge;
             options.interpolation = interpolation;
             new (self) TrackBuilder(options);
           },
           nb::kw_only(), "min_length"_a, "cosine"_a, "cosine_relative_to_dominant"_a,
           "cosine_scale"_a, "max_interval"_a, "max_block_area"_a, "max_uncoded_block_area"_a,
           "smoothness"_a,
-          "border"_a, "interpolation"_a)
+          "border"_a, "interpolation"_a, "bridge"_a)
       .def("add", &add_frame, nb::kw_only(), "decode_index"_a, "display_index"_a, "show_frame"_a,
            "width"_a,
            "height"_a, "coded_width"_a, "ref_decode_index"_a, "ref_display_index"_a,

@@ -16,6 +16,7 @@ namespace {
 
 constexpr float kUnit = 4.F;
 constexpr float kHalfUnit = 2.F;
+constexpr int kMaxBridge = 8;  // units to the motion on either side
 constexpr std::size_t kMaxDominantSamples = 1024;
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
@@ -167,6 +168,7 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
   }
   judge_blocks(frame, coded);
   if (options_.interpolation > 0) interpolate(frame);
+  if (options_.bridge > 0) bridge(frame);
   return frame;
 }
 
@@ -259,6 +261,61 @@ void TrackBuilder::interpolate(Frame& frame) {
   }
 }
 
+// Units of a block without motion that may be trusted, such as an intra one, move as what lies on
+// either side where that moves alike, across and down: each is given the motion between.
+void TrackBuilder::bridge(Frame& frame) {
+  auto& list = frame.motion[0];
+  block_motion_.assign(list.begin(), list.end());
+  const auto nearest = [&](int row, int col, int row_step, int col_step, int* distance) {
+    for (*distance = 1; *distance <= kMaxBridge; ++*distance) {
+      row += row_step;
+      col += col_step;
+      if (row < 0 || row >= frame.visible_rows || col < 0 || col >= frame.visible_cols) break;
+      const UnitMotion& motion = block_motion_[row * frame.cols + col];
+      if (motion.ref != 0) return &motion;
+    }
+    return static_cast<const UnitMotion*>(nullptr);
+  };
+  for (int row = 0; row < frame.visible_rows; ++row) {
+    for (int col = 0; col < frame.visible_cols; ++col) {
+      const int unit = row * frame.cols + col;
+      if (block_motion_[unit].ref != 0 || frame.motion[1][unit].ref != 0) continue;
+      UnitMotion between;
+      float total = 0.F;
+      bool agrees = true;
+      for (const bool across : {true, false}) {
+        int before = 0;
+        int behind = 0;
+        const UnitMotion* a = nearest(row, col, across ? 0 : -1, across ? -1 : 0, &before);
+        const UnitMotion* b = nearest(row, col, across ? 0 : 1, across ? 1 : 0, &behind);
+        if (a == nullptr || b == nullptr || a->ref != b->ref) continue;
+        if (between.ref != 0 && a->ref != between.ref) continue;
+        if (!moves_alike(*a, *b)) {
+          agrees = false;
+          continue;
+        }
+        const float share = static_cast<float>(before) / static_cast<float>(before + behind);
+        const float weight = 1.F / static_cast<float>(before + behind);
+        const float gap = distance({a->dx, a->dy}, {b->dx, b->dy});
+        between.dx += weight * (a->dx + share * (b->dx - a->dx));
+        between.dy += weight * (a->dy + share * (b->dy - a->dy));
+        between.variance += weight * (std::max(a->variance, b->variance) + gap * gap);
+        between.ref = a->ref;
+        total += weight;
+      }
+      if (between.ref == 0 || !agrees) continue;
+      between.dx /= total;
+      between.dy /= total;
+      between.variance /= total;
+      list[unit] = between;
+    }
+  }
+}
+
+bool TrackBuilder::moves_alike(const UnitMotion& a, const UnitMotion& b) const {
+  return distance({a.dx, a.dy}, {b.dx, b.dy}) < static_cast<float>(options_.bridge);
+}
+
 TrackBuilder::Agreement TrackBuilder::judge_border(const Frame& frame, int row, int col,
                                                    int list) const {
   Agreement result;
@@ -333,8 +390,11 @@ void TrackBuilder::chain_frame(Frame& frame) {
       if (link.forward) {
         chain_forward(link, list);
       } else {
-        chain_backward(link, list);
+        chain_backward(link, list, Reach::kOwn);
       }
+    }
+    for (int list = 0; list < 2 && !link.forward && options_.bridge > 0; ++list) {
+      chain_backward(link, list, Reach::kBeside);
     }
   }
   seed();
@@ -401,10 +461,10 @@ void TrackBuilder::fit_dominant(Link& link) {
   link.dominant = fit_dominant_motion(samples_, frame.coded_width, frame.height, scratch_);
 }
 
-// By the current frame's displacements: every free unit asks for the track nearest to
-// its centre, every track goes to the unit that puts it nearest to its centre (a stable
+// By the current frame's displacements: every free unit asks for the longest track that it
+// finds, every track goes to the unit that puts it nearest to its centre (a stable
 // matching, so the order of units does not matter).
-void TrackBuilder::chain_backward(const Link& link, int list) {
+void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion[list];
   bool found = false;
   for (int row = 0; row < current_->visible_rows; ++row) {
@@ -416,7 +476,12 @@ void TrackBuilder::chain_backward(const Link& link, int list) {
       for (int unit = first; unit >= 0;) {
         int cell = -1;
         Claim claim;
-        if (!best_cell(link, unit, motion[unit], &cell, &claim)) break;
+        if (reach == Reach::kOwn) {
+          best_cell(link, unit, motion[unit], &cell, &claim);
+        } else {
+          best_cell_beside(link, list, unit, &cell, &claim);
+        }
+        if (cell < 0) break;
         unit = std::exchange(claims_[cell], claim).unit;
       }
     }
@@ -431,8 +496,27 @@ void TrackBuilder::chain_backward(const Link& link, int list) {
   }
 }
 
+// The same by the displacements of the units beside `unit`: where these point apart, tracks lie in
+// the gap that their blocks leave.
+void TrackBuilder::best_cell_beside(const Link& link, int list, int unit, int* best,
+                                    Claim* best_claim) const {
+  const int row = unit / current_->cols;
+  const int col = unit % current_->cols;
+  const auto& motion = current_->motion[list];
+  for (int r = std::max(0, row - 1); r <= std::min(current_->visible_rows - 1, row + 1); ++r) {
+    for (int c = std::max(0, col - 1); c <= std::min(current_->visible_cols - 1, col + 1); ++c) {
+      const int other = r * current_->cols + c;
+      if (other == unit || !link.refs[motion[other].ref] ||
+          !moves_alike(motion[other], motion[unit])) {
+        continue;
+      }
+      best_cell(link, unit, motion[other], best, best_claim);
+    }
+  }
+}
+
 // By the other frame's displacements: every track moves with the unit it lies in, and a
-// free unit takes the one that lands nearest to its centre.
+// free unit takes the longest one that lands in it.
 void TrackBuilder::chain_forward(const Link& link, int list) {
   const Frame& other = *link.other;
   const auto& motion = other.motion[list];
@@ -461,7 +545,8 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
       claim.cost = distance(claim.position, centre);
       if (!found) claims_.assign(current_->cells.size(), Claim{});
       found = true;
-      if (is_better(claim, claims_[target], other) &&
+      const Claim& holder = claims_[target];
+      if ((holder.unit < 0 || is_preferred(cell, claim, other.cells[holder.unit], holder)) &&
           passes_cosine(link, unit, from, moved, &claim)) {
         claims_[target] = claim;
       }
@@ -477,8 +562,9 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
   }
 }
 
-// The nearest track that `unit` has a better claim on than the unit that holds it.
-bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
+// The longest track that `unit` has a better claim on than the unit that holds it; what `best`
+// holds already is kept where it is longer.
+void TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
                              Claim* best_claim) const {
   const Frame& other = *link.other;
   const float scale_x = current_->coded_width / other.width;
@@ -489,7 +575,6 @@ bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motio
   const Window window =
       around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
              reach / scale_x, reach / scale_y);
-  *best = -1;
   for (int row = window.top; row <= window.bottom; ++row) {
     for (int col = window.left; col <= window.right; ++col) {
       const int cell = row * other.cols + col;
@@ -504,7 +589,8 @@ bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motio
       claim.unit = unit;
       claim.cost = distance(claim.position, centre);
       claim.variance = found.variance + motion.variance;
-      if ((*best >= 0 && claim.cost >= best_claim->cost) || !is_in_picture(claim.position) ||
+      if ((*best >= 0 && !is_preferred(found, claim, other.cells[*best], *best_claim)) ||
+          !is_in_picture(claim.position) ||
           !is_better(claim, claims_[cell], *current_) ||
           tracks_[found.track].last_seen == frames_chained_ ||
           !passes_cosine(link, cell, claim.position, target, &claim)) {
@@ -514,7 +600,14 @@ bool TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motio
       *best_claim = claim;
     }
   }
-  return *best >= 0;
+}
+
+// Of two tracks that want one unit the longer goes on: another one can start at any time.
+bool TrackBuilder::is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
+                                const Claim& other_claim) const {
+  const int32_t length = tracks_[cell.track].length;
+  const int32_t other_length = tracks_[other.track].length;
+  return length != other_length ? length > other_length : claim.cost < other_claim.cost;
 }
 
 // The vectors of small blocks are the better ones. `frame` has the claiming units.

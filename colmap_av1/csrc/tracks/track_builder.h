@@ -26,6 +26,7 @@ struct TrackBuilderOptions {
   double smoothness = -1;
   double interpolation = -1;
   double border = -1;
+  double bridge = -1;
 };
 
 // One coded frame. Borrowed for the call.
@@ -163,12 +164,17 @@ class TrackBuilder {
     int right = -1;
   };
 
+  // Whose displacements a unit looks for tracks by: its own, or those of the units beside it.
+  enum class Reach { kOwn, kBeside };
+
   bool uses_cosine() const { return options_.cosine >= -1; }
   Frame* find_frame(int decode_index) const;
   bool is_waiting(int display_index) const;
   Frame& read_frame(const CodedFrame& coded);
   void judge_blocks(Frame& frame, const CodedFrame& coded) const;
   void interpolate(Frame& frame);
+  void bridge(Frame& frame);
+  bool moves_alike(const UnitMotion& a, const UnitMotion& b) const;
   Agreement judge_border(const Frame& frame, int row, int col, int list) const;
   void chain_up_to(int display_index);
   void chain_frame(Frame& frame);
@@ -176,10 +182,14 @@ class TrackBuilder {
   bool is_within_reach(int interval) const;
   bool links(const Frame& from, const Frame& to) const;
   void fit_dominant(Link& link);
-  void chain_backward(const Link& link, int list);
+  void chain_backward(const Link& link, int list, Reach reach);
   void chain_forward(const Link& link, int list);
-  bool best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
+  void best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
                  Claim* best_claim) const;
+  void best_cell_beside(const Link& link, int list, int unit, int* best,
+                        Claim* best_claim) const;
+  bool is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
+                    const Claim& other_claim) const;
   static bool is_better(const Claim& claim, const Claim& holder, const Frame& frame);
   static float distance(Point a, Point b);
   bool passes_cosine(const Link& link, int other_unit, Point from, Point moved,
