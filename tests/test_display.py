@@ -13,7 +13,7 @@ from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_av1 import cli
+from colmap_av1 import summaries
 from colmap_av1.display import Display, shown_picture, shown_points, shown_size, turn_of_matrix
 from colmap_av1.errors import VideoError
 from colmap_av1.info import inspect
@@ -306,7 +306,7 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
 
 
 def info_rows(video: Path) -> list[tuple[str, str]]:
-    return cli._info_rows(inspect(video))
+    return summaries.info_rows(inspect(video))
 
 
 def test_images_whose_pixels_were_made_square(
