@@ -15,6 +15,7 @@ from colmap_av1.errors import ColmapAv1Error, EvaluationError, ModelError, Optio
 from colmap_av1.evaluate.clouds import cloud_distances, model_points
 from colmap_av1.evaluate.footage import Footage, choose_footage
 from colmap_av1.evaluate.frontends import Frontend, imported_frontend, make_frontends, run_frontend
+from colmap_av1.evaluate.learned import check_learned_options
 from colmap_av1.evaluate.mapping import (
     MapperSettings,
     densify_model,
@@ -94,6 +95,7 @@ def compare(
     video, output = Path(video), Path(output)
     write_report = _report_writer()
     frontends = _chosen_frontends(options)
+    check_learned_options(options.learned)
     open_stages(output)
     try:
         footage = choose_footage(

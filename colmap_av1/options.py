@@ -258,8 +258,11 @@ class LearnedOptions:
     max_keypoints: int = 2048
     # images are scaled down to this many pixels along the longer side
     max_image_size: int = 1024
-    # images after each that it is matched with; none: all, up to 30 images, else 4
-    neighbours: int | None = None
+    # only every n-th image is matched; the others stay without a pose
+    learned_every: int = 1
+    # distances between the images of a pair, in images that are matched; None: all pairs of
+    # up to 30 images, else 1,2,4,8
+    learned_offsets: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)

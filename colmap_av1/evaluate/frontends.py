@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -148,23 +148,31 @@ def _learned(
     features: str, options: LearnedOptions, footage: Footage, database: Path
 ) -> dict[str, float]:
     files = database.with_name("features.h5"), database.with_name("matches.h5")
-    seconds = extract_and_match(features, footage.image_path, footage.names, files, options)
-    return {**seconds, **_import(*files, footage, database)}
+    names = footage.names[:: options.learned_every]
+    seconds = extract_and_match(features, footage.image_path, names, files, options)
+    return {**seconds, **_import(files, names, footage, database)}
 
 
-def _import(features: Path, matches: Path, footage: Footage, database: Path) -> dict[str, float]:
+def _import_all(files: tuple[Path, Path], footage: Footage, database: Path) -> dict[str, float]:
+    return _import(files, footage.names, footage, database)
+
+
+def _import(
+    files: tuple[Path, Path], names: Sequence[str], footage: Footage, database: Path
+) -> dict[str, float]:
+    """Fill a database from files in hloc's layout, which hold the named images at least."""
     clock = Clock()
     pycolmap.set_random_seed(0)
     with clock.measure("import"):
-        found = read_hloc(features, matches)
-        missing = next((name for name in footage.names if name not in found.names), None)
+        found = read_hloc(*files)
+        missing = next((name for name in names if name not in found.names), None)
         if missing is not None:
             raise HlocError(
-                f"{features}: lacks image '{missing}': extract the features of the images in "
+                f"{files[0]}: lacks image '{missing}': extract the features of the images in "
                 f"{footage.image_path}"
             )
         _list_images(footage, database)
-        pairs = _write_hloc(found, set(footage.names), database)
+        pairs = _write_hloc(found, set(names), database)
     with clock.measure("verification"):
         listing = database.with_name("pairs.txt")
         listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
@@ -224,7 +232,7 @@ def learned_frontend(features: str, options: LearnedOptions | None = None) -> Fr
 def imported_frontend(features: Path, matches: Path) -> Frontend:
     """What other programs wrote in hloc's layout, verified by COLMAP."""
     return Frontend(
-        partial(_import, features, matches),
+        partial(_import_all, (features, matches)),
         lambda footage: (
             *(content_of(path) if path.is_file() else None for path in (features, matches)),
             pycolmap.__version__,

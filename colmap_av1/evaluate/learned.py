@@ -13,9 +13,9 @@ from colmap_av1.errors import EvaluationError, OptionError
 from colmap_av1.options import LearnedOptions
 
 PROGRAM = Path(__file__).with_name("lightglue_matches.py")
-# So many images are matched exhaustively.
+# So many images are matched exhaustively, more of them at these distances.
 _FEW = 30
-_NEIGHBOURS = 4
+_OFFSETS = (1, 2, 4, 8)
 
 
 def extract_and_match(
@@ -43,14 +43,12 @@ def extract_and_match(
         Wall time of "extraction" and "matching".
 
     Raises:
-        OptionError: an option has a value that cannot work.
         EvaluationError: the packages are missing, or the program failed.
     """
-    _check(options)
     task = {
         "features": features,
         "images": {name: str(image_path / name) for name in names},
-        "pairs": pairs_of(names, options.neighbours),
+        "pairs": pairs_of(names, options.learned_offsets),
         "features_file": str(files[0]),
         "matches_file": str(files[1]),
         "max_keypoints": options.max_keypoints,
@@ -74,21 +72,28 @@ def extract_and_match(
     return seconds
 
 
-def pairs_of(names: Sequence[str], neighbours: int | None) -> list[tuple[str, str]]:
-    """The pairs that are matched: each image with those after it.
+def pairs_of(names: Sequence[str], offsets: Sequence[int] | None) -> list[tuple[str, str]]:
+    """The pairs that are matched.
 
     Args:
         names: the images, in display order.
-        neighbours: how many; None: all where there are few images, else _NEIGHBOURS.
+        offsets: distances between the images of a pair; None: all pairs where there are few
+            images, else _OFFSETS.
     """
-    if neighbours is None:
-        neighbours = len(names) if len(names) <= _FEW else _NEIGHBOURS
-    return [(a, b) for i, a in enumerate(names) for b in names[i + 1 : i + 1 + neighbours]]
+    if offsets is None:
+        offsets = range(1, len(names)) if len(names) <= _FEW else _OFFSETS
+    return [(a, b) for d in offsets for a, b in zip(names, names[d:], strict=False)]
 
 
-def _check(options: LearnedOptions) -> None:
-    least = {"max_keypoints": 16, "max_image_size": 64, "neighbours": 1}
+def check_learned_options(options: LearnedOptions) -> None:
+    """Refuse options that cannot work.
+
+    Raises:
+        OptionError: a value cannot work.
+    """
+    least = {"max_keypoints": 16, "max_image_size": 64, "learned_every": 1}
     for name, value in least.items():
-        given = getattr(options, name)
-        if given is not None and given < value:
-            raise OptionError(f"{name} is {given}: give {value} or more")
+        if getattr(options, name) < value:
+            raise OptionError(f"{name} is {getattr(options, name)}: give {value} or more")
+    if options.learned_offsets is not None and min(options.learned_offsets, default=0) < 1:
+        raise OptionError(f"learned_offsets is {options.learned_offsets}: give 1 or more each")
