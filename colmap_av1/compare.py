@@ -25,6 +25,7 @@ from colmap_av1.evaluate.mapping import (
 from colmap_av1.evaluate.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.evaluate.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.sequence import read_poses
+from colmap_av1.evaluate.trainers import check_trainer, train, write_split
 from colmap_av1.model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions
 from colmap_av1.progress import Progress, no_progress
@@ -96,6 +97,7 @@ def compare(
     write_report = _report_writer()
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
+    _check_training(options)
     open_stages(output)
     try:
         footage = choose_footage(
@@ -121,6 +123,7 @@ def compare(
                 options=options,
                 progress=progress,
             )
+        columns = [_trained(column, footage, output, options, progress) for column in columns]
         found = given if given is not None else _Reference()
         found = _with_pseudo_truth(found, columns, footage)
         measured = [_measure(column, found, footage) for column in columns]
@@ -240,6 +243,43 @@ def _run_column(
         dense = replace(dense, error=str(error), model_path=None)
     progress(name, 3, total)
     return [column, dense]
+
+
+def _check_training(options: CompareOptions) -> None:
+    if options.trainer is not None:
+        check_trainer(options.trainer)
+    if options.iterations < 1 or min(options.milestones, default=1) < 1:
+        raise OptionError(
+            f"iterations is {options.iterations}, milestones are {options.milestones}: give 1 or "
+            "more each"
+        )
+
+
+def _trained(
+    column: Column, footage: Footage, output: Path, options: CompareOptions, progress: Progress
+) -> Column:
+    """The column with what is trained on its model."""
+    if column.model_path is None or not (options.split or options.trainer):
+        return column
+    folder = output / "splats" / column.name.replace(" ", "")
+    stage = f"{column.name}, training"
+    try:
+        progress(stage, 0, 1)
+        split = write_split(column.model_path, footage.image_path, folder / "split")
+        if options.trainer is None:
+            return column
+        training = train(
+            options.trainer,
+            split,
+            folder / "training",
+            name=column.name,
+            iterations=options.iterations,
+            milestones=options.milestones,
+        )
+        progress(stage, 1, 1)
+    except ColmapAv1Error as error:
+        return replace(column, training_error=str(error))
+    return replace(column, training=training)
 
 
 def _larger(a: int | None, b: int | None) -> int | None:

@@ -288,6 +288,16 @@ class CompareOptions:
     frontends: tuple[str, ...] = ("av1", "av1-refined", "sift-exhaustive", "sift-sequential")
     # beside each of this package's models one of all its tracks on the same poses
     all_tracks: bool = True
+    # trains 3D Gaussians on half of each model's images: 'gsplat', which needs CUDA, or a shell
+    # command with {data}, the folder of that half, and of {test}, the other half's, {output},
+    # {renders}, which gets the renderings of the test images, {iterations} and {name}
+    trainer: str | None = None
+    # of the training
+    iterations: int = 30_000
+    # iterations after which gsplat's renderings are measured, too
+    milestones: tuple[int, ...] = (1000, 3000, 7000, 15_000)
+    # write the two halves even where nothing is trained
+    split: bool = False
 
 
 @dataclass(frozen=True)

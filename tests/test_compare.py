@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,7 @@ from colmap_av1 import compare as compare_module
 from colmap_av1.cli import main
 from colmap_av1.compare import compare
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
+from colmap_av1.evaluate.trainers import match_renders
 from colmap_av1.export import export_hloc
 from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
 
@@ -172,9 +174,68 @@ def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeyp
             run_again(video, output, truth)
     assert times(output) == kept
     report = run_again(video, output, truth)
+    assert [c.error for c in report.columns[:3]] == [""] * 3
     assert report.columns[1].model.num_registered == 8
     assert set(kept.items()) < set(times(output).items())
     assert len(times(output)) == 5
+
+
+@pytest.mark.slow
+def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
+    output = tmp_path / "report"
+    shutil.copytree(compared, output)
+    copy = "import shutil, sys; shutil.copytree(*sys.argv[1:], dirs_exist_ok=True)"
+    command = f'{sys.executable} -c "{copy}" {{test}}/images {{renders}} && echo {{iterations}}'
+    options = CompareOptions(
+        match=OPTIONS, frontends=("av1",), all_tracks=False, trainer=command, iterations=7
+    )
+    report = compare(video, output, reference=truth, options=options)
+    (column,) = report.columns
+    training = column.training
+    assert training.names == [f"frame_{i:06d}.png" for i in (6, 18, 30, 42)]
+    assert training.metrics.psnr_y.tolist() == [60] * 4
+    assert (output / "splats" / "av1" / "training" / "log.txt").read_text() == "7\n"
+    train = output / "splats" / "av1" / "split" / "train"
+    model = pycolmap.Reconstruction(train / "sparse" / "0")
+    names = [f"frame_{i:06d}.png" for i in (0, 12, 24, 36)]
+    assert sorted(i.name for i in model.images.values()) == names
+    assert sorted(p.name for p in (train / "images").iterdir()) == names
+    assert model.num_points3D() == column.model.num_points
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    results = json.loads((output / "results.json").read_text())
+    assert results["columns"][0]["training"]["metrics"]["psnr_y"] == [60] * 4
+    html = (output / "report.html").read_text()
+    assert "frame_000030.png, photograph" in html
+    assert "av1: 60.00 dB" in html
+
+    # What fails leaves its line, and figures of the clouds.
+    refused = {
+        "false {data}": "the trainer ended with status 1",
+        "echo {data}": "holds 0 renderings for 4 test images",
+    }
+    for command, told in refused.items():
+        options = replace(options, trainer=command)
+        (column,) = compare(video, output, reference=truth, options=options).columns
+        assert told in column.training_error
+        assert column.model.num_registered == 8
+        assert (
+            f"nothing rendered of av1: {column.training_error}"
+            in (output / "report.md").read_text()
+        )
+
+
+def test_renderings_are_found_by_name_or_order(tmp_path):
+    references = [tmp_path / f"frame_{i:06d}.png" for i in (1, 3, 5)]
+    renders = tmp_path / "renders"
+    renders.mkdir()
+    with pytest.raises(EvaluationError, match="holds 0 renderings for 3 test images"):
+        match_renders(renders, references)
+    for name in ("9.png", "10.png", "100.png"):
+        (renders / name).touch()
+    assert [p.name for p in match_renders(renders, references)] == ["9.png", "10.png", "100.png"]
+    for reference in references:
+        (renders / f"{reference.stem}.jpg").touch()
+    assert [p.stem for p in match_renders(renders, references)] == [r.stem for r in references]
 
 
 @pytest.mark.slow
@@ -208,6 +269,13 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         assert told in error
+    for trainer in ("train {scene}", "train {data} {", "train"):
+        assert main([*given, "--trainer", trainer]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"trainer '{trainer}': " in error
+    assert main([*given, "--learned_offsets", "1,0"]) == 2
+    assert main([*given, "--iterations", "0"]) == 2
     assert not output.exists()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").touch()

@@ -164,6 +164,38 @@ def length_chart(columns: Sequence[Column]) -> bytes:
         return _svg(figure)
 
 
+def training_chart(columns: Sequence[Column]) -> bytes | None:
+    """Curves of the renderings' PSNR-Y over the training's time, as SVG; None without any."""
+    colours = colours_of([c.name for c in columns])
+    trained = [(c.name, c.training.states) for c in columns if c.training and c.training.states]
+    if not trained:
+        return None
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(10, 3.4), layout="constrained")
+        axis: Any = figure.subplots()
+        for name, states in trained:
+            quality = [float(state.metrics.psnr_y.mean()) for state in states]
+            seconds = [state.seconds for state in states]
+            axis.plot(seconds, quality, marker="o", color=colours[name], label=name)
+        axis.set_xlabel("seconds of training")
+        axis.set_title("PSNR-Y of the test images, dB", loc="left", fontsize=9)
+        axis.grid(alpha=0.25)
+        axis.legend(frameon=False, fontsize=8)
+        return _svg(figure)
+
+
+def crop_window(reference: _Image) -> tuple[slice, slice]:
+    """Rows and columns of the third of a picture, each way, that has the strongest edges."""
+    grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    edges = cv2.magnitude(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1))
+    height, width = (max(1, n // 3) for n in grey.shape)
+    sums = cv2.integral(edges)
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width]
+    inside += sums[:-height, :-width]
+    row, column = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return slice(int(row), int(row) + height), slice(int(column), int(column) + width)
+
+
 def _bars(axis: Any, panel: _Panel, colours: Mapping[str, str]) -> None:
     place = list(range(len(colours)))
     known = [value is not None and np.isfinite(value) for value in panel.values]

@@ -15,21 +15,28 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_av1.evaluate.footage import Footage
 from colmap_av1.evaluate.pictures import (
     bar_charts,
     cost_chart,
+    crop_window,
     draw_perspective,
     draw_plan,
     length_chart,
+    training_chart,
     view_of,
 )
 from colmap_av1.evaluate.results import Cloud, Column, CompareReport
+from colmap_av1.evaluate.splatting import share_of_time
 from colmap_av1.files import whole_file
 
 PICTURES = "pictures"
+# What the others' figures are shares of.
+BASELINE = "sift-exhaustive"
 _NONE = "-"
 _LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
 _CSS = """
@@ -97,12 +104,18 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
         "lengths": [_Figure("track_lengths.svg", "Track lengths", length_chart(report.columns))],
         "cost": [_Figure("cpu_time.svg", "CPU time", cost_chart(report.columns))],
     }
+    curves = training_chart(report.columns)
+    if curves is not None:
+        figures["training"] = [_Figure("training.svg", "Renderings over time", curves)]
+    figures["crops"] = _crop_figures(report.columns)
     folder = report.output / PICTURES
     folder.mkdir(exist_ok=True)
     for figure in (figure for group in figures.values() for figure in group):
         _write(folder / figure.name, figure.content)
     tables = {"models": _models_table(report), "cost": _cost_table(report.columns)}
     tables["lengths"] = _lengths_table(report.columns)
+    if any(column.training is not None for column in report.columns):
+        tables["renderings"] = _renderings_table(report.columns)
     _write(report.output / "report.md", _markdown(report, tables, figures).encode())
     _write(report.output / "report.html", _html(report, tables, figures).encode())
     _write(report.output / "results.json", _json(report).encode())
@@ -120,6 +133,8 @@ def _json(report: CompareReport) -> str:
             return {str(k): plain(v) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
             return [plain(v) for v in value]
+        if isinstance(value, np.ndarray):
+            return plain(value.tolist())
         if isinstance(value, float) and not math.isfinite(value):
             return None
         return str(value) if isinstance(value, Path) else value
@@ -141,7 +156,7 @@ def _versions() -> dict[str, str]:
 
 
 def _models_table(report: CompareReport) -> _Table:
-    base = next((c.model for c in report.columns if c.name == "sift-exhaustive"), None)
+    base = next((c.model for c in report.columns if c.name == BASELINE), None)
     header = ["front-end", "images", "points"]
     header += ["x SIFT exhaustive"] * (base is not None)
     header += ["track length", "error px, mean / median"]
@@ -256,6 +271,69 @@ def _lengths_table(columns: Sequence[Column]) -> _Table:
     return _Table("Track lengths", "", header, rows)
 
 
+def _renderings_table(columns: Sequence[Column]) -> _Table:
+    header = ["front-end", "PSNR-Y, dB", "SSIM, dB", "LPIPS", "VMAF", "Q", "difference of Q"]
+    header += ["Gaussians", "training, s", "share of the baseline's time"]
+    base = next((c.training for c in columns if c.name == BASELINE), None)
+    rows = []
+    told = ""
+    for column in columns:
+        training = column.training
+        if training is None:
+            rows.append([column.name, *[_NONE] * (len(header) - 1)])
+            continue
+        metrics = training.metrics
+        row = [column.name, f"{metrics.psnr_y.mean():.2f}", f"{metrics.ssim_db.mean():.2f}"]
+        row.append(f"{metrics.lpips.mean():.3f}" if metrics.lpips is not None else _NONE)
+        row += [f"{metrics.vmaf.mean():.2f}", f"{metrics.sharpness.mean():.2f}"]
+        row.append(f"{metrics.sharpness_difference.mean():.2f}")
+        row.append(f"{training.states[-1].num_gaussians:,}" if training.states else _NONE)
+        row.append(f"{training.seconds:.0f}")
+        share = None
+        if base is not None and base.states and training.states:
+            share = share_of_time(training.states, base.states)
+        row.append(f"{share:.0%}" if share is not None else _NONE)
+        rows.append(row)
+        told = metrics.no_lpips or told
+    about = (
+        "Means over the test images, which are the odd ones; trained on the even ones. Q: Zhu and "
+        "Milanfar's measure of sharpness, and its absolute difference to that of the photograph. "
+        f"The baseline is {BASELINE}: when its last PSNR-Y is reached."
+    )
+    return _Table("Renderings", f"{about} No LPIPS: {told}." if told else about, header, rows)
+
+
+def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
+    """The same part of a test image and of its renderings."""
+    trained = [(c.name, c.training) for c in columns if c.training is not None]
+    shared = (
+        [n for n in trained[0][1].names if all(n in t.names for _, t in trained)] if trained else []
+    )
+    if not shared:
+        return []
+    name = shared[len(shared) // 2]
+    first = trained[0][1]
+    reference = _picture(first.references[first.names.index(name)])
+    rows, cols = crop_window(reference)
+    figures = [_crop("photograph", f"{name}, photograph", reference[rows, cols])]
+    for column, training in trained:
+        i = training.names.index(name)
+        told = f"{column}: {training.metrics.psnr_y[i]:.2f} dB, VMAF {training.metrics.vmaf[i]:.1f}"
+        figures.append(
+            _crop(column.replace(" ", ""), told, _picture(training.renders[i])[rows, cols])
+        )
+    return figures
+
+
+def _crop(name: str, caption: str, picture: NDArray[np.uint8]) -> _Figure:
+    _, encoded = cv2.imencode(".png", picture)
+    return _Figure(f"{name}_crop.png", caption, encoded.tobytes())
+
+
+def _picture(path: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR), dtype=np.uint8)
+
+
 def _number(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else _NONE
 
@@ -310,6 +388,11 @@ def _notes(report: CompareReport) -> list[str]:
         if column.model is not None and column.model.num_registered < report.num_images:
             missing = report.num_images - column.model.num_registered
             notes.append(f"{column.name}: {missing} images have no pose")
+    untrained: dict[str, list[str]] = {}
+    for column in report.columns:
+        if column.training_error:
+            untrained.setdefault(column.training_error, []).append(column.name)
+    notes += [f"nothing rendered of {', '.join(names)}: {e}" for e, names in untrained.items()]
     if not report.pose_reference:
         notes.append(
             "no poses or cloud to measure against: give --reference, or compare sift-exhaustive"
@@ -336,6 +419,10 @@ def _markdown(
     parts += ["## Clouds from one viewpoint", ""]
     for figure in (*views, *plans):
         parts += [figure.caption, "", picture(figure), ""]
+    if "renderings" in tables:
+        parts += table(tables["renderings"])
+        for figure in (*figures.get("training", []), *figures["crops"]):
+            parts += [figure.caption, "", picture(figure), ""]
     parts += [*table(tables["lengths"]), picture(figures["lengths"][0]), ""]
     parts += [*table(tables["cost"]), picture(figures["cost"][0]), ""]
     return "\n".join(parts)
@@ -364,12 +451,16 @@ def _html(
         each = "".join(
             f'<figure><img alt="{html.escape(f.caption)}" src="{f.uri}">'
             f"<figcaption>{html.escape(f.caption)}</figcaption></figure>"
-            for f in figures["clouds"]
+            for f in (*figures["clouds"], *figures["crops"])
             if f.name.endswith(f"_{kind}.png")
         )
         upright = " upright" if kind == "view" and report.size[1] > report.size[0] else ""
         return f'<div class="clouds{upright}">{each}</div>'
 
+    renderings = ""
+    if "renderings" in tables:
+        renderings = table("renderings") + "".join(map(chart, figures.get("training", [])))
+        renderings += grid("crop")
     title = html.escape(f"Front-ends compared on {report.video.name}")
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in _notes(report))
     versions = ", ".join(f"{name} {number}" for name, number in _versions().items())
@@ -386,6 +477,7 @@ def _html(
         + "camera's path.</p>"
         + grid("view")
         + grid("plan")
+        + renderings
         + table("lengths")
         + chart(figures["lengths"][0])
         + table("cost")

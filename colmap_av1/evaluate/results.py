@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.evaluate.clouds import CloudDistances
 from colmap_av1.evaluate.mapping import ModelFigures
 from colmap_av1.evaluate.poses import PoseErrors
+from colmap_av1.evaluate.trainers import Training
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Column:
         track_lengths: points by the number of images that see them.
         cloud: distances to the reference's cloud; None where there is none, or it is this one.
         poses: errors of the poses against the reference's; None likewise.
+        training: 3D Gaussians trained on the model; None where nothing was.
+        training_error: why not, where something was to be.
     """
 
     name: str
@@ -43,6 +46,8 @@ class Column:
     track_lengths: dict[int, int] = dataclasses.field(default_factory=dict)
     cloud: CloudDistances | None = None
     poses: PoseErrors | None = None
+    training: Training | None = None
+    training_error: str = ""
 
 
 @dataclass(frozen=True)
