@@ -185,7 +185,8 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     copy = "import shutil, sys; shutil.copytree(*sys.argv[1:], dirs_exist_ok=True)"
-    command = f'{sys.executable} -c "{copy}" {{test}}/images {{renders}} && echo {{iterations}}'
+    words = f'{sys.executable} -c "{copy}" {{test}}/images {{renders}}'
+    command = f"cd {{data}} && {words} && echo {{iterations}}"
     options = CompareOptions(
         match=OPTIONS, frontends=("av1",), all_tracks=False, trainer=command, iterations=7
     )

@@ -165,10 +165,10 @@ def train(
         for path in (folder / "output", renders):
             path.mkdir()
         words = {
-            "data": split.train,
-            "test": split.test,
-            "output": folder / "output",
-            "renders": renders,
+            "data": split.train.resolve(),
+            "test": split.test.resolve(),
+            "output": (folder / "output").resolve(),
+            "renders": renders.resolve(),
             "iterations": iterations,
             "name": name,
         }
