@@ -1,14 +1,13 @@
 """Tracks of the rendered clip against its exact truth, and the metrics against known cases."""
 
 import functools
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+import render_scene
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import build_tracks, read_motion
@@ -31,21 +30,12 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
 @pytest.fixture(scope="module")
-def render_scene():
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def scene(render_scene):
+def scene():
     return render_scene.build_scene()
 
 
 @pytest.fixture(scope="module")
-def transfer(render_scene, scene):
+def transfer(scene):
     return functools.partial(render_scene.transfer, scene)
 
 
@@ -76,7 +66,7 @@ def _tracks(size, offsets, frame, xy):
 
 
 @pytest.fixture(scope="module")
-def true_tracks(render_scene, scene):
+def true_tracks(scene):
     """Surface points followed exactly, from frame 10 to 20."""
     rng = np.random.default_rng(1)
     points = render_scene.surface_points(scene, 15, rng.uniform(100, 260, (300, 2)))

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import render_scene
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
@@ -23,17 +22,6 @@ STEP = np.array([1.3, -0.45])
 FLAT = 80  # columns on the left without texture
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 EXAMPLE = EXAMPLES / "scene.mp4"
-
-
-@pytest.fixture(scope="module")
-def render_scene() -> Any:
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def texture(size: int, seed: int = 0) -> NDArray[np.float32]:
@@ -205,7 +193,7 @@ def test_progress_counts_frames() -> None:
     assert seen == list(range(1, FRAMES + 1))
 
 
-def test_the_example_clip_is_refined_and_knows_its_errors(render_scene: Any) -> None:
+def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
     tracks = build_tracks(read_motion(EXAMPLE))
     refined = refine_tracks(tracks, decode_frames(EXAMPLE), LK)
     later = np.ones(len(tracks.frame), bool)

@@ -1,26 +1,14 @@
 """The example clip and its truth agree with each other and with themselves."""
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import pytest
+import render_scene
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-
-
-def _load():
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-render_scene = _load()
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ those held out.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from tracks import load_render_scene
 
 from colmap_av1 import FrameMotion, RefineOptions, Tracks, build_tracks, read_motion
 from colmap_av1.evaluate import model_poses
@@ -118,12 +118,7 @@ def main() -> int:
 
 def rendered_clip() -> Clip:
     """The example clip, of which every point's true path is known."""
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    assert spec is not None
-    assert spec.loader is not None
-    render_scene = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = render_scene
-    spec.loader.exec_module(render_scene)
+    render_scene = load_render_scene()
     scene = render_scene.build_scene()
 
     def errors(tracks: Tracks, source: NDArray[np.int64], target: NDArray[np.int64]) -> Floats:

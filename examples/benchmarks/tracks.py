@@ -240,15 +240,21 @@ def measure_case(
     return rows, about
 
 
-def rendered_clip() -> Material:
-    """The example clip with its exact truth."""
+def load_render_scene() -> Any:
+    """The script that rendered the example clip, as a module."""
     spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["render_scene"] = module
     spec.loader.exec_module(module)
-    scene = module.build_scene()
+    return module
+
+
+def rendered_clip() -> Material:
+    """The example clip with its exact truth."""
+    render_scene = load_render_scene()
+    scene = render_scene.build_scene()
     camera = pycolmap.Camera(
         model="PINHOLE",
         width=scene.width,
@@ -260,7 +266,7 @@ def rendered_clip() -> Material:
         num_frames=len(scene.cam_from_world),
         camera=camera,
         poses=scene.cam_from_world,
-        transfer=functools.partial(module.transfer, scene),
+        transfer=functools.partial(render_scene.transfer, scene),
     )
 
 
