@@ -43,6 +43,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.reconstruct import densify, reconstruct
 from colmap_av1.summaries import (
+    Rows,
     check_rows,
     compare_rows,
     densify_rows,
@@ -394,6 +395,14 @@ def _match_options(namespace: argparse.Namespace) -> MatchOptions:
     )
 
 
+def _print_result(namespace: argparse.Namespace, rows: Rows, warnings: Sequence[str] = ()) -> None:
+    """Print the warnings, and a summary unless it is not wanted."""
+    for warning in warnings:
+        print_warning(warning)
+    if not namespace.quiet:
+        print_summary(rows)
+
+
 def _run_match(namespace: argparse.Namespace) -> None:
     options = _match_options(namespace)
     with progress_bars(namespace.quiet) as report:
@@ -404,10 +413,8 @@ def _run_match(namespace: argparse.Namespace) -> None:
             options=options,
             progress=report,
         )
-    for warning in result.warnings:
-        print_warning(warning)
+    _print_result(namespace, match_rows(result), result.warnings)
     if not namespace.quiet:
-        print_summary(match_rows(result))
         print_next(result)
 
 
@@ -419,10 +426,7 @@ def _run_reconstruct(namespace: argparse.Namespace) -> None:
     )
     with progress_bars(namespace.quiet) as report:
         result = reconstruct(namespace.video, namespace.output, options=options, progress=report)
-    for warning in result.warnings:
-        print_warning(warning)
-    if not namespace.quiet:
-        print_summary(reconstruct_rows(result))
+    _print_result(namespace, reconstruct_rows(result), result.warnings)
 
 
 def _run_densify(namespace: argparse.Namespace) -> None:
@@ -438,10 +442,7 @@ def _run_densify(namespace: argparse.Namespace) -> None:
             options=options,
             progress=report,
         )
-    for warning in result.warnings:
-        print_warning(warning)
-    if not namespace.quiet:
-        print_summary(densify_rows(result))
+    _print_result(namespace, densify_rows(result), result.warnings)
 
 
 def _run_compare(namespace: argparse.Namespace) -> None:
@@ -464,10 +465,7 @@ def _run_compare(namespace: argparse.Namespace) -> None:
     for column in result.columns:
         if column.error:
             print_warning(f"{column.name}: {column.error}")
-    for warning in result.warnings:
-        print_warning(warning)
-    if not namespace.quiet:
-        print_summary(compare_rows(result))
+    _print_result(namespace, compare_rows(result), result.warnings)
 
 
 def _run_encode(namespace: argparse.Namespace) -> None:
@@ -480,9 +478,8 @@ def _run_encode(namespace: argparse.Namespace) -> None:
             options=given(namespace, EncodeOptions),
             progress=report,
         )
-    if not namespace.quiet:
-        rows = [("frames", str(result.num_frames)), ("encoder", result.encoder)]
-        print_summary([*rows, ("output", str(result.output))])
+    rows = [("frames", str(result.num_frames)), ("encoder", result.encoder)]
+    _print_result(namespace, [*rows, ("output", str(result.output))])
 
 
 def _run_info(namespace: argparse.Namespace) -> None:
@@ -509,8 +506,7 @@ def _run_motion(namespace: argparse.Namespace) -> None:
             given(namespace, ReadOptions),
             lambda done: report("motion", done, None),
         )
-    if not namespace.quiet:
-        print_summary([("coded frames", str(count)), ("output", namespace.output)])
+    _print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
 
 
 def _run_export(namespace: argparse.Namespace) -> None:
@@ -518,14 +514,8 @@ def _run_export(namespace: argparse.Namespace) -> None:
         num_images, num_pairs = export_hloc(
             namespace.database, namespace.output, given(namespace, ExportOptions), report
         )
-    if not namespace.quiet:
-        print_summary(
-            [
-                ("images", str(num_images)),
-                ("pairs", str(num_pairs)),
-                ("output", namespace.output),
-            ]
-        )
+    rows = [("images", str(num_images)), ("pairs", str(num_pairs))]
+    _print_result(namespace, [*rows, ("output", namespace.output)])
 
 
 def _run_view(namespace: argparse.Namespace) -> None:
@@ -552,8 +542,7 @@ def _run_view(namespace: argparse.Namespace) -> None:
             read=given(namespace, ReadOptions),
             progress=report,
         )
-    if not namespace.quiet:
-        print_summary([("frames", str(count)), ("output", namespace.output)])
+    _print_result(namespace, [("frames", str(count)), ("output", namespace.output)])
 
 
 def _serve(namespace: argparse.Namespace) -> None:

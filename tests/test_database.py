@@ -3,7 +3,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from half_way import kill, start_writing
 from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, alignment_error, make_scene, match_scene
@@ -460,39 +460,7 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
     make_empty(path)
     query(path, f"PRAGMA journal_mode = {journal}")
     before = dump(path)
-    script = """
-        import sys, time
-        sys.path.insert(0, sys.argv[2])
-        import numpy as np
-        from colmap_av1 import database, database_file
-        from test_database import CAMERA, NAMES, ROWS
-
-        class Waiting(list):
-            def __getitem__(self, index):
-                if index == len(self) - 1:
-                    print("half-way", flush=True)
-                    time.sleep(60)
-                return super().__getitem__(index)
-
-        # A small cache makes SQLite write pages of the open transaction to the disk.
-        connect = database_file.sqlite3.connect
-        def connect_small(*args, **kwargs):
-            connection = connect(*args, **kwargs)
-            connection.execute("PRAGMA cache_size = 5")
-            return connection
-        database_file.sqlite3.connect = connect_small
-        rows = {**ROWS, "geometries": Waiting(ROWS["geometries"])}
-        database.write_matches(sys.argv[1], NAMES, CAMERA, **rows)
-    """
-    with subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(script), path, Path(__file__).parent],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=path.parent,  # else the checkout would hide the installed package
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "half-way\n"
-        process.send_signal(signal.SIGKILL)
+    kill(start_writing(path, "error", "test_database", "ROWS"))
     assert dump(path) == before
     write_matches(path, NAMES, None, **ROWS)
     assert len(query(path, "SELECT * FROM matches")) == len(ROWS["pairs"])

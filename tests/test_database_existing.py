@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from existing_database import (
     query,
     sift_keypoints,
 )
+from half_way import kill, start_writing
 from numpy.typing import NDArray
 from synthetic_scene import HEIGHT, WIDTH, alignment_error
 
@@ -493,50 +493,6 @@ def test_matcher_of_pycolmap_runs_after_an_append(tmp_path: Path, layout: str) -
     options.use_gpu = False
     pycolmap.match_exhaustive(path, matching_options=options, device=pycolmap.Device.cpu)
     check_matched_again(path, before)
-
-
-WAITING = """
-    import sys, time
-    sys.path.insert(0, sys.argv[2])
-    import numpy as np
-    from colmap_av1 import database, database_file
-    from existing_database import CAMERA, NAMES, OURS
-
-    class Waiting(list):
-        def __getitem__(self, index):
-            if index == len(self) - 1:
-                print("half-way", flush=True)
-                time.sleep(60)
-            return super().__getitem__(index)
-
-    # A small cache makes SQLite write pages of the open transaction to the disk.
-    connect = database_file.sqlite3.connect
-    def connect_small(*args, **kwargs):
-        connection = connect(*args, **kwargs)
-        connection.execute("PRAGMA cache_size = 5")
-        return connection
-    database_file.sqlite3.connect = connect_small
-    rows = {**OURS, "geometries": Waiting(OURS["geometries"])}
-    database.write_matches(sys.argv[1], NAMES, CAMERA, **rows, on_existing=sys.argv[3])
-"""
-
-
-def start_writing(path: Path, mode: str) -> subprocess.Popen[str]:
-    """A process that has written most rows and then waits inside its transaction."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(WAITING), path, Path(__file__).parent, mode],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=path.parent,  # else the checkout would hide the installed package
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "half-way\n"
-    return process
-
-
-def kill(process: subprocess.Popen[str]) -> None:
-    with process:
-        process.send_signal(signal.SIGKILL)
 
 
 @pytest.mark.parametrize("mode", MODES)
