@@ -196,7 +196,7 @@ def encode(
         raise EncodeError(f"{output}: the folder does not exist: make it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
-    remove_leftovers(output)
+    remove_leftovers(output.parent, output.name)
     facts = video_facts(video)
     name, ffmpeg = find_encoder(options)
     encoder = _ENCODERS[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import os
 from collections.abc import Iterator
@@ -27,14 +28,21 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def remove_leftovers(path: Path) -> None:
-    """Remove what killed processes left of a file that they wrote by `whole_file`."""
+def remove_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove what killed processes left of files that they wrote by `whole_file`.
+
+    Args:
+        folder: where the files are.
+        name: of the file; None: any.
+    """
     if os.name != "posix":  # elsewhere asking for a process may end it
         return
-    for name in glob.glob(f".{glob.escape(path.name)}.*.partial", root_dir=path.parent):
-        writer = name.split(".")[-2]
+    names = "*" if name is None else glob.escape(name)
+    for leftover in glob.glob(f".{names}.*.partial", root_dir=folder):
+        writer = leftover.split(".")[-2]
         if writer.isdecimal() and not _is_running(int(writer)):
-            (path.parent / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # what cannot be removed does no harm
+                (folder / leftover).unlink()
 
 
 def _is_running(process: int) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.display import Display
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.files import whole_file
+from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.video import decode_frames
 
 _WRITE_PARAMETERS = {
@@ -270,6 +270,7 @@ def write_images(
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ImageError(f"{parent}: cannot be made: {error.strerror}") from error
+        remove_leftovers(parent)
 
     last = max(wanted)
     size: tuple[int, ...] | None = None

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError
-from colmap_av1.files import whole_file
+from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import ReadOptions
 
@@ -56,6 +56,7 @@ def export_motion(
         raise OptionError(f"{path}: give an output file that ends in .npz or .h5")
     count = 0
     try:
+        remove_leftovers(path.parent, path.name)
         with whole_file(path) as partial:
             with writers[path.suffix.lower()](partial) as write:
                 for frame in read_motion(video, options):

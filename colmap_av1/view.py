@@ -25,7 +25,7 @@ from colmap_av1.database import (
 )
 from colmap_av1.database_file import check_layout, open_unaltered
 from colmap_av1.errors import DatabaseError, ImageError, OptionError
-from colmap_av1.files import whole_file
+from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.images import image_file
 from colmap_av1.model import read_model
 from colmap_av1.motion import read_motion
@@ -516,6 +516,7 @@ def _open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[_Image],
 def _output(path: Path) -> Iterator[Path]:
     """A `whole_file`, whose errors become ours."""
     try:
+        remove_leftovers(path.parent, path.name)
         with whole_file(path) as partial:
             yield partial
     except (OSError, av.error.FFmpegError) as error:

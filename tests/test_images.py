@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -169,6 +172,16 @@ def test_full_disk_leaves_no_partial_image(clip: Path, tmp_path: Path) -> None:
     with no_space(), pytest.raises(ImageError, match=r"a\.png: cannot be written"):
         write_images(clip, tmp_path, ["a.png"], [0])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_leftovers_of_killed_processes_are_removed(clip: Path, tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    others = [f".b.png.{os.getpid()}.partial", ".b.png.partial", ".b.png.x.partial", "b.partial"]
+    for name in [f".a.png.{ended.pid}.partial", f".b [1].png.{ended.pid}.partial", *others]:
+        (tmp_path / name).touch()
+    write_images(clip, tmp_path, ["a.png"], [0])
+    assert {p.name for p in tmp_path.iterdir()} == {"a.png", *others}
 
 
 def test_frames_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
