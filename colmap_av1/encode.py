@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ import imageio_ffmpeg
 from colmap_av1.errors import BitstreamError, EncodeError, NotAv1Error, OptionError, VideoError
 from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.options import EncodeOptions
+from colmap_av1.processes import bound
 from colmap_av1.progress import Progress, no_progress
 from colmap_av1.video import VideoFacts, count_frames, open_stream, video_facts
 
@@ -41,15 +41,6 @@ _KEPT_FORMATS = (".mp4", ".mkv", ".webm")
 _TALK = ("-hide_banner", "-nostats", "-v", "level+info")
 _MESSAGE_SOURCE = re.compile(r"^(\[[^\]]+\] )+")
 _GRAVE = re.compile(r"\[(error|fatal|panic)\]")
-# A program that becomes ffmpeg. Linux ends it with the process that started it, even where that is
-# killed and cannot.
-_BOUND = """
-import ctypes, os, signal, sys
-starter, *command = sys.argv[1:]
-ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-if os.getppid() == int(starter):
-    os.execv(command[0], command)
-"""
 _NEW_SIZE = re.compile(r"Reconfiguring filter graph.* changed to .*, (\d+)x(\d+)")
 
 
@@ -420,10 +411,8 @@ def _run(
 @contextmanager
 def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen[str]]:
     """A running ffmpeg that does not outlive what waits for it."""
-    if sys.platform == "linux" and sys.executable:
-        command = [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
     process = subprocess.Popen(
-        command,
+        bound(command),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=words,  # type: ignore[call-overload]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from colmap_av1.errors import ModelError
+from colmap_av1.processes import bound
 from colmap_av1.progress import Progress
 
 # Poses that are nearly right need no more steps; COLMAP's own limits take five times as long.
@@ -147,7 +148,7 @@ def _run_apart(
     with (
         log.open("wb") as file,
         subprocess.Popen(
-            [sys.executable, "-c", _CHILD, json.dumps(settings)],
+            bound([sys.executable, "-c", _CHILD, json.dumps(settings)]),
             stdout=subprocess.PIPE,
             stderr=file,
             env={**os.environ, "PYTHONPATH": path},
