@@ -537,7 +537,7 @@ def match_images(
         cameras: the camera of all images, or one for each.
         options: those of pairs and verification are used.
         clock: gets the stages "pairs" and "verification".
-        progress: told about the stage "verification".
+        progress: told about the stages "pairs" and "verification".
 
     Raises:
         VideoError: no two images share enough tracks.
@@ -551,7 +551,10 @@ def match_images(
                 "nothing to match: 'colmap-av1 info --video' says what the stream lacks, "
                 "--reencode 1 converts it first"
             )
-        matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
+        matches = []
+        for i, j in pairs:
+            matches.append(pair_matches(keypoints[i], keypoints[j]))
+            progress("pairs", len(matches), len(pairs))
     with clock.measure("verification"):
         geometries = verify_pairs(
             keypoints,

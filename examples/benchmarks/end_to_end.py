@@ -1,11 +1,13 @@
-"""Time the way from a video to a dense model beside SIFT's way to its sparse one.
+"""Time the ways from a video to a database and to a dense model beside SIFT's.
 
 python examples/benchmarks/end_to_end.py --cache benchmark_end_to_end
 
 In turn, for each sequence and round: `reconstruct` makes the folder that trainers open from the
-AV1 stream; pycolmap extracts SIFT, matches sequentially and maps the same frames; `densify` puts
-the tracks on the poses of that model. Every step has a process of its own; medians over the rounds.
-Poses are judged against the truth, where none is known against SIFT's exhaustive model.
+AV1 stream; pycolmap extracts SIFT, matches sequentially and maps the same frames; `match` fills a
+database with the default preset and the same mapper maps that; `densify` puts the tracks on the
+poses of SIFT's model. Every step has a process of its own; medians over the rounds, and what they
+are of SIFT's. Poses are judged against the truth, where none is known against SIFT's exhaustive
+model.
 """
 
 from __future__ import annotations
@@ -44,33 +46,66 @@ from colmap_av1 import (
 )
 from colmap_av1.evaluate import (
     Footage,
+    FrontendRun,
+    MapperRun,
     MapperSettings,
+    Measured,
     map_database,
     model_figures,
     model_poses,
     pose_errors,
     prepare_footage,
     run_frontend,
+    run_measured,
 )
-from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.model import read_model
+
+# The ways, and the one that each is compared with.
+SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
+SIFT_MODEL = "SIFT sequential: model"
+WAYS = {
+    SIFT_DATABASE: None,
+    SIFT_MAPPER: None,
+    SIFT_MODEL: None,
+    "match: database": SIFT_DATABASE,
+    "match: mapper": SIFT_MAPPER,
+    "reconstruct: dense model": SIFT_MODEL,
+    "densify on SIFT's model": SIFT_MODEL,
+}
 
 
 @dataclass(frozen=True)
-class Figures:
-    """What one way took in one round and what came out."""
+class Step:
+    """What a step took: wall and CPU seconds, peak memory in bytes."""
 
     seconds: float
     cpu_seconds: float
     peak_memory: int
-    num_images: int
-    num_points: int
-    error: float
-    ate: float | None
+
+    def __add__(self, other: Step) -> Step:
+        """This step and then another one."""
+        return Step(
+            self.seconds + other.seconds,
+            self.cpu_seconds + other.cpu_seconds,
+            max(self.peak_memory, other.peak_memory),
+        )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What one way took in one round and, where it ends with a model, what came out."""
+
+    seconds: float
+    cpu_seconds: float
+    peak_memory: int
+    num_images: int | None = None
+    num_points: int | None = None
+    error: float | None = None
+    ate: float | None = None
 
 
 def main() -> int:
-    """Measure both ways on every sequence and print the table."""
+    """Measure all ways on every sequence and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -124,31 +159,46 @@ def measure_case(
     if truth.poses is None:
         model = reference_model(footage, folder, settings, console)
         truth = with_reference(truth, model, material.num_frames)
-    measured: dict[str, list[Figures]] = {"reconstruct": [], "SIFT sequential": [], "densify": []}
+    measured: dict[str, list[Figures]] = {way: [] for way in WAYS}
     for number in range(rounds):
         console.print(f"{case.name}: round {number + 1} of {rounds}", markup=False)
         where = folder / "round"
         shutil.rmtree(where, ignore_errors=True)
         where.mkdir()
-        made = run_measured(
-            run_reconstruct, footage, case, where / "dense", log=where / "reconstruct.log"
+        log = where / "log.txt"
+
+        def add(way: str, step: Step, model: Path | None = None) -> None:
+            measured[way].append(figures(step, model, material, truth))
+
+        made = step_of(run_measured(run_reconstruct, footage, case, where / "dense", log=log))
+        add("reconstruct: dense model", made, where / "dense" / "sparse" / "0")
+        sift = step_of_frontend(run_frontend("sift-sequential", footage, where / "sift"))
+        mapped = map_database(
+            where / "sift" / "database.db", footage.image_path, where / "sift-model", settings
         )
-        model = where / "dense" / "sparse" / "0"
-        measured["reconstruct"].append(figures([made], model, material, truth))
-        sift = run_frontend("sift-sequential", footage, where / "sift")
-        mapper = map_database(sift.database, footage.image_path, where / "sift-model", settings)
-        if mapper.model is None:
-            console.print(f"{case.name}: SIFT gives no model", markup=False)
-            continue
-        # What the front-end tells is of its stages; its process does nothing else.
-        both = [(sum(sift.seconds.values()), sift.cpu_seconds, sift.peak_memory)]
-        both.append((mapper.seconds, mapper.cpu_seconds, mapper.peak_memory))
-        measured["SIFT sequential"].append(figures(both, mapper.model, material, truth))
-        onto = run_measured(
-            run_densify, mapper.model, footage, case, where / "onto", log=where / "densify.log"
+        ours = step_of_frontend(run_frontend("av1", footage, where / "match"))
+        our_model = map_database(
+            where / "match" / "database.db", footage.image_path, where / "match-model", settings
         )
-        measured["densify"].append(figures([onto], where / "onto", material, truth))
+        add(SIFT_DATABASE, sift)
+        add("match: database", ours)
+        add("match: mapper", step_of(our_model), our_model.model)
+        add(SIFT_MAPPER, step_of(mapped), mapped.model)
+        add(SIFT_MODEL, sift + step_of(mapped), mapped.model)
+        if mapped.model is not None:
+            onto = run_measured(run_densify, mapped.model, footage, case, where / "onto", log=log)
+            add("densify on SIFT's model", step_of(onto), where / "onto")
     return measured
+
+
+def step_of(run: Measured | MapperRun) -> Step:
+    """What a process took."""
+    return Step(run.seconds, run.cpu_seconds, run.peak_memory or 0)
+
+
+def step_of_frontend(run: FrontendRun) -> Step:
+    """What a front-end took; its process does nothing but its stages."""
+    return Step(sum(run.seconds.values()), run.cpu_seconds, run.peak_memory or 0)
 
 
 def run_reconstruct(footage: Footage, case: Case, output: Path) -> None:
@@ -163,20 +213,18 @@ def run_densify(model: Path, footage: Footage, case: Case, output: Path) -> None
     densify(model, footage.video, output, options=DensifyOptions(match=options))
 
 
-def figures(steps: list, model: Path, material: Material, truth: Truth) -> Figures:
-    """Sums over the steps of (seconds, CPU seconds, peak memory), and what the model is worth."""
-    taken = [
-        s if isinstance(s, tuple) else (s.seconds, s.cpu_seconds, s.peak_memory) for s in steps
-    ]
+def figures(step: Step, model: Path | None, material: Material, truth: Truth) -> Figures:
+    """What a way took, and what its model is worth."""
+    taken = (step.seconds, step.cpu_seconds, step.peak_memory)
+    if model is None:
+        return Figures(*taken)
     reconstruction = read_model(model)
     about = model_figures(reconstruction)
     errors = None
     if truth.poses is not None:
         errors = pose_errors(model_poses(reconstruction, material.num_frames), truth.poses)
     return Figures(
-        seconds=sum(step[0] for step in taken),
-        cpu_seconds=sum(step[1] for step in taken),
-        peak_memory=max(step[2] or 0 for step in taken),
+        *taken,
         num_images=about.num_registered,
         num_points=about.num_points,
         error=about.mean_error,
@@ -191,16 +239,16 @@ def table_rows(name: str, measured: dict[str, list[Figures]]) -> list[list[str]]
         values = [getattr(figures, field) for figures in measured[way]]
         return None if not values or None in values else statistics.median(values)
 
-    def cell(way: str, field: str, spell: str, scale: float = 1.0) -> str:
-        value, base = median(way, field), median("SIFT sequential", field)
+    def cell(way: str, field: str, spell: str) -> str:
+        value, other = median(way, field), WAYS[way]
         if value is None:
             return "-"
-        ratio = f" ({value / base:.2f}x)" if base and way != "SIFT sequential" else ""
-        return f"{value * scale:{spell}}{ratio}"
+        base = median(other, field) if other is not None else None
+        return f"{value:{spell}} ({value / base:.2f}x)" if base else f"{value:{spell}}"
 
     columns = (
-        *(("num_images", ".0f", 1.0), ("num_points", ",.0f", 1.0), ("error", ".3f", 1.0)),
-        *(("ate", ".4f", 1.0), ("seconds", ".1f", 1.0), ("cpu_seconds", ".1f", 1.0)),
+        *(("num_images", ".0f"), ("num_points", ",.0f"), ("error", ".3f")),
+        *(("ate", ".4f"), ("seconds", ".1f"), ("cpu_seconds", ".1f")),
     )
     rows = []
     for way, values in measured.items():
