@@ -71,19 +71,25 @@ class DatabaseImage:
 
 
 def make_camera(
-    options: CameraOptions, width: int, height: int, pixel_aspect: float = 1.0
+    options: CameraOptions,
+    width: int,
+    height: int,
+    pixel_aspect: float = 1.0,
+    focal_length: float | None = None,
 ) -> pycolmap.Camera:
     """Make the camera of new images.
 
     Without parameters it is COLMAP's first guess, without a focal length prior: focal length
     1.2 times the longer side, principal point in the centre, no distortion. Where pixels are
-    not square, this holds for the picture as it is shown. Given parameters count as a prior.
+    not square, this holds for the picture as it is shown. Given parameters, and a focal length
+    that is known otherwise, count as a prior.
 
     Args:
         options: camera model and parameters.
         width: image width in pixels.
         height: image height in pixels.
         pixel_aspect: width of a pixel over its height.
+        focal_length: in heights of a pixel; used where no parameters are given.
 
     Raises:
         OptionError: the model is unknown, or the parameters do not fit it.
@@ -96,7 +102,9 @@ def make_camera(
         raise OptionError(f"unknown camera model {name!r}: give one of {', '.join(names)}")
     model = pycolmap.CameraModelId.__members__[name]
     create = getattr(pycolmap.Camera, "create_from_model_id", None) or pycolmap.Camera.create
-    focal_length = 1.2 * max(width * pixel_aspect, height)
+    is_known = focal_length is not None or options.camera_params is not None
+    if focal_length is None:
+        focal_length = 1.2 * max(width * pixel_aspect, height)
     camera = create(0, model, focal_length, width, height)
     if len(camera.focal_length_idxs()) == 2:
         params = camera.params
@@ -107,7 +115,7 @@ def make_camera(
             f"camera model {name} has no focal length, so it does not fit a "
             "video: give a perspective or fisheye model such as SIMPLE_RADIAL"
         )
-    camera.has_prior_focal_length = options.camera_params is not None
+    camera.has_prior_focal_length = is_known
     if options.camera_params is not None:
         camera.params = _parse_camera_params(options.camera_params, camera)
     return camera

@@ -28,6 +28,7 @@ from colmap_av1.density import select_tracks
 from colmap_av1.display import Display, shown_size, turned_back
 from colmap_av1.encode import stream_of
 from colmap_av1.errors import BitstreamError, DatabaseError, ImageError, OptionError, VideoError
+from colmap_av1.focal import estimate_focal_length
 from colmap_av1.images import (
     check_image_folder,
     check_images_there,
@@ -67,6 +68,8 @@ _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 _INIT_MAX_FORWARD_MOTION = 0.95
 # Of the tracks; fewer over the picture are left out without a word.
 _NOTABLE_SHARE = 0.01
+# Camera models that a pinhole camera is a first guess of.
+_RECTILINEAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -87,6 +90,8 @@ class MatchReport:
         track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
             to 1 (longest).
         num_observations: keypoints of all images.
+        focal_length: in heights of a pixel, where the tracks told it; None where it was given,
+            or the motion does not tell it, so that the camera has COLMAP's first guess.
         num_pairs: image pairs written.
         num_verified_pairs: those with a two-view geometry.
         num_matches: matches of all pairs.
@@ -109,6 +114,7 @@ class MatchReport:
     num_tracks: int
     track_lengths: dict[float, int]
     num_observations: int
+    focal_length: float | None
     num_pairs: int
     num_verified_pairs: int
     num_matches: int
@@ -202,20 +208,29 @@ class PreparedImages:
 
 
 @dataclass(frozen=True)
-class MatchedImages:
-    """Keypoints of the images, and the verified matches between them.
+class PairedImages:
+    """Keypoints of the images, and the matches between them.
 
     Attributes:
         keypoints: keypoints of each image.
         pairs: int32 [m, 2] indices of images.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
-        geometries: two-view geometry of each pair.
-        forward_motion: the camera moves along its axis, see `MatchReport`.
     """
 
     keypoints: list[ImageKeypoints]
     pairs: NDArray[np.int32]
     matches: list[NDArray[np.uint32]]
+
+
+@dataclass(frozen=True)
+class MatchedImages(PairedImages):
+    """Keypoints of the images, and the verified matches between them.
+
+    Attributes:
+        geometries: two-view geometry of each pair.
+        forward_motion: the camera moves along its axis, see `MatchReport`.
+    """
+
     geometries: list[TwoViewGeometry]
     forward_motion: bool
 
@@ -268,11 +283,17 @@ def match(
         seen = np.isin(tracks.frame, chosen.frames)
         tracks = select_tracks(keep_observations(tracks, seen), options.density)
     pixel_aspect = prepared.pixel_aspect
+    paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
+    focal_length = None
+    if not listed:
+        focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
     cameras, new_cameras = _cameras(
-        database, listed, chosen.names, size, options.camera, pixel_aspect=pixel_aspect
+        *(database, listed, chosen.names, size, options.camera),
+        pixel_aspect=pixel_aspect,
+        focal_length=focal_length,
     )
     notes = [*tracked.warnings, *_camera_notes(cameras, listed, pixel_aspect)]
-    matched = match_images(video, tracks, chosen, cameras, options, clock=clock, progress=progress)
+    matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
 
     num_written = 0
     if folder is not None:
@@ -315,6 +336,7 @@ def match(
         num_tracks=len(lengths),
         track_lengths={q: int(v) for q, v in zip(_LENGTH_QUANTILES, quantiles, strict=True)},
         num_observations=sum(len(k.xy) for k in matched.keypoints),
+        focal_length=focal_length,
         num_pairs=len(matched.geometries),
         num_verified_pairs=sum(count > 0 for count in num_inliers),
         num_matches=sum(len(m) for m in matched.matches),
@@ -518,26 +540,24 @@ def track_video(
     return TrackedVideo(tracks, structure.num_coded, tuple(notes))
 
 
-def match_images(
+def pair_images(
     video: Path,
     tracks: Tracks,
     chosen: ChosenImages,
-    cameras: Any,
     options: MatchOptions,
     *,
     clock: Clock,
     progress: Progress,
-) -> MatchedImages:
-    """Match the images along the tracks, and verify the pairs.
+) -> PairedImages:
+    """Match the images along the tracks.
 
     Args:
         video: the file that messages name.
         tracks: tracks of the whole video.
         chosen: the images.
-        cameras: the camera of all images, or one for each.
-        options: those of pairs and verification are used.
-        clock: gets the stages "pairs" and "verification".
-        progress: told about the stages "pairs" and "verification".
+        options: those of pairs are used.
+        clock: gets the stage "pairs".
+        progress: told about the stage "pairs".
 
     Raises:
         VideoError: no two images share enough tracks.
@@ -555,6 +575,61 @@ def match_images(
         for i, j in pairs:
             matches.append(pair_matches(keypoints[i], keypoints[j]))
             progress("pairs", len(matches), len(pairs))
+    return PairedImages(keypoints, pairs, matches)
+
+
+def shared_focal_length(
+    paired: PairedImages,
+    size: tuple[int, int],
+    pixel_aspect: float,
+    options: MatchOptions,
+    *,
+    clock: Clock,
+) -> float | None:
+    """The focal length that the tracks tell of a camera about which nothing is given.
+
+    Args:
+        paired: the images, all of one camera.
+        size: (width, height) of the images in pixels.
+        pixel_aspect: width of a pixel over its height.
+        options: those of the camera and the seed are used.
+        clock: gets the stage "focal length".
+
+    Returns:
+        In heights of a pixel; None where parameters are given or the motion does not tell it.
+    """
+    camera = options.camera
+    if camera.camera_params is not None or camera.camera_model not in (None, *_RECTILINEAR):
+        return None
+    with clock.measure("focal length"):
+        return estimate_focal_length(
+            paired.keypoints,
+            paired.pairs,
+            paired.matches,
+            size,
+            pixel_aspect=pixel_aspect,
+            seed=options.verify.seed,
+        )
+
+
+def verify_images(
+    paired: PairedImages,
+    cameras: Any,
+    options: MatchOptions,
+    *,
+    clock: Clock,
+    progress: Progress,
+) -> MatchedImages:
+    """Verify the pairs.
+
+    Args:
+        paired: the images and their matches.
+        cameras: the camera of all images, or one for each.
+        options: those of verification are used.
+        clock: gets the stage "verification".
+        progress: told about the stage "verification".
+    """
+    keypoints, pairs, matches = paired.keypoints, paired.pairs, paired.matches
     with clock.measure("verification"):
         geometries = verify_pairs(
             keypoints,
@@ -704,6 +779,7 @@ def _cameras(
     options: CameraOptions,
     *,
     pixel_aspect: float,
+    focal_length: float | None,
 ) -> tuple[list[Any], Any]:
     """The camera of each image, and what the database is to get where it lists no images."""
     if listed:
@@ -713,7 +789,7 @@ def _cameras(
         if missing is not None:
             raise DatabaseError(f"{database}: image '{missing}' has no camera")
         return [cameras[camera_id[name]] for name in names], None
-    camera = make_camera(options, *size, pixel_aspect)
+    camera = make_camera(options, *size, pixel_aspect, focal_length)
     if options.single_camera:
         return [camera] * len(names), camera
     # Images share a camera where theirs are one object.

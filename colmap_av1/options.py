@@ -150,8 +150,8 @@ class CameraOptions:
     # name of one of COLMAP's camera models; None: SIMPLE_RADIAL, or OPENCV, which has two
     # focal lengths, where the video's pixels are not square
     camera_model: str | None = None
-    # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: focal length 1.2
-    # times the longer side and the principal point in the centre, both to be refined
+    # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: the focal length that
+    # the tracks tell, else 1.2 times the longer side, to be refined; principal point in the centre
     camera_params: str | None = None
     # one camera for all images instead of one for each
     single_camera: bool = True
@@ -221,7 +221,7 @@ class MapperOptions:
     """How the poses are found."""
 
     # COLMAP's 'incremental' or 'global' mapper; 'auto': the global one where camera_params
-    # are given, else the incremental one
+    # are given or the tracks tell the focal length, else the incremental one
     mapper: Literal["auto", "incremental", "global"] = "auto"
     # refine focal length and distortion; None: unless camera_params are given
     refine_intrinsics: bool | None = None

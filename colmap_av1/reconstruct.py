@@ -26,9 +26,11 @@ from colmap_av1.match import (
     MatchedImages,
     VideoSource,
     check_options,
-    match_images,
     open_source,
+    pair_images,
+    shared_focal_length,
     track_video,
+    verify_images,
 )
 from colmap_av1.model import ModelImage, ModelPoints, read_model, write_model
 from colmap_av1.options import (
@@ -433,17 +435,13 @@ def _match_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept)
         with clock.measure("pairs"):
             seen = np.isin(tracks.frame, chosen.frames)
             sparse = select_tracks(keep_observations(tracks, seen), density)
-        pixel_aspect = read_display(run.source.pictures).pixel_aspect
-        camera = make_camera(options.match.camera, tracks.width, tracks.height, pixel_aspect)
-        matched = match_images(
-            run.source.pictures,
-            sparse,
-            chosen,
-            camera,
-            options.match,
-            clock=clock,
-            progress=progress,
-        )
+        video = run.source.pictures
+        paired = pair_images(video, sparse, chosen, options.match, clock=clock, progress=progress)
+        size = (tracks.width, tracks.height)
+        pixel_aspect = read_display(video).pixel_aspect
+        focal_length = shared_focal_length(paired, size, pixel_aspect, options.match, clock=clock)
+        camera = make_camera(options.match.camera, *size, pixel_aspect, focal_length)
+        matched = verify_images(paired, camera, options.match, clock=clock, progress=progress)
         with clock.measure("database"):
             write_matches(
                 partial / "database.db",
@@ -454,7 +452,11 @@ def _match_stage(run: _Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept)
                 matches=matched.matches,
                 geometries=matched.geometries,
             )
-        return {"num_pose_tracks": len(sparse.offsets) - 1, **_pair_facts(matched)}
+        return {
+            "num_pose_tracks": len(sparse.offsets) - 1,
+            "guessed": not camera.has_prior_focal_length,
+            **_pair_facts(matched),
+        }
 
     given = (density, options.match.pairs, options.match.verify, options.match.camera)
     return run_stage(
@@ -481,11 +483,11 @@ def _pair_facts(matched: MatchedImages) -> dict[str, Any]:
 
 def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
     options, clock, progress = run.options, run.clock, run.progress
-    mapping, camera = options.mapping, options.match.camera
+    mapping = options.mapping
     forward = bool(matched.facts["forward_motion"])
     mapper = mapping.mapper
     if mapper == "auto":
-        mapper = "incremental" if camera.camera_params is None else "global"
+        mapper = "incremental" if matched.facts["guessed"] else "global"
     refine = _refines_intrinsics(options)
 
     def make(partial: Path) -> dict[str, Any]:
@@ -506,7 +508,7 @@ def _pose_stage(run: _Run, matched: Kept, num_images: int) -> Kept:
                 progress=progress,
             )
         if not mapped.num_images:
-            raise ModelError(_why_no_start(matched.facts, mapper, camera.camera_params is None))
+            raise ModelError(_why_no_start(matched.facts, mapper))
         return {
             "num_registered": mapped.num_images[0],
             "other_models": list(mapped.num_images[1:]),
@@ -531,7 +533,7 @@ def _refines_intrinsics(options: ReconstructOptions) -> bool:
     return options.match.camera.camera_params is None
 
 
-def _why_no_start(facts: dict[str, Any], mapper: str, guessed: bool) -> str:
+def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     """Why a mapper found no two images to start with, and what to try."""
     told = f"COLMAP's {mapper} mapper finds no start"
     other = "incremental" if mapper == "global" else "global"
@@ -547,14 +549,14 @@ def _why_no_start(facts: dict[str, Any], mapper: str, guessed: bool) -> str:
             f"{facts['num_verified_pairs']} pairs the camera only turns or the scene is flat: film "
             "while moving sideways, or give a longer part of the video"
         )
-    if guessed:
+    if facts["guessed"]:
         return (
             f"{told}: the focal length is a guess and may be far off, or the parallax too little: "
             f"give --camera_model and --camera_params, or try --mapper {other}"
         )
     return (
-        f"{told}: the parallax between images that share tracks is too little, or the given "
-        f"camera_params do not fit: check them, or try --mapper {other}"
+        f"{told}: the parallax between images that share tracks is too little, or the intrinsics "
+        f"do not fit: give --camera_model and --camera_params, or try --mapper {other}"
     )
 
 

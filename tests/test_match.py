@@ -71,7 +71,7 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
     assert report.track_lengths[0.0] >= 3
     assert report.track_lengths[1.0] <= 16
     assert list(report.seconds) == [
-        "motion", "tracks", "choice", "pairs", "verification", "images", "database"
+        "motion", "tracks", "choice", "pairs", "focal length", "verification", "images", "database"
     ]  # fmt: skip
     assert report.warnings == ()
 

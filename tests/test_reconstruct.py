@@ -264,7 +264,7 @@ def test_poses_are_true(made: ReconstructReport, truth: Truth) -> None:
 def test_report(made: ReconstructReport) -> None:
     report = json.loads((made.output / "report.json").read_text())
     assert report["num_points"] == made.num_points
-    assert report["mapper"] == "incremental"
+    assert report["mapper"] == "global"
     assert set(report["seconds"]) >= {"motion", "poses", "points", "images"}
     with pycolmap.Database.open(made.database) as database:
         assert database.num_images() == NUM_IMAGES

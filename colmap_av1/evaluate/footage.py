@@ -14,7 +14,7 @@ from colmap_av1.density import select_tracks
 from colmap_av1.errors import ImageError, VideoError
 from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.images import check_images_there, existing_images, image_names, write_images
-from colmap_av1.match import PreparedImages, match_images, prepare_images
+from colmap_av1.match import PreparedImages, pair_images, prepare_images, verify_images
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
@@ -182,15 +182,15 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     seen = keep_observations(tracks, np.isin(tracks.frame, chosen.frames))
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
     try:
-        matched = match_images(
+        paired = pair_images(
             video,
             select_tracks(seen, DensityOptions(preset="sparse")),
             chosen,
-            camera,
             replace(options, pairs=PairOptions(offsets=(1,), growth=1.0)),
             clock=Clock(),
             progress=no_progress,
         )
     except VideoError:  # no two images share tracks; other front-ends may still match them
         return False
+    matched = verify_images(paired, camera, options, clock=Clock(), progress=no_progress)
     return matched.forward_motion

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_av1.focal import estimate_focal_length
+from colmap_av1.pairs import image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.tracks import Tracks
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
+NUM_FRAMES = 24
+
+
+def seen_by(
+    centre: NDArray[np.float64], turn: NDArray[np.float64], num_points: int = 600
+) -> Tracks:
+    """Tracks of points in a box; the camera's centres and rotation vectors, [NUM_FRAMES, 3]."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-6, -4, 8], [6, 4, 16], (num_points, 3))
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    local = np.einsum("fij,fpj->pfi", rotation, points - centre[:, None])
+    xy = FOCAL * local[..., :2] / local[..., 2:] + np.array([WIDTH / 2, HEIGHT / 2])
+    xy += rng.normal(0, 0.2, xy.shape)
+    return Tracks(
+        num_frames=NUM_FRAMES,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=np.arange(num_points + 1, dtype=np.int64) * NUM_FRAMES,
+        frame=np.tile(np.arange(NUM_FRAMES), num_points).astype(np.int32),
+        xy=xy.reshape(-1, 2).astype(np.float32),
+        sigma=np.zeros(xy.size // 2, np.float32),
+        confirmed=np.zeros(xy.size // 2, np.bool_),
+    )
+
+
+def walk(num_points: int = 600) -> Tracks:
+    """What a hand-held camera sees that walks sideways and looks up and around."""
+    t = np.linspace(0, 1, NUM_FRAMES)[:, None]
+    centre = np.hstack([3 * t, 0.5 * np.sin(5 * t), 0.8 * np.sin(3 * t)])
+    turn = np.hstack([0.2 * np.sin(6 * t), 0.25 * np.sin(4 * t), 0.05 * t])
+    return seen_by(centre, turn, num_points)
+
+
+def estimate(tracks: Tracks, pixel_aspect: float = 1.0) -> float | None:
+    keypoints = image_keypoints(tracks, range(tracks.num_frames))
+    pairs = schedule_pairs(keypoints)
+    matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
+    size = (tracks.width, tracks.height)
+    return estimate_focal_length(keypoints, pairs, matches, size, pixel_aspect=pixel_aspect)
+
+
+def test_walk() -> None:
+    found = estimate(walk())
+    assert found == pytest.approx(FOCAL, rel=0.04)
+    assert estimate(walk()) == found
+
+
+def test_oblong_pixels() -> None:
+    tracks = walk()
+    narrow = replace(tracks, width=WIDTH // 2, xy=tracks.xy / np.array([2, 1], np.float32))
+    assert estimate(narrow, pixel_aspect=2.0) == pytest.approx(FOCAL, rel=0.04)
+
+
+def test_wrong_matches() -> None:
+    tracks, rng = walk(), np.random.default_rng(0)
+    xy = tracks.xy.copy()
+    wrong = rng.random(len(xy)) < 0.1
+    xy[wrong] = rng.uniform(0, [WIDTH, HEIGHT], (int(wrong.sum()), 2)).astype(np.float32)
+    assert estimate(replace(tracks, xy=xy)) == pytest.approx(FOCAL, rel=0.08)
+
+
+def test_motion_along_the_axis() -> None:
+    t = np.linspace(0, 1, NUM_FRAMES)[:, None]
+    assert estimate(seen_by(np.hstack([0 * t, 0 * t, 4 * t]), np.zeros((NUM_FRAMES, 3)))) is None
+
+
+def test_circle_around_what_the_camera_looks_at() -> None:
+    """Pairs with axes that meet at equal distance tell no focal length."""
+    angle = np.linspace(-0.5, 0.5, NUM_FRAMES)[:, None]
+    centre = np.hstack([12 * np.sin(angle), 0 * angle, 12 - 12 * np.cos(angle)])
+    found = estimate(seen_by(centre, np.hstack([0 * angle, angle, 0 * angle])))
+    assert found is None
+
+
+def test_too_few_matches() -> None:
+    assert estimate(walk(num_points=40)) is None
