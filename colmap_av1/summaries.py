@@ -35,6 +35,8 @@ def match_rows(report: MatchReport) -> Rows:
         ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
     ]
+    if report.focal_length is not None:
+        rows.append(("focal length", f"{report.focal_length:.1f} px, told by the tracks"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     return [*rows, *_seconds_rows(report.seconds)]
