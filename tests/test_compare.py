@@ -134,6 +134,15 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     again = json.loads((output / "results.json").read_text())
     assert [c["seconds"] for c in again["columns"]] == [c["seconds"] for c in first["columns"]]
 
+    # A model as the truth: itself.
+    model = output / "frontends" / "sift-exhaustive" / "mapped" / "model"
+    report = run_again(video, output, model, "sift-exhaustive")
+    (sift,) = report.columns
+    assert (report.is_truth, report.pose_reference) == (True, str(model))
+    assert sift.poses.ate < 1e-6 * sift.poses.extent
+    assert sift.cloud.hausdorff < 1e-6 * sift.cloud.extent
+    assert times(output) == before
+
     # SIFT's features and matches as other programs would hand them in: a new column.
     export_hloc(
         output / "frontends" / "sift-exhaustive" / "matches" / "database.db", tmp_path / "h"

@@ -1,8 +1,10 @@
 """Front-ends and mapper of the comparison, what they take, and what of it is kept."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -69,6 +71,42 @@ def test_a_failing_call_says_where_its_log_is(tmp_path):
     assert "Traceback" in log.read_text()
     with pytest.raises(EvaluationError, match="its process ended with status 3"):
         run_measured(os._exit, 3, log=log)
+
+
+def _start(path):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    path.write_text(str(child.pid))
+    child.wait()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
+def test_an_interrupt_ends_what_the_process_started(tmp_path):
+    path = tmp_path / "pid"
+
+    def interrupt():
+        while not (path.exists() and path.read_text()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_measured(_start, path, log=tmp_path / "log")
+    thread.join()
+    pid, end = int(path.read_text()), time.monotonic() + 10
+    while _is_alive(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not _is_alive(pid)
+
+
+def _is_alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # One that nobody waits for is a zombie.
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_results_are_kept_while_their_key_is_the_same(tmp_path):
