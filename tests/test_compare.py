@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from colmap_av1 import compare as compare_module
 from colmap_av1.cli import main
 from colmap_av1.compare import compare
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
+from colmap_av1.evaluate.learned import pairs_of
 from colmap_av1.evaluate.trainers import match_renders
 from colmap_av1.export import export_hloc
 from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
@@ -310,6 +312,16 @@ def test_a_reference_of_other_images_is_refused(video, tmp_path):
         compare(video, tmp_path / "report", reference=poses, options=options)
     with pytest.raises(ImageError, match="holds no poses that can be read"):
         compare(video, tmp_path / "report", reference=tmp_path / "none", options=options)
+
+
+def test_learned_features_are_matched_at_growing_distances():
+    names = [f"{i:02}" for i in range(31)]
+    assert pairs_of(names[:4], None) == [
+        *(("00", "01"), ("01", "02"), ("02", "03"), ("00", "02"), ("01", "03"), ("00", "03"))
+    ]
+    distances = Counter(int(b) - int(a) for a, b in pairs_of(names, None))
+    assert distances == {1: 30, 2: 29, 4: 27, 8: 23}
+    assert pairs_of(names, (3,))[-1] == ("27", "30")
 
 
 def test_learned_features_without_their_extra(tmp_path):
