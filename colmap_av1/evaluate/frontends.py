@@ -122,8 +122,8 @@ def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str,
 def _list_images(footage: Footage, database: Path) -> None:
     """Make a database of the images, as COLMAP does."""
     reader = pycolmap.ImageReaderOptions()
-    if footage.camera.camera_model is not None:
-        reader.camera_model = footage.camera.camera_model
+    camera = make_camera(footage.camera, *footage.size, footage.pixel_aspect)
+    reader.camera_model = camera.model_name
     reader.camera_params = footage.camera.camera_params or ""
     pycolmap.Database.open(database).close()
     # Threads of the extraction would number the images in the order in which they finish.
