@@ -53,7 +53,7 @@ td { text-align: right; border-bottom: 1px solid #e5e7eb; padding: .3em .7em;
 table.cost td:last-child, table.cost th:last-child { text-align: left; white-space: normal; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 .clouds { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 14px; }
-.clouds.upright { grid-template-columns: repeat(auto-fill, minmax(210px, 1fr)); }
+.clouds.upright { grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); }
 figure { margin: 0; }
 figcaption { font-size: 13px; margin: .25em 0 .6em; }
 figure img, .chart { width: 100%; display: block; }
