@@ -42,6 +42,7 @@ class Footage:
         camera: the camera of all images.
         forward_motion: the camera moves along its axis, see `MatchReport`.
         warnings: what was noticed while the images were chosen.
+        existed: others wrote the images, which may be scaled.
     """
 
     video: Path
@@ -54,6 +55,7 @@ class Footage:
     camera: CameraOptions
     forward_motion: bool = False
     warnings: tuple[str, ...] = ()
+    existed: bool = False
 
 
 def prepare_footage(
@@ -117,6 +119,7 @@ def choose_footage(
 
     def work() -> dict[str, Any]:
         clock = Clock()
+        existed = bool(existing_images(images, options.images.image_name))
         prepared = prepare_images(video, images, options, listed={}, clock=clock, progress=progress)
         chosen = prepared.chosen
         write_images(
@@ -137,6 +140,7 @@ def choose_footage(
             "pixel_aspect": prepared.pixel_aspect,
             "forward_motion": _is_forward_motion(prepared, video, options),
             "warnings": prepared.tracked.warnings,
+            "existed": existed,
         }
 
     listed = options.images.frame_list

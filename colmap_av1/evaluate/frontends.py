@@ -9,10 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
-from colmap_av1.database import make_camera, write_matches
+from colmap_av1.database import make_camera
 from colmap_av1.errors import EvaluationError, HlocError, OptionError
 from colmap_av1.evaluate.footage import Footage, frame_list
 from colmap_av1.evaluate.learned import PROGRAM, extract_and_match
@@ -25,7 +24,6 @@ from colmap_av1.options import (
     LearnedOptions,
     MatchOptions,
 )
-from colmap_av1.pairs import ImageKeypoints
 from colmap_av1.progress import Clock
 
 Preset = Literal["sparse", "default", "dense"]
@@ -103,20 +101,10 @@ def run_frontend(
 
 
 def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
-    # The images exist: a database that lists them says so.
-    nothing = (np.empty((0, 2), np.float32), np.empty(0, np.int64))
-    write_matches(
-        database,
-        footage.names,
-        make_camera(footage.camera, *footage.size, footage.pixel_aspect),
-        [ImageKeypoints(frame, *nothing) for frame in footage.frames],
-        pairs=np.empty((0, 2), np.int32),
-        matches=(),
-        geometries=(),
-    )
     images = ImageOptions(frame_list=frame_list(footage, database.with_name("frames.txt")))
     options = replace(options, camera=footage.camera, images=images, on_existing="error")
-    return match(database, footage.video, options=options).seconds
+    folder = footage.image_path if footage.existed else None
+    return match(database, footage.video, image_path=folder, options=options).seconds
 
 
 def _list_images(footage: Footage, database: Path) -> None:
