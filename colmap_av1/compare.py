@@ -33,6 +33,10 @@ from colmap_av1.stages import open_stages
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"
+# Whose cloud stands for it where poses are given: the first that has them, up to a share of the
+# path's extent.
+_PSEUDO_TRUTHS = (PSEUDO_TRUTH, "sift-sequential")
+_LARGEST_ATE = 0.02
 ALL_TRACKS = " + all tracks"
 _OWN = "av1"
 
@@ -309,18 +313,22 @@ def _read_reference(path: Path, footage: Footage) -> _Reference:
 
 
 def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footage) -> _Reference:
-    """The same, with SIFT's exhaustive model for what is not given."""
-    column = next((c for c in columns if c.name == PSEUDO_TRUTH), None)
-    if given.points is not None or column is None or column.model_path is None:
+    """The same, with SIFT's model for what is not given; where poses are, one that has these."""
+    if given.points is not None:
         return given
-    model = read_model(column.model_path)
-    poses, points = image_poses(model, footage.names), model_points(model)
-    if given.poses is None:
-        return _Reference(poses, points, PSEUDO_TRUTH, PSEUDO_TRUTH)
-    similarity = fit_similarity(poses, given.poses)
-    if similarity is None:
-        return given
-    return replace(given, points=similarity.move(points), cloud_source=PSEUDO_TRUTH)
+    for name in _PSEUDO_TRUTHS if given.poses is not None else (PSEUDO_TRUTH,):
+        column = next((c for c in columns if c.name == name), None)
+        if column is None or column.model_path is None:
+            continue
+        model = read_model(column.model_path)
+        poses, points = image_poses(model, footage.names), model_points(model)
+        if given.poses is None:
+            return _Reference(poses, points, name, name)
+        similarity, errors = fit_similarity(poses, given.poses), pose_errors(poses, given.poses)
+        if similarity is None or errors is None or errors.ate > _LARGEST_ATE * errors.extent:
+            continue
+        return replace(given, points=similarity.move(points), cloud_source=name)
+    return given
 
 
 def _measure(

@@ -145,6 +145,15 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     assert sift.cloud.hausdorff < 1e-6 * sift.cloud.extent
     assert times(output) == before
 
+    # Poses that the model does not have: its cloud stands for no truth.
+    lines = truth.read_text().splitlines()[1:]
+    wrong = tmp_path / "wrong.txt"
+    moved = [[w.split()[0], str(i % 5), *w.split()[2:]] for i, w in enumerate(lines)]
+    wrong.write_text("\n".join(" ".join(words) for words in moved))
+    report = run_again(video, output, wrong, "sift-exhaustive")
+    assert (report.pose_reference, report.cloud_reference) == (str(wrong), "")
+    assert report.columns[0].poses.ate > 0.02 * report.columns[0].poses.extent
+
     # SIFT's features and matches as other programs would hand them in: a new column.
     export_hloc(
         output / "frontends" / "sift-exhaustive" / "matches" / "database.db", tmp_path / "h"
