@@ -88,11 +88,16 @@ def test_an_interrupt_ends_what_the_process_started(tmp_path):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
+    # What was started in the background of a shell ignores interrupts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     thread = threading.Thread(target=interrupt)
     thread.start()
-    with pytest.raises(KeyboardInterrupt):
-        run_measured(_start, path, log=tmp_path / "log")
-    thread.join()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_measured(_start, path, log=tmp_path / "log")
+    finally:
+        thread.join()
+        signal.signal(signal.SIGINT, before)
     pid, end = int(path.read_text()), time.monotonic() + 10
     while _is_alive(pid) and time.monotonic() < end:
         time.sleep(0.05)
