@@ -1,6 +1,7 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
 from colmap_av1.check import CheckReport, check
+from colmap_av1.densify import DensifyReport, densify
 from colmap_av1.encode import EncodeReport, encode
 from colmap_av1.errors import (
     BitstreamError,
@@ -37,7 +38,7 @@ from colmap_av1.options import (
     TriangulateOptions,
     VerifyOptions,
 )
-from colmap_av1.reconstruct import DensifyReport, ReconstructReport, densify, reconstruct
+from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.tracks import Tracks, build_tracks
 
 __all__ = [

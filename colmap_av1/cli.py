@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from colmap_av1.check import check
 from colmap_av1.command_options import add_options, given, underscored
 from colmap_av1.compare import compare
+from colmap_av1.densify import densify
 from colmap_av1.encode import encode
 from colmap_av1.errors import ColmapAv1Error, OptionError
 from colmap_av1.export import export_hloc
@@ -41,7 +42,7 @@ from colmap_av1.options import (
     VerifyOptions,
     ViewOptions,
 )
-from colmap_av1.reconstruct import densify, reconstruct
+from colmap_av1.reconstruct import reconstruct
 from colmap_av1.summaries import (
     Rows,
     check_rows,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from colmap_av1.check import CheckReport
+from colmap_av1.densify import DensifyReport
 from colmap_av1.evaluate.results import CompareReport
 from colmap_av1.info import StreamReport
 from colmap_av1.match import MatchReport
-from colmap_av1.reconstruct import DensifyReport, ReconstructReport
+from colmap_av1.reconstruct import ReconstructReport
 
 Rows = list[tuple[str, str]]
 

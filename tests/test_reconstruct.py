@@ -16,6 +16,7 @@ from conftest import PROJECT, Encode
 
 from colmap_av1 import mapper as mapper_module
 from colmap_av1.cli import main
+from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError
 from colmap_av1.evaluate.poses import model_poses, pose_errors
 from colmap_av1.model import ModelImage, ModelPoints, read_model, write_model
@@ -28,7 +29,7 @@ from colmap_av1.options import (
     ReconstructOptions,
     TriangulateOptions,
 )
-from colmap_av1.reconstruct import ReconstructReport, densify, reconstruct
+from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
 from colmap_av1.video import decode_frames
 
@@ -306,7 +307,7 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(importlib.import_module("colmap_av1.reconstruct"), "write_model", full)
+        patch.setattr(importlib.import_module("colmap_av1.reconstruct_stages"), "write_model", full)
         with pytest.raises(ModelError, match="No space left on device: the stages before are kept"):
             reconstruct(SCENE, made.output, options=other)
     assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before

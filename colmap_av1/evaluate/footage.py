@@ -13,8 +13,8 @@ from colmap_av1.database import make_camera
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import ImageError, VideoError
 from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.image_matches import pair_images, verify_images
 from colmap_av1.images import check_images_there, existing_images, image_names, write_images
-from colmap_av1.match import PreparedImages, pair_images, prepare_images, verify_images
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
@@ -25,6 +25,7 @@ from colmap_av1.options import (
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import keep_observations
 from colmap_av1.video import picture_size, read_display
+from colmap_av1.video_images import PreparedImages, prepare_images
 
 
 @dataclass(frozen=True)

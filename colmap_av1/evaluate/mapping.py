@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
+from colmap_av1.densify import densify
 from colmap_av1.evaluate.footage import Footage, frame_list
 from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.model import read_model
 from colmap_av1.options import DensifyOptions, ImageOptions
-from colmap_av1.reconstruct import densify
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,179 @@
+"""From a model and its video to a dense model on the same poses."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from colmap_av1.choice import choose_images
+from colmap_av1.dense_points import (
+    LEAST_AGREEING,
+    Colours,
+    model_points,
+    seen_in,
+    triangulate_tracks,
+)
+from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.images import size_of_images
+from colmap_av1.model import ModelImage, read_model, write_model
+from colmap_av1.option_checks import check_options
+from colmap_av1.options import DensifyOptions
+from colmap_av1.progress import Clock, Progress, no_progress
+from colmap_av1.tracks import scale_tracks
+from colmap_av1.triangulate import check_triangulate_options
+from colmap_av1.video import picture_size, read_display
+from colmap_av1.video_tracks import decoded_pictures, open_source, times_of_frames, track_video
+
+
+@dataclass(frozen=True)
+class DensifyReport:
+    """What `densify` made.
+
+    Attributes:
+        output: folder of the dense model.
+        model: the model whose poses it has.
+        num_images: images of the model.
+        num_tracks: tracks of the video that its images see often enough.
+        agreeing: share of these that agree with the poses.
+        num_points: 3D points.
+        num_model_points: those of the given model.
+        mean_error: mean reprojection error of the points in pixels.
+        seconds: wall time of each stage.
+        warnings: what the user should know.
+    """
+
+    output: Path
+    model: Path
+    num_images: int
+    num_tracks: int
+    agreeing: float
+    num_points: int
+    num_model_points: int
+    mean_error: float
+    seconds: dict[str, float]
+    warnings: tuple[str, ...]
+
+
+def densify(
+    model: str | os.PathLike[str],
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    image_path: str | os.PathLike[str] | None = None,
+    options: DensifyOptions | None = None,
+    progress: Progress | None = None,
+) -> DensifyReport:
+    """Triangulate the tracks of a video on the poses of a model that is there.
+
+    Poses, cameras and image names stay as they are; the points are new.
+
+    Args:
+        model: folder of a COLMAP model of this video's frames, from whatever mapper.
+        video: a video; one that is not AV1 is converted first.
+        output: new or empty folder for the dense model.
+        image_path: folder of the model's images, to tell by what they show which frames they
+            are where their names leave doubt.
+        options: options of every stage.
+        progress: called with a stage's name, what is done, and of how much where known.
+
+    Raises:
+        ModelError: there is no readable model with poses, it is not of this video, or the
+            dense one cannot be written.
+        VideoError: the video cannot be read.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: the model's images do not say which frames they are.
+        OptionError: an option has a value that cannot work, or the folder is not empty.
+    """
+    options = options if options is not None else DensifyOptions()
+    progress = progress if progress is not None else no_progress
+    model, video, output = Path(model), Path(video), Path(output)
+    clock = Clock()
+    video_size = picture_size(video)
+    check_options(options.match, video_size)
+    check_triangulate_options(options.triangulate)
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise OptionError(f"{output}: is there and not empty: give a new folder")
+    reconstruction = read_model(model)
+    by_name = {i.name: i for i in reconstruction.images.values() if i.has_pose}
+    cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in by_name.values()}
+    sizes = {
+        name: (int(cameras[i.camera_id].width), int(cameras[i.camera_id].height))
+        for name, i in by_name.items()
+    }
+    size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
+
+    source = open_source(video, options.match, clock=clock, progress=progress)
+    tracked = track_video(source, options.match, one_size=True, clock=clock, progress=progress)
+    with clock.measure("choice"):
+        chosen = choose_images(
+            tracked.tracks,
+            options.match.images,
+            existing=list(by_name),
+            folder=Path(image_path) if image_path is not None else None,
+            times=lambda: times_of_frames(source, tracked.tracks.num_frames),
+            decode=lambda: decoded_pictures(source, options.match),
+        )
+    tracks = scale_tracks(tracked.tracks, size)
+    images = [
+        ModelImage(
+            int(by_name[name].image_id),
+            name,
+            int(by_name[name].camera_id),
+            np.asarray(by_name[name].cam_from_world().matrix()),
+        )
+        for name in chosen.names
+    ]
+    seen, view = seen_in(tracks, chosen.frames)
+    with clock.measure("points"):
+        points = triangulate_tracks(
+            *(seen, view, [cameras[i.camera_id] for i in images]),
+            *([i.cam_from_world for i in images], None),
+            options=options.triangulate,
+            num_threads=options.match.verify.num_threads,
+            progress=progress,
+        )
+    agreeing = points.num_agreeing / max(points.num_tracks, 1)
+    if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
+        raise ModelError(
+            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses and "
+            f"{len(points.xyz)} give a point: give the video that the model's images come from, "
+            "and see that their names count its frames (--first_number, --frame_list)"
+        )
+    with clock.measure("colours"):
+        colours = Colours(seen, view, points, len(images))
+        image_of_frame = {int(frame): i for i, frame in enumerate(chosen.frames)}
+        for frame, picture in decoded_pictures(source, options.match):
+            progress("colours", frame + 1, tracks.num_frames)
+            if frame in image_of_frame:
+                colours.add(image_of_frame[frame], picture)
+            if frame >= chosen.frames[-1]:
+                break
+    with clock.measure("writing"):
+        partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
+        try:
+            partial.mkdir(parents=True)
+            xy = seen.xy[points.observation].astype(np.float64)
+            write_model(partial, cameras, images, model_points(points, colours.mean(), view, xy))
+            if output.exists():
+                output.rmdir()
+            partial.replace(output)
+        except OSError as error:
+            raise ModelError(f"{output}: cannot be written: {error.strerror}") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    return DensifyReport(
+        output=output,
+        model=model,
+        num_images=len(images),
+        num_tracks=points.num_tracks,
+        agreeing=agreeing,
+        num_points=len(points.xyz),
+        num_model_points=reconstruction.num_points3D(),
+        mean_error=float(points.error.mean()),
+        seconds=clock.seconds,
+        warnings=tracked.warnings,
+    )
