@@ -180,13 +180,7 @@ def _make_parser() -> argparse.ArgumentParser:
         commands, "reconstruct", _run_reconstruct, "make a dense model for 3D Gaussian splatting"
     )
     _add_video(command, "a video; one that is not AV1 is converted first")
-    command.add_argument(
-        "--output",
-        "--output_path",
-        required=True,
-        metavar="PATH",
-        help="folder for images/ and sparse/0/; that of an earlier run is gone on with",
-    )
+    _add_output(command, "folder for images/ and sparse/0/; that of an earlier run is gone on with")
     stages = {
         MapperOptions: "poses",
         TriangulateOptions: "points",
@@ -210,9 +204,7 @@ def _make_parser() -> argparse.ArgumentParser:
         "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
     )
     _add_video(command, "the video its images come from")
-    command.add_argument(
-        "--output", "--output_path", required=True, metavar="PATH", help="new folder for the model"
-    )
+    _add_output(command, "new folder for the model")
     command.add_argument(
         "--image_path", metavar="PATH", help="folder of its images, where names leave doubt"
     )
@@ -225,13 +217,7 @@ def _make_parser() -> argparse.ArgumentParser:
         commands, "compare", _run_compare, "compare with SIFT and others on a video, with a report"
     )
     _add_video(command, "a video; one that is not AV1 is converted first")
-    command.add_argument(
-        "--output",
-        "--output_path",
-        required=True,
-        metavar="PATH",
-        help="folder for the report; that of an earlier run is gone on with",
-    )
+    _add_output(command, "folder for the report; that of an earlier run is gone on with")
     command.add_argument(
         "--image_path",
         metavar="PATH",
@@ -265,13 +251,7 @@ def _make_parser() -> argparse.ArgumentParser:
 
     command = _add_command(commands, "encode", _run_encode, "convert a video to a good AV1 stream")
     _add_video(command, "a video that ffmpeg decodes")
-    command.add_argument(
-        "--output",
-        "--output_path",
-        required=True,
-        metavar="PATH",
-        help="the stream: .mp4, .mkv, .webm or .ivf",
-    )
+    _add_output(command, "the stream: .mp4, .mkv, .webm or .ivf")
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
     command.add_argument(
         "--strict",
@@ -300,9 +280,7 @@ def _make_parser() -> argparse.ArgumentParser:
 
     command = _add_command(commands, "motion", _run_motion, "write the motion of every frame")
     _add_video(command)
-    command.add_argument(
-        "--output", "--output_path", required=True, metavar="PATH", help="a .npz or .h5 file"
-    )
+    _add_output(command, "a .npz or .h5 file")
     add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
 
@@ -310,9 +288,7 @@ def _make_parser() -> argparse.ArgumentParser:
         commands, "export", _run_export, "write a database's features and matches for hloc"
     )
     _add_database(command)
-    command.add_argument(
-        "--output", "--output_path", required=True, metavar="PATH", help="folder for the files"
-    )
+    _add_output(command, "folder for the files")
     add_options(command, {ExportOptions: "files"})
     _add_quiet(command)
 
@@ -374,6 +350,10 @@ def _add_database(command: argparse.ArgumentParser) -> None:
 
 def _add_video(command: argparse.ArgumentParser, what: str = "an AV1 video") -> None:
     command.add_argument("--video", "--video_path", required=True, metavar="PATH", help=what)
+
+
+def _add_output(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument("--output", "--output_path", required=True, metavar="PATH", help=what)
 
 
 def _add_quiet(command: argparse.ArgumentParser) -> None:

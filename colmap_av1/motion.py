@@ -124,7 +124,7 @@ class FrameMotion:
 
 
 @dataclass(frozen=True)
-class ShownFrame:
+class _ShownFrame:
     """One frame of the output, in output order.
 
     Attributes:
@@ -153,7 +153,7 @@ class _Group:
 class _Index:
     """What the headers say: the shown frames, the groups, units of the largest frame."""
 
-    shown: list[ShownFrame]
+    shown: list[_ShownFrame]
     groups: list[_Group]
     num_units: int
 
@@ -199,27 +199,12 @@ def read_motion(
         warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
 
 
-def shown_frames(
-    video: str | PathLike[str], options: ReadOptions | None = None
-) -> list[ShownFrame]:
-    """Read the headers of a video and list its shown frames in output order.
+def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
+    """Read the headers of a video up to the first damage.
 
     Of a temporal unit with several spatial layers the highest is output (7.18.1).
-
-    Returns:
-        The shown frames before the first damage, if there is one; its error is left to
-        the reader of the blocks.
-
-    Raises:
-        LimitError: a frame is larger than `options.max_frame_size`.
-        VideoError: as `read_motion`.
     """
-    return _read_index(video, options if options is not None else ReadOptions()).shown
-
-
-def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
-    """Read the headers of a video up to the first damage."""
-    shown: list[ShownFrame] = []
+    shown: list[_ShownFrame] = []
     groups = [_Group(0, None)]
     num_units = 0
     seen: set[int] = set()
@@ -246,7 +231,7 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
                     if event.temporal_unit == last_unit and shown:
                         seen.discard(shown.pop().decode_index)
                     last_unit = event.temporal_unit
-                    shown.append(ShownFrame(decoded, decoded not in seen))
+                    shown.append(_ShownFrame(decoded, decoded not in seen))
                     seen.add(decoded)
     except BitstreamError:
         pass
