@@ -9,6 +9,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from dense_scene import made, truth  # noqa: F401 - fixtures
 from numpy.typing import NDArray
 
 PROJECT = Path(__file__).resolve().parents[1]

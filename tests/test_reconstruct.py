@@ -12,17 +12,15 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import PROJECT, Encode
+from conftest import Encode
+from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
 
-from colmap_av1 import mapper as mapper_module
 from colmap_av1.cli import main
-from colmap_av1.densify import densify
-from colmap_av1.errors import ImageError, ModelError, OptionError
+from colmap_av1.errors import ModelError, OptionError
 from colmap_av1.evaluate.poses import model_poses, pose_errors
-from colmap_av1.model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.model import read_model
 from colmap_av1.options import (
     CameraOptions,
-    DensifyOptions,
     ImageOptions,
     MapperOptions,
     MatchOptions,
@@ -30,65 +28,8 @@ from colmap_av1.options import (
     TriangulateOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
-from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
-from colmap_av1.video import decode_frames
 
-SCENE = PROJECT / "examples" / "scene.mp4"
-EVERY = 3
-NUM_IMAGES = 20
-OPTIONS = ReconstructOptions(
-    match=MatchOptions(images=ImageOptions(every=EVERY)),
-    mapping=MapperOptions(pose_tracks_per_image=300, pose_spacing=24.0),
-)
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
-NO_POINTS = ModelPoints(
-    np.empty((0, 3)),
-    np.empty((0, 3), np.uint8),
-    np.empty(0),
-    np.zeros(1, np.int64),
-    np.empty(0, np.int64),
-    np.empty((0, 2)),
-)
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The rendered clip's exact cameras and depth."""
-
-    camera: pycolmap.Camera
-    cam_from_world: np.ndarray
-    depth: np.ndarray
-    depth_x: np.ndarray
-    depth_y: np.ndarray
-
-
-@pytest.fixture(scope="session")
-def truth() -> Truth:
-    with np.load(PROJECT / "examples" / "scene_truth.npz") as file:
-        params = [float(file[name]) for name in ("fx", "fy", "cx", "cy")]
-        size = {"width": int(file["width"]), "height": int(file["height"])}
-        camera = pycolmap.Camera(camera_id=7, model="PINHOLE", params=params, **size)
-        depth = [file[name] for name in ("depth", "depth_x", "depth_y")]
-        return Truth(camera, file["cam_from_world"], *depth)
-
-
-@pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> ReconstructReport:
-    return reconstruct(SCENE, tmp_path_factory.mktemp("made") / "scene", options=OPTIONS)
-
-
-def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -> Path:
-    """A model without points that has the true poses, or those of other frames."""
-    folder.mkdir()
-    images = [
-        ModelImage(100 - i, f"{frame:04d}.png", 7, truth.cam_from_world[frame * shuffle % 60])
-        for i, frame in enumerate(frames)
-    ]
-    write_model(folder, {7: truth.camera}, images, NO_POINTS)
-    return folder
-
-
-# The model's files as the trainers' own readers see them, byte by byte.
 
 
 @dataclass(frozen=True)
@@ -315,75 +256,6 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
     assert reconstruct(SCENE, made.output, options=OPTIONS).resumed[-1] == "model"
 
 
-def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> None:
-    def interrupt(stage: str, done: int, total: int | None) -> None:
-        if done >= 2:
-            raise KeyboardInterrupt
-
-    copy = tmp_path / "mapped.db"
-    copy.write_bytes(made.database.read_bytes())
-    with pytest.raises(KeyboardInterrupt):
-        mapper_module.map_poses(
-            copy,
-            tmp_path / "poses",
-            mapper="incremental",
-            refine_intrinsics=True,
-            forward_motion=False,
-            seed=0,
-            num_threads=1,
-            log=tmp_path / "log",
-            num_images=NUM_IMAGES,
-            progress=interrupt,
-        )
-    assert not list((tmp_path / "poses").glob("*.bin"))
-
-
-def test_mapper_that_fails(tmp_path: Path) -> None:
-    (tmp_path / "no.db").write_bytes(b"no database")
-    with pytest.raises(ModelError, match="log tells where"):
-        mapper_module.map_poses(
-            tmp_path / "no.db",
-            tmp_path / "poses",
-            mapper="global",
-            refine_intrinsics=True,
-            forward_motion=False,
-            seed=0,
-            num_threads=1,
-            log=tmp_path / "log",
-            num_images=3,
-            progress=lambda *_: None,
-        )
-    assert (tmp_path / "log").stat().st_size > 0
-
-
-def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
-    model = read_model(made.output / ".stages" / "adjusted")
-    rng = np.random.default_rng(0)
-    for frame in model.frames.values():
-        pose = frame.rig_from_world
-        turn = pycolmap.Rotation3d(rng.normal(0.0, 0.004, 3)) * pose.rotation
-        frame.rig_from_world = pycolmap.Rigid3d(turn, pose.translation + rng.normal(0.0, 0.02, 3))
-    bent = pose_errors(model_poses(model, 60), truth.cam_from_world)
-    focal_length = model.cameras[1].mean_focal_length()
-    model.write_binary(tmp_path)
-    mapper_module.adjust_model(
-        tmp_path,
-        refine_intrinsics=False,
-        loss_scale=0.5,
-        seed=0,
-        num_threads=1,
-        log=tmp_path / "log",
-    )
-    adjusted = read_model(tmp_path)
-    errors = pose_errors(model_poses(adjusted, 60), truth.cam_from_world)
-    before = pose_errors(
-        model_poses(read_model(made.output / "sparse" / "0"), 60), truth.cam_from_world
-    )
-    assert errors.rotation < min(bent.rotation / 3, before.rotation + 0.05)
-    assert errors.ate < min(bent.ate / 3, before.ate * 1.5)
-    assert adjusted.cameras[1].mean_focal_length() == focal_length
-
-
 def test_without_adjustment(made: ReconstructReport, tmp_path: Path) -> None:
     shutil.copytree(made.output, tmp_path / "plain")
     options = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
@@ -448,103 +320,6 @@ def test_camera_that_stands_still(encode: Encode, tmp_path: Path) -> None:
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()
     assert not (tmp_path / "out" / "sparse").exists()
-
-
-def test_densify_on_true_poses(truth: Truth, tmp_path: Path) -> None:
-    """Points lie where the rendered clip's depth says, and in its colours."""
-    model = true_model(tmp_path / "model", truth, range(0, 60, 4))
-    options = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
-    report = densify(model, SCENE, tmp_path / "dense", options=options)
-    assert report.num_images == 15
-    assert report.agreeing > 0.9
-    dense = pycolmap.Reconstruction(tmp_path / "dense")
-    assert dense.num_points3D() == report.num_points > 8_000
-    assert sorted(dense.images) == sorted(pycolmap.Reconstruction(model).images)
-    assert list(dense.cameras) == [7]
-    fx, fy, cx, cy = truth.camera.params
-    wrong, num_checked = [], 0
-    for image in dense.images.values():
-        frame = int(Path(image.name).stem)
-        assert np.allclose(image.cam_from_world().matrix(), truth.cam_from_world[frame])
-        ids = [p.point3D_id for p in image.points2D]
-        xyz = np.array([dense.points3D[i].xyz for i in ids])
-        x, y, z = truth.cam_from_world[frame] @ np.column_stack([xyz, np.ones(len(xyz))]).T
-        column = np.abs((fx * x / z + cx)[:, None] - truth.depth_x).argmin(axis=1)
-        row = np.abs((fy * y / z + cy)[:, None] - truth.depth_y).argmin(axis=1)
-        # Depth is known on a grid: its neighbourhood tells where it is smooth.
-        padded = np.pad(truth.depth[frame], 1, mode="edge")
-        around = np.stack([padded[row + i, column + j] for i in range(3) for j in range(3)])
-        smooth = around.max(axis=0) / around.min(axis=0) < 1.1
-        depth = truth.depth[frame][row, column]
-        wrong.append(np.abs(z / depth - 1)[smooth])
-        num_checked += smooth.sum()
-    assert num_checked > 10_000
-    assert np.median(np.concatenate(wrong)) < 0.02
-    assert np.mean(np.concatenate(wrong) > 0.1) < 0.05
-    picture = next(decode_frames(SCENE))[1]
-    first = next(i for i in dense.images.values() if i.name == "0000.png")
-    off = [
-        dense.points3D[p.point3D_id].color.astype(int) - picture[int(p.xy[1]), int(p.xy[0]), ::-1]
-        for p in first.points2D
-    ]
-    assert np.median(np.abs(off)) < 10
-
-
-def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: Path) -> None:
-    model = true_model(tmp_path / "model", truth, range(60))
-    with pytest.raises(ImageError, match="640x360"):
-        densify(model, clip, tmp_path / "dense")
-    shuffled = true_model(tmp_path / "shuffled", truth, range(60), shuffle=7)
-    with pytest.raises(ModelError, match="of the video's tracks agree with the model's poses"):
-        densify(shuffled, SCENE, tmp_path / "dense")
-    with pytest.raises(ModelError, match="holds no COLMAP model"):
-        densify(tmp_path, SCENE, tmp_path / "dense")
-    (tmp_path / "empty").mkdir()
-    write_model(tmp_path / "empty", {7: truth.camera}, [], NO_POINTS)
-    with pytest.raises(ModelError, match="no image of the model has a pose"):
-        densify(tmp_path / "empty", SCENE, tmp_path / "dense")
-    few = true_model(tmp_path / "few", truth, range(20))
-    with pytest.raises(ImageError, match="do not say which frames"):
-        densify(few, SCENE, tmp_path / "dense")
-    with pytest.raises(OptionError, match="not empty"):
-        densify(model, SCENE, model)
-    names = {p.name for p in tmp_path.iterdir()}
-    assert names == {"model", "shuffled", "empty", "few"}
-
-
-def test_undistorted_picture_shows_the_same() -> None:
-    for k in (-0.12, 0.1):
-        camera = pycolmap.Camera(
-            camera_id=3, model="SIMPLE_RADIAL", width=320, height=240, params=[250, 160, 120, k]
-        )
-        pinhole = pinhole_camera(camera)
-        assert (pinhole.model_name, pinhole.width, pinhole.height) == ("PINHOLE", 320, 240)
-        undistort = undistortion(camera, pinhole)
-        assert undistort is not None
-        assert undistort(np.full((240, 320, 3), 200, np.uint8)).min() == 200
-        at = np.array([[60.5, 50.5], [250.5, 180.5]], np.float32)
-        picture = np.zeros((240, 320, 3), np.uint8)
-        for x, y in at:
-            cv2.circle(picture, (int(x), int(y)), 3, (255, 255, 255), -1)
-        flat = undistort(picture)[..., 0].astype(float)
-        for x, y in on_pinhole(camera, pinhole, at):
-            near = np.mgrid[int(y) - 8 : int(y) + 9, int(x) - 8 : int(x) + 9]
-            weight = flat[near[0], near[1]]
-            centre = [(weight * (n + 0.5)).sum() / weight.sum() for n in near[::-1]]
-            assert np.allclose(centre, [x, y], atol=0.3)
-        # As wide as can be: some edge pixel comes from the source's edge.
-        wider = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=pinhole.params * 1)
-        wider.params = [p * 0.98 for p in pinhole.params[:2]] + list(pinhole.params[2:])
-        undistort_wider = undistortion(camera, wider)
-        ramp = np.zeros((240, 320, 3), np.uint8)
-        ramp[2:-2, 2:-2] = 255
-        assert undistort_wider is not None
-        assert undistort_wider(ramp).min() == 0
-    plain = pycolmap.Camera(
-        camera_id=3, model="SIMPLE_PINHOLE", width=320, height=240, params=[250, 160, 120]
-    )
-    assert undistortion(plain, pinhole_camera(plain)) is None
-    assert list(pinhole_camera(plain).params) == [250, 250, 160, 120]
 
 
 def test_command_line(

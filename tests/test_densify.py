@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from dense_scene import SCENE, Truth
+
+from colmap_av1.densify import densify
+from colmap_av1.errors import ImageError, ModelError, OptionError
+from colmap_av1.model import ModelImage, ModelPoints, write_model
+from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions
+from colmap_av1.video import decode_frames
+
+NO_POINTS = ModelPoints(
+    np.empty((0, 3)),
+    np.empty((0, 3), np.uint8),
+    np.empty(0),
+    np.zeros(1, np.int64),
+    np.empty(0, np.int64),
+    np.empty((0, 2)),
+)
+
+
+def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -> Path:
+    """A model without points that has the true poses, or those of other frames."""
+    folder.mkdir()
+    images = [
+        ModelImage(100 - i, f"{frame:04d}.png", 7, truth.cam_from_world[frame * shuffle % 60])
+        for i, frame in enumerate(frames)
+    ]
+    write_model(folder, {7: truth.camera}, images, NO_POINTS)
+    return folder
+
+
+def test_densify_on_true_poses(truth: Truth, tmp_path: Path) -> None:
+    """Points lie where the rendered clip's depth says, and in its colours."""
+    model = true_model(tmp_path / "model", truth, range(0, 60, 4))
+    options = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
+    report = densify(model, SCENE, tmp_path / "dense", options=options)
+    assert report.num_images == 15
+    assert report.agreeing > 0.9
+    dense = pycolmap.Reconstruction(tmp_path / "dense")
+    assert dense.num_points3D() == report.num_points > 8_000
+    assert sorted(dense.images) == sorted(pycolmap.Reconstruction(model).images)
+    assert list(dense.cameras) == [7]
+    fx, fy, cx, cy = truth.camera.params
+    wrong, num_checked = [], 0
+    for image in dense.images.values():
+        frame = int(Path(image.name).stem)
+        assert np.allclose(image.cam_from_world().matrix(), truth.cam_from_world[frame])
+        ids = [p.point3D_id for p in image.points2D]
+        xyz = np.array([dense.points3D[i].xyz for i in ids])
+        x, y, z = truth.cam_from_world[frame] @ np.column_stack([xyz, np.ones(len(xyz))]).T
+        column = np.abs((fx * x / z + cx)[:, None] - truth.depth_x).argmin(axis=1)
+        row = np.abs((fy * y / z + cy)[:, None] - truth.depth_y).argmin(axis=1)
+        # Depth is known on a grid: its neighbourhood tells where it is smooth.
+        padded = np.pad(truth.depth[frame], 1, mode="edge")
+        around = np.stack([padded[row + i, column + j] for i in range(3) for j in range(3)])
+        smooth = around.max(axis=0) / around.min(axis=0) < 1.1
+        depth = truth.depth[frame][row, column]
+        wrong.append(np.abs(z / depth - 1)[smooth])
+        num_checked += smooth.sum()
+    assert num_checked > 10_000
+    assert np.median(np.concatenate(wrong)) < 0.02
+    assert np.mean(np.concatenate(wrong) > 0.1) < 0.05
+    picture = next(decode_frames(SCENE))[1]
+    first = next(i for i in dense.images.values() if i.name == "0000.png")
+    off = [
+        dense.points3D[p.point3D_id].color.astype(int) - picture[int(p.xy[1]), int(p.xy[0]), ::-1]
+        for p in first.points2D
+    ]
+    assert np.median(np.abs(off)) < 10
+
+
+def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: Path) -> None:
+    model = true_model(tmp_path / "model", truth, range(60))
+    with pytest.raises(ImageError, match="640x360"):
+        densify(model, clip, tmp_path / "dense")
+    shuffled = true_model(tmp_path / "shuffled", truth, range(60), shuffle=7)
+    with pytest.raises(ModelError, match="of the video's tracks agree with the model's poses"):
+        densify(shuffled, SCENE, tmp_path / "dense")
+    with pytest.raises(ModelError, match="holds no COLMAP model"):
+        densify(tmp_path, SCENE, tmp_path / "dense")
+    (tmp_path / "empty").mkdir()
+    write_model(tmp_path / "empty", {7: truth.camera}, [], NO_POINTS)
+    with pytest.raises(ModelError, match="no image of the model has a pose"):
+        densify(tmp_path / "empty", SCENE, tmp_path / "dense")
+    few = true_model(tmp_path / "few", truth, range(20))
+    with pytest.raises(ImageError, match="do not say which frames"):
+        densify(few, SCENE, tmp_path / "dense")
+    with pytest.raises(OptionError, match="not empty"):
+        densify(model, SCENE, model)
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"model", "shuffled", "empty", "few"}
