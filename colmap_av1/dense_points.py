@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.model import ModelPoints
-from colmap_av1.options import TriangulateOptions
+from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.progress import Progress
 from colmap_av1.tracks import Tracks, keep_observations
 from colmap_av1.triangulate import Points, Sightings, Views, triangulate
@@ -18,6 +19,17 @@ _Image = NDArray[np.uint8]
 
 # Share of the tracks that agree with the poses of a model of the same video, at least.
 LEAST_AGREEING = 0.5
+# Shown frames that a track is seen in at least which a point may come from: where rays meet at an
+# angle, points of three frames are as true as those of four and five.
+_TRACK_LENGTH = 3
+
+
+def chaining_for_points(options: MatchOptions, triangulate: TriangulateOptions) -> MatchOptions:
+    """The options with those tracks chained, too, that are only long enough for points."""
+    if options.tracks.min_length is not None:
+        return options
+    min_length = min(_TRACK_LENGTH, triangulate.min_observations)
+    return replace(options, tracks=replace(options.tracks, min_length=min_length))
 
 
 def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:

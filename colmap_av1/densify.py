@@ -13,6 +13,7 @@ from colmap_av1.choice import choose_images
 from colmap_av1.dense_points import (
     LEAST_AGREEING,
     Colours,
+    chaining_for_points,
     model_points,
     seen_in,
     triangulate_tracks,
@@ -107,7 +108,8 @@ def densify(
     size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
 
     source = open_source(video, options.match, clock=clock, progress=progress)
-    tracked = track_video(source, options.match, one_size=True, clock=clock, progress=progress)
+    matching = chaining_for_points(options.match, options.triangulate)
+    tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
     with clock.measure("choice"):
         chosen = choose_images(
             tracked.tracks,

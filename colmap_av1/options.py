@@ -40,8 +40,9 @@ class EncodeOptions:
 class TrackOptions:
     """How displacements are chained into tracks."""
 
-    # shown frames a track is seen in at least
-    min_length: int = 4
+    # shown frames a track is seen in at least; None: 4, and 3, or min_observations where that
+    # is less, for tracks that only points of a dense model come from
+    min_length: int | None = None
     # end a track where the space-time cosine between its motion and the motion predicted
     # from the step before falls below this; None: never
     cosine: float | None = 0.3

@@ -21,6 +21,7 @@ from colmap_av1.reconstruct_stages import (
     match_stage,
     model_stage,
     pose_stage,
+    pose_tracks,
     read_tracks,
     track_stage,
 )
@@ -118,11 +119,12 @@ def reconstruct(
     run = Run(source, output, stages, options, clock, progress)
     tracked = track_stage(run)
     tracks, chosen = read_tracks(stages)
-    matched = match_stage(run, tracks, chosen, tracked)
+    longer = pose_tracks(run, tracks)
+    matched = match_stage(run, longer, chosen, tracked)
     posed = pose_stage(run, matched, len(chosen.names))
     kept = {"tracks": tracked, "matches": matched, "poses": posed}
     if options.mapping.adjust:
-        kept["adjustment"] = posed = adjustment_stage(run, tracks, chosen, posed)
+        kept["adjustment"] = posed = adjustment_stage(run, longer, chosen, posed)
     kept["model"] = model_stage(run, tracks, chosen, posed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     notes = [*facts.pop("warnings"), *_notes(facts)]

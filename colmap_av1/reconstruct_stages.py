@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from colmap_av1.choice import ChosenImages, choose_images
 from colmap_av1.database import make_camera, write_matches
-from colmap_av1.dense_points import Colours, model_points, seen_in, triangulate_tracks
+from colmap_av1.dense_points import (
+    Colours,
+    chaining_for_points,
+    model_points,
+    seen_in,
+    triangulate_tracks,
+)
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import ModelError, OptionError
 from colmap_av1.image_matches import MatchedImages, pair_images, shared_focal_length, verify_images
@@ -24,7 +30,7 @@ from colmap_av1.model import ModelImage, read_model, write_model
 from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.stages import Kept, run_stage
-from colmap_av1.tracks import Tracks, keep_observations
+from colmap_av1.tracks import MIN_LENGTH, Tracks, keep_long_tracks, keep_observations
 from colmap_av1.triangulate import Points
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
 from colmap_av1.video import read_display
@@ -61,15 +67,15 @@ class Run:
 
 def track_stage(run: Run) -> Kept:
     """Chain the motion of the video into tracks and choose the frames that are images."""
-    source, options = run.source, run.options.match
-    clock, progress = run.clock, run.progress
+    source, clock, progress = run.source, run.clock, run.progress
+    options = chaining_for_points(run.options.match, run.options.triangulate)
 
     def make(partial: Path) -> dict[str, Any]:
         tracked = track_video(source, options, one_size=True, clock=clock, progress=progress)
         tracks = tracked.tracks
         with clock.measure("choice"):
             chosen = choose_images(
-                tracks,
+                pose_tracks(run, tracks),
                 options.images,
                 existing=(),
                 folder=partial,
@@ -116,6 +122,11 @@ def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages]:
     for name in ("num_frames", "width", "height"):
         arrays[name] = int(arrays[name])
     return Tracks(**arrays), chosen
+
+
+def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
+    """The tracks that may tell of the poses; short ones are for points only."""
+    return keep_long_tracks(tracks, run.options.match.tracks.min_length or MIN_LENGTH)
 
 
 def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -> Kept:

@@ -16,6 +16,9 @@ from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.motion import FrameMotion
 from colmap_av1.options import TrackOptions
 
+# Shown frames that a track is seen in at least where the options leave it open.
+MIN_LENGTH = 4
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -71,7 +74,7 @@ def build_tracks(
         progress: called after each coded frame with the number of frames so far.
 
     Returns:
-        Tracks of at least `options.min_length` shown frames, in the order of their seeds
+        Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their seeds
         (display order of the frame, then raster order). Where frames differ in size,
         positions are in pixels of the first shown frame's size.
 
@@ -84,7 +87,7 @@ def build_tracks(
     options = options if options is not None else TrackOptions()
     _check_options(options)
     builder = _core.TrackBuilder(
-        min_length=options.min_length,
+        min_length=MIN_LENGTH if options.min_length is None else options.min_length,
         cosine=-2.0 if options.cosine is None else options.cosine,
         cosine_relative_to_dominant=options.cosine_relative_to == "dominant",
         cosine_scale=options.cosine_scale,
@@ -182,6 +185,12 @@ def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
     )
 
 
+def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
+    """The tracks that are seen in `min_length` frames or more, in their former order."""
+    lengths = np.diff(tracks.offsets)
+    return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
+
+
 def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
     """The tracks in pictures that are scaled to another (width, height) in pixels."""
     if size == (tracks.width, tracks.height):
@@ -205,7 +214,7 @@ def _or_off(limit: _Limit | None) -> _Limit | int:
 
 
 def _check_options(options: TrackOptions) -> None:
-    if options.min_length < 1:
+    if options.min_length is not None and options.min_length < 1:
         raise OptionError(f"min_length is {options.min_length}: give 1 or more")
     if options.cosine is not None and not -1.0 <= options.cosine <= 1.0:
         raise OptionError(f"cosine is {options.cosine}: give a value from -1 to 1, or None")

@@ -177,7 +177,7 @@ def test_help_gives_the_comments_of_the_options(capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit, match="0"):
         main(["match", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "shown frames a track is seen in at least [4]" in text
+    assert "shown frames a track is seen in at least; none: 4" in text
     assert "so many frames a second, by the time stamps" in text
 
 

@@ -25,6 +25,7 @@ from colmap_av1.options import (
     MapperOptions,
     MatchOptions,
     ReconstructOptions,
+    TrackOptions,
     TriangulateOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
@@ -211,6 +212,24 @@ def test_report(made: ReconstructReport) -> None:
     with pycolmap.Database.open(made.database) as database:
         assert database.num_images() == NUM_IMAGES
         assert database.num_verified_image_pairs() > NUM_IMAGES
+
+
+def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
+    """The database that poses come from is the same with and without them, byte for byte."""
+
+    def stop(stage: str, done: int, total: int | None) -> None:
+        if stage == "poses":
+            raise KeyboardInterrupt
+
+    written = []
+    for name, tracks in (("all", TrackOptions()), ("longer", TrackOptions(min_length=4))):
+        options = replace(OPTIONS, match=MatchOptions(tracks=tracks))
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+        with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
+            written.append((np.diff(file["offsets"]).min(), tmp_path / name / "database.db"))
+    assert [shortest for shortest, _ in written] == [3, 4]
+    assert written[0][1].read_bytes() == written[1][1].read_bytes()
 
 
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:

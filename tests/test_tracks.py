@@ -18,7 +18,7 @@ from colmap_av1 import _core
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import TrackOptions
-from colmap_av1.tracks import Tracks, build_tracks
+from colmap_av1.tracks import Tracks, build_tracks, keep_long_tracks
 
 BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32 = 0, 3, 6, 9
 NEWMV, GLOBALMV = 16, 15
@@ -592,6 +592,19 @@ def test_tracks_below_the_minimum_length_are_left_out() -> None:
     empty = build_tracks(frames, TrackOptions(min_length=5, border=None))
     assert empty.frame.shape == (0,)
     assert empty.xy.shape == (0, 2)
+    assert len(build_tracks(frames[:3], TrackOptions(border=None)).offsets) == 1
+    short = build_tracks(frames[:3], TrackOptions(min_length=3, border=None))
+    assert len(short.offsets) == 16 * 12 + 1
+
+
+def test_long_tracks_are_kept() -> None:
+    frames = low_delay([(3.0, 0.0)] * 7)
+    tracks = build_tracks(frames, TrackOptions(min_length=1, border=None))
+    assert set(np.diff(tracks.offsets)) > {1, 2, 8}
+    longer = build_tracks(frames, TrackOptions(min_length=4, border=None))
+    kept = keep_long_tracks(tracks, 4)
+    for name in ("offsets", "frame", "xy", "sigma"):
+        assert np.array_equal(getattr(kept, name), getattr(longer, name))
 
 
 # trust
