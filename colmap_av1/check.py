@@ -12,8 +12,6 @@ from typing import Literal
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from colmap_av1.database import (
     cameras_of,
@@ -359,6 +357,10 @@ def _read_pairs(connection: sqlite3.Connection, path: Path, images: _Images) -> 
 def _largest_group(num_images: int, edges: NDArray[np.int64]) -> int:
     if len(edges) == 0:
         return 0
+    # Slow to import, and nothing else of the package's daily work needs it.
+    from scipy.sparse import coo_array  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(num_images, num_images))
     _, label = connected_components(graph, directed=False)
     return int(np.bincount(label).max())

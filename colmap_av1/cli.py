@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 
 from colmap_av1.check import check
 from colmap_av1.command_options import add_options, given, underscored
-from colmap_av1.compare import compare
 from colmap_av1.densify import densify
 from colmap_av1.encode import encode
 from colmap_av1.errors import ColmapAv1Error, OptionError
@@ -427,6 +426,8 @@ def _run_densify(namespace: argparse.Namespace) -> None:
 
 
 def _run_compare(namespace: argparse.Namespace) -> None:
+    from colmap_av1.compare import compare  # noqa: PLC0415 - slow to import
+
     options = given(
         namespace,
         CompareOptions,

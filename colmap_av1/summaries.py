@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from colmap_av1.check import CheckReport
 from colmap_av1.densify import DensifyReport
-from colmap_av1.evaluate.results import CompareReport
 from colmap_av1.info import StreamReport
 from colmap_av1.match import MatchReport
 from colmap_av1.reconstruct import ReconstructReport
+
+if TYPE_CHECKING:  # the comparison is slow to import
+    from colmap_av1.evaluate.results import CompareReport
 
 Rows = list[tuple[str, str]]
 
