@@ -109,8 +109,10 @@ def shown_points(
 
     Returns:
         float32 [n, 2], origin at the shown picture's top-left corner; what was cut off lies
-        beyond the picture.
+        beyond the picture. The same object where pictures are shown as they are stored.
     """
+    if display.turn == _UPRIGHT and not any(display.crop):
+        return stored
     turn = np.array(display.turn, dtype=np.float32)
     left, top, _, _ = display.crop
     points = (stored - np.array([left, top], dtype=np.float32)) @ turn.T

@@ -29,25 +29,36 @@ def remove_overlays(tracks: Tracks) -> Tracks:
     if len(tracks.offsets) == 1:
         return tracks
     first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
-    lengths = np.diff(tracks.offsets)
-    distance = np.linalg.norm(tracks.xy - np.repeat(tracks.xy[first], lengths, axis=0), axis=1)
-    still = np.maximum.reduceat(distance, first) <= _STILL
     travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(tracks))])
     moved = travelled[tracks.frame[last] + 1] - travelled[tracks.frame[first] + 1]
-    return keep_observations(tracks, np.repeat(~still | (moved < _MOVED), lengths))
+    # Few tracks end where they began, and only these can have stood still.
+    ends_still = _length(tracks.xy[last] - tracks.xy[first]) <= _STILL
+    over_picture = ends_still & (moved >= _MOVED)
+    for index in np.flatnonzero(over_picture):
+        xy = tracks.xy[first[index] : last[index] + 1]
+        over_picture[index] = _length(xy - xy[0]).max() <= _STILL
+    return keep_observations(tracks, np.repeat(~over_picture, np.diff(tracks.offsets)))
 
 
 def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     """Median step in pixels that leads to each frame: float64 [num_frames], 0 where none does."""
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
-    within = track[1:] == track[:-1]
-    step = np.linalg.norm(np.diff(tracks.xy, axis=0)[within], axis=1)
-    step /= np.diff(tracks.frame)[within]
-    frame = tracks.frame[1:][within]
-    order = np.lexsort((step, frame))
+    within = np.ones(len(tracks.frame), dtype=np.bool_)
+    within[tracks.offsets[:-1]] = False
+    step = _length(np.diff(tracks.xy, axis=0))[within[1:]]
+    step /= np.diff(tracks.frame)[within[1:]]
+    frame = tracks.frame[within]
     count = np.bincount(frame, minlength=tracks.num_frames)
-    start = np.cumsum(count) - count
-    has = count > 0
+    # A type of two bytes is sorted by radix, in a quarter of the time.
+    order = np.argsort(frame.astype(np.min_scalar_type(tracks.num_frames)), kind="stable")
+    by_frame = np.split(step[order], np.cumsum(count)[:-1])
     motion = np.zeros(tracks.num_frames)
-    motion[has] = step[order][(start + count // 2)[has]]
+    for index in np.flatnonzero(count):
+        middle = len(by_frame[index]) // 2
+        motion[index] = np.partition(by_frame[index], middle)[middle]
     return motion
+
+
+def _length(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Length of each of [n, 2] vectors; NumPy's own norm takes many times as long for two."""
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.sqrt(x * x + y * y)
