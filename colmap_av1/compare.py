@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -102,8 +103,7 @@ def compare(
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
     _check_training(options)
-    open_stages(output)
-    try:
+    with open_stages(output), _writing(output):
         footage = choose_footage(
             video,
             output / "footage",
@@ -147,12 +147,18 @@ def compare(
         )
         clouds = {column.name: cloud for column, cloud in measured if cloud is not None}
         write_report(report, clouds, footage)
+    return report
+
+
+@contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise OptionError(
             f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
             "run the same command again once that is mended"
         ) from error
-    return report
 
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:

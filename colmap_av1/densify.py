@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from colmap_av1.dense_points import (
     triangulate_tracks,
 )
 from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.files import remove_leftovers, whole_folder
 from colmap_av1.images import size_of_images
 from colmap_av1.model import ModelImage, read_model, write_model
 from colmap_av1.option_checks import check_options
@@ -98,6 +98,7 @@ def densify(
     check_triangulate_options(options.triangulate)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise OptionError(f"{output}: is there and not empty: give a new folder")
+    remove_leftovers(output.parent, output.name)
     reconstruction = read_model(model)
     by_name = {i.name: i for i in reconstruction.images.values() if i.has_pose}
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in by_name.values()}
@@ -155,18 +156,13 @@ def densify(
             if frame >= chosen.frames[-1]:
                 break
     with clock.measure("writing"):
-        partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
+        xy = seen.xy[points.observation].astype(np.float64)
+        dense = model_points(points, colours.mean(), view, xy)
         try:
-            partial.mkdir(parents=True)
-            xy = seen.xy[points.observation].astype(np.float64)
-            write_model(partial, cameras, images, model_points(points, colours.mean(), view, xy))
-            if output.exists():
-                output.rmdir()
-            partial.replace(output)
+            with whole_folder(output) as partial:
+                write_model(partial, cameras, images, dense)
         except OSError as error:
             raise ModelError(f"{output}: cannot be written: {error.strerror}") from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
     return DensifyReport(
         output=output,
         model=model,

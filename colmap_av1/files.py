@@ -1,13 +1,19 @@
-"""Files that appear under their names only when whole."""
+"""Files and folders that appear under their names only when whole, and only one run in each."""
 
 from __future__ import annotations
 
 import contextlib
 import glob
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # there is none on Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -20,7 +26,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be given its name.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = _partial(path)
     try:
         yield partial
         partial.replace(path)
@@ -28,12 +34,55 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """The same for a folder, made with those above it, that does not exist yet or is empty.
+
+    Raises:
+        OSError: the folder cannot be made or given its name.
+    """
+    partial = _partial(path)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if path.exists():
+            path.rmdir()
+        partial.replace(path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+@contextmanager
+def only_run(lock: Path) -> Iterator[bool]:
+    """Hold a file as long as the body runs; False where another process holds it.
+
+    It is given back however this process ends.
+
+    Raises:
+        OSError: the file cannot be made.
+    """
+    with lock.open("ab") as file:
+        held = True
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                held = False
+            except OSError:  # a file system without locks
+                pass
+        yield held
+
+
 def remove_leftovers(folder: Path, name: str | None = None) -> None:
-    """Remove what killed processes left of files that they wrote by `whole_file`.
+    """Remove what killed processes left of what they wrote by `whole_file` and `whole_folder`.
 
     Args:
-        folder: where the files are.
-        name: of the file; None: any.
+        folder: where that is.
+        name: of the file or folder; None: any.
     """
     if os.name != "posix":  # elsewhere asking for a process may end it
         return
@@ -41,8 +90,9 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
     for leftover in glob.glob(f".{names}.*.partial", root_dir=folder):
         writer = leftover.split(".")[-2]
         if writer.isdecimal() and not _is_running(int(writer)):
+            path = folder / leftover
             with contextlib.suppress(OSError):  # what cannot be removed does no harm
-                (folder / leftover).unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _is_running(process: int) -> bool:

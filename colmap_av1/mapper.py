@@ -48,7 +48,7 @@ def map_poses(
     refine_intrinsics: bool,
     forward_motion: bool,
     seed: int,
-    num_threads: int | None,
+    num_threads: int,
     log: Path,
     num_images: int,
     progress: Progress,
@@ -62,7 +62,7 @@ def map_poses(
         refine_intrinsics: refine focal length and distortion.
         forward_motion: let the incremental mapper start with images behind each other.
         seed: the random seed.
-        num_threads: threads; None: one per CPU.
+        num_threads: threads; the result is the same from run to run with one only.
         log: file that gets what the mapper prints.
         num_images: number of images, for the progress.
         progress: told about the stage "poses" with the number of images placed so far.
@@ -78,7 +78,7 @@ def map_poses(
         "refine_intrinsics": refine_intrinsics,
         "forward_motion": forward_motion,
         "seed": seed,
-        "num_threads": num_threads or -1,
+        "num_threads": num_threads,
     }
     progress("poses", 0, num_images)
     sizes: list[int] = []
@@ -105,7 +105,7 @@ def adjust_model(
     refine_intrinsics: bool,
     loss_scale: float,
     seed: int,
-    num_threads: int | None,
+    num_threads: int,
     log: Path,
 ) -> None:
     """Adjust poses, points and, if asked to, intrinsics of a model together; it is overwritten.
@@ -116,7 +116,7 @@ def adjust_model(
         loss_scale: reprojection error in pixels from which on an observation counts less
             (Cauchy's loss).
         seed: the random seed.
-        num_threads: threads; None: one per CPU.
+        num_threads: threads; the result is the same from run to run with one only.
         log: file that gets what COLMAP prints.
 
     Raises:
@@ -128,7 +128,7 @@ def adjust_model(
         "refine_intrinsics": refine_intrinsics,
         "loss_scale": loss_scale,
         "seed": seed,
-        "num_threads": num_threads or -1,
+        "num_threads": num_threads,
     }
     _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
 

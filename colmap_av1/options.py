@@ -230,6 +230,9 @@ class MapperOptions:
     pose_tracks_per_image: int = 600
     # width in pixels of the cells of an image that one of these tracks each is wanted in
     pose_spacing: float = 16.0
+    # threads of the mapper and the adjustment; with several, the last digits of their results
+    # change from run to run
+    mapper_threads: int = 1
     # adjust the poses once more on points of more tracks, and of all lengths
     adjust: bool = True
 

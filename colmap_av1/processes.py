@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 # A program that becomes another. Linux then ends that one with the process that started it, even
 # where that is killed and cannot.
 _BOUND = """
@@ -26,3 +29,16 @@ def bound(command: Sequence[str]) -> list[str]:
     if sys.platform != "linux" or not sys.executable:
         return list(command)
     return [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
+
+
+def bind(starter: int) -> None:
+    """End this process with the one that started it, even where that one is killed.
+
+    Args:
+        starter: its process id. The thread of it that started this one must not end before.
+    """
+    if sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    if os.getppid() != starter:
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -113,17 +113,21 @@ def reconstruct(
     clock = Clock()
     check_options(options.match, picture_size(video))
     _check_reconstruct_options(options)
-    stages = open_stages(output)
+    with open_stages(output) as stages:
+        source = open_source(video, options.match, clock=clock, progress=progress)
+        report = _run_stages(Run(source, output, stages, options, clock, progress))
+        _write_report(report)
+    return report
 
-    source = open_source(video, options.match, clock=clock, progress=progress)
-    run = Run(source, output, stages, options, clock, progress)
+
+def _run_stages(run: Run) -> ReconstructReport:
     tracked = track_stage(run)
-    tracks, chosen = read_tracks(stages)
+    tracks, chosen = read_tracks(run.stages)
     longer = pose_tracks(run, tracks)
     matched = match_stage(run, longer, chosen, tracked)
     posed = pose_stage(run, matched, len(chosen.names))
     kept = {"tracks": tracked, "matches": matched, "poses": posed}
-    if options.mapping.adjust:
+    if run.options.mapping.adjust:
         kept["adjustment"] = posed = adjustment_stage(run, longer, chosen, posed)
     kept["model"] = model_stage(run, tracks, chosen, posed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
@@ -132,17 +136,15 @@ def reconstruct(
         f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
     }
     reported["other_models"] = tuple(facts["other_models"])
-    report = ReconstructReport(
-        output=output,
-        video=video,
-        database=output / "database.db",
+    return ReconstructReport(
+        output=run.output,
+        video=run.source.pictures,
+        database=run.output / "database.db",
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
-        seconds=clock.seconds,
+        seconds=run.clock.seconds,
         warnings=tuple(notes),
         **reported,
     )
-    _write_report(report)
-    return report
 
 
 def _check_reconstruct_options(options: ReconstructOptions) -> None:
@@ -154,6 +156,8 @@ def _check_reconstruct_options(options: ReconstructOptions) -> None:
         raise OptionError(
             f"pose_tracks_per_image is {options.mapping.pose_tracks_per_image}: give 50 or more"
         )
+    if options.mapping.mapper_threads < 1:
+        raise OptionError(f"mapper_threads is {options.mapping.mapper_threads}: give 1 or more")
     if not options.match.camera.single_camera:
         raise OptionError("single_camera is 0: a trainer's folder has one camera, leave it at 1")
     name = options.match.images.image_name

@@ -212,7 +212,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
                 refine_intrinsics=refine,
                 forward_motion=forward,
                 seed=options.match.verify.seed,
-                num_threads=options.match.verify.num_threads,
+                num_threads=mapping.mapper_threads,
                 log=run.stages / "mapper.log",
                 num_images=num_images,
                 progress=progress,
@@ -226,7 +226,8 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
             "poses": "poses",
         }
 
-    given = (mapper, refine, forward, options.match.verify.seed, pycolmap.__version__)
+    how = (mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
+    given = (mapper, refine, forward, *how)
     return run_stage(
         run.stages,
         "poses",
@@ -304,13 +305,14 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
                 refine_intrinsics=refine,
                 loss_scale=_LOSS_SCALE,
                 seed=options.match.verify.seed,
-                num_threads=options.match.verify.num_threads,
+                num_threads=options.mapping.mapper_threads,
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
         return {"poses": "adjusted"}
 
-    given = (_ADJUSTED, _LOSS_SCALE, refine, options.match.verify.seed, pycolmap.__version__)
+    how = (options.mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
+    given = (_ADJUSTED, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,
         "adjustment",

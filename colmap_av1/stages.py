@@ -6,12 +6,14 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.files import only_run, remove_leftovers
 
 _FOLDER = ".stages"
 
@@ -31,26 +33,36 @@ class Kept:
     resumed: bool
 
 
-def open_stages(output: Path) -> Path:
+@contextmanager
+def open_stages(output: Path) -> Iterator[Path]:
     """The folder of the stages in an output folder, both made where they are missing.
 
     Raises:
-        OptionError: the output folder holds something else, or cannot be made.
+        OptionError: the output folder holds something else, cannot be made, or another run
+            works in it.
     """
     stages = output / _FOLDER
-    if output.exists() and not output.is_dir():
-        raise OptionError(f"{output}: is a file: give a folder for the model")
-    try:
-        if output.is_dir() and not stages.is_dir() and any(output.iterdir()):
+    with ExitStack() as running:
+        try:
+            if output.exists() and not output.is_dir():
+                raise OptionError(f"{output}: is a file: give a folder")
+            if output.is_dir() and not stages.is_dir() and any(output.iterdir()):
+                raise OptionError(
+                    f"{output}: is not empty and not the output of an earlier run: give another "
+                    "folder"
+                )
+            stages.mkdir(parents=True, exist_ok=True)
+            if not os.access(output, os.W_OK | os.X_OK):
+                raise PermissionError(None, "no permission")
+            alone = running.enter_context(only_run(stages / "lock"))
+        except OSError as error:
+            raise OptionError(f"{output}: cannot be written: {error.strerror}") from error
+        if not alone:
             raise OptionError(
-                f"{output}: is not empty and not the output of an earlier run: give another folder"
+                f"{output}: another run is at work in it: wait for its end, or give another folder"
             )
-        stages.mkdir(parents=True, exist_ok=True)
-        if not os.access(output, os.W_OK | os.X_OK):
-            raise PermissionError(None, "no permission")
-    except OSError as error:
-        raise OptionError(f"{output}: cannot be written: {error.strerror}") from error
-    return stages
+        remove_leftovers(output)
+        yield stages
 
 
 def run_stage(

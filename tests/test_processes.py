@@ -9,11 +9,20 @@ import pytest
 
 from colmap_av1.processes import bound
 
-STARTER = """
+BOUND = """
 import subprocess, sys, time
 from colmap_av1.processes import bound
 child = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
 subprocess.Popen(bound([sys.executable, "-c", child]))
+time.sleep(60)
+"""
+BINDING = """
+import os, subprocess, sys, time
+child = (
+    "import os, sys, time; from colmap_av1.processes import bind; "
+    "bind(int(sys.argv[1])); print(os.getpid(), flush=True); time.sleep(60)"
+)
+subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
 time.sleep(60)
 """
 
@@ -41,9 +50,10 @@ def test_a_program_without_a_folder_is_looked_for() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
-def test_a_bound_process_ends_with_a_killed_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", [BOUND, BINDING], ids=["bound", "binding"])
+def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", STARTER], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=tmp_path
     ) as starter:
         assert starter.stdout is not None
         child = int(starter.stdout.readline())

@@ -5,6 +5,9 @@ import importlib
 import json
 import shutil
 import struct
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -273,6 +276,36 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
     assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before
     assert not list((made.output / ".stages").glob("*.partial"))
     assert reconstruct(SCENE, made.output, options=OPTIONS).resumed[-1] == "model"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
+def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
+    """The mapper ends with it, and the next run makes of the rest what one run makes."""
+    output = tmp_path / "out"
+    words = ["--video", str(SCENE), "--output", str(output), "--every", str(EVERY)]
+    words += ["--pose_tracks_per_image", "300", "--pose_spacing", "24"]
+    command = [sys.executable, "-m", "colmap_av1", "reconstruct", *words, "--quiet"]
+    with subprocess.Popen(command, cwd=tmp_path) as process:
+        while not (output / ".stages" / "poses.partial" / "poses").is_dir():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+    deadline = time.monotonic() + 10
+    while any(str(output).encode() in words_of(p) for p in Path("/proc").glob("[0-9]*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    again = reconstruct(SCENE, output, options=OPTIONS)
+    assert again.resumed == ("tracks", "matches")
+    for path in made.output.glob("[is]*/**/*.*"):
+        assert (output / path.relative_to(made.output)).read_bytes() == path.read_bytes()
+    assert not list(output.glob("**/*.partial"))
+
+
+def words_of(process: Path) -> bytes:
+    try:
+        return (process / "cmdline").read_bytes()
+    except OSError:
+        return b""
 
 
 def test_without_adjustment(made: ReconstructReport, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from colmap_av1.errors import EvaluationError, OptionError
 from colmap_av1.options import LearnedOptions
+from colmap_av1.processes import bound
 
 PROGRAM = Path(__file__).with_name("lightglue_matches.py")
 # So many images are matched exhaustively, more of them at these distances.
@@ -59,7 +60,7 @@ def extract_and_match(
         else os.cpu_count(),
     }
     run = subprocess.run(
-        [sys.executable, str(PROGRAM)],
+        bound([sys.executable, str(PROGRAM)]),
         input=json.dumps(task),
         capture_output=True,
         text=True,

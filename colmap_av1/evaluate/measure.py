@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from colmap_av1.errors import ColmapAv1Error, EvaluationError
+from colmap_av1.processes import bind
 
 _Result = TypeVar("_Result")
 
@@ -53,7 +54,7 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
     # Fresh, not forked: a fork has the parent's threads' locks and its peak memory.
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_call, args=(sender, log, function, args))
+    process = context.Process(target=_call, args=(os.getpid(), sender, log, function, args))
     process.start()
     sender.close()
     try:
@@ -83,8 +84,13 @@ def _end(process: BaseProcess) -> None:
 
 
 def _call(
-    sender: Connection, log: Path, function: Callable[..., Any], args: tuple[Any, ...]
+    starter: int,
+    sender: Connection,
+    log: Path,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
 ) -> None:
+    bind(starter)
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)
     with log.open("ab") as file:

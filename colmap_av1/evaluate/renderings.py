@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
+from colmap_av1.processes import bound
 
 _Image = NDArray[np.uint8]
 
@@ -181,7 +182,7 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
             *("-filter_complex", graph, "-f", "null", "-"),
         ]
         with subprocess.Popen(
-            command, cwd=folder, stdin=subprocess.PIPE, stderr=subprocess.PIPE
+            bound(command), cwd=folder, stdin=subprocess.PIPE, stderr=subprocess.PIPE
         ) as process:
             pipe: Any = process.stdin
             # An early end of ffmpeg is explained by its own words below.
@@ -206,7 +207,7 @@ def _lpips(
     """
     files = [[str(a), str(b)] for a, b in zip(rendered, references, strict=True)]
     run = subprocess.run(
-        [sys.executable, str(_LPIPS_SCRIPT)],
+        bound([sys.executable, str(_LPIPS_SCRIPT)]),
         input=json.dumps(files),
         capture_output=True,
         text=True,

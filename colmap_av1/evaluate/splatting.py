@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import EvaluationError, ModelError, OptionError
 from colmap_av1.evaluate.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.model import read_model
+from colmap_av1.processes import bound
 
 _PROGRAM = Path(__file__).with_name("train_gaussians.py")
 # Of other points, whose mean distance is the first size of a point's Gaussian.
@@ -193,7 +194,9 @@ def _run(
     states = []
     with (
         log.open("w+", encoding="utf-8", errors="replace") as errors,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+        subprocess.Popen(
+            bound(command), stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
     ):
         try:
             output: IO[str] = process.stdout  # type: ignore[assignment]
