@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,9 @@ _MIN_PAIRS = 8
 _MIN_MATCHES = 50
 # Error in pixels from which on a match counts less (Cauchy's loss).
 _LOSS_SCALE = 0.5
-_RANSAC = {"max_epipolar_error": 2.0, "max_iterations": 200, "min_iterations": 15}
+# A pose is searched with some of the matches and refined with all.
+_NUM_SEARCHED = 64
+_RANSAC = {"max_epipolar_error": 2.0, "max_iterations": 100, "min_iterations": 15}
 _REFINEMENT = {"max_iterations": 20, "loss_type": "CAUCHY", "loss_scale": _LOSS_SCALE}
 # By how much the loss has to rise where the focal length is half or twice as long, and how far
 # apart the focal lengths of every second pair and of the others may be, as a factor.
@@ -78,19 +80,28 @@ def estimate_focal_length(
     if len(chosen) < _MIN_PAIRS:
         return None
     tried = max(centre) * 2 * np.geomspace(_SHORTEST, _LONGEST, _NUM_TRIED)
-    loss = np.array(
-        [
-            [_loss(xa, xb, focal_length, seed) for focal_length in tried.tolist()]
-            for _, (_, xa, xb) in sorted(chosen.items())
-        ]
-    )
+    views = [(xa, xb) for _, (_, xa, xb) in sorted(chosen.items())]
+    loss = np.full((len(views), _NUM_TRIED), np.nan)
+
+    def measure(columns: Iterable[int]) -> None:
+        for k in columns:
+            loss[:, k] = [_loss(xa, xb, float(tried[k]), seed) for xa, xb in views]
+
+    def curves() -> list[_Floats]:
+        return [loss.mean(axis=0), loss[::2].mean(axis=0), loss[1::2].mean(axis=0)]
+
+    # Every second one, then those beside the best.
+    measure(range(0, _NUM_TRIED, 2))
+    best = [int(np.nanargmin(curve)) for curve in curves()]
+    measure(sorted({k + side for k in best for side in (-1, 1) if 0 <= k + side < _NUM_TRIED}))
     at = np.log(tried)
-    found = _lowest(at, loss.mean(axis=0))
-    halves = [_lowest(at, loss[k::2].mean(axis=0)) for k in (0, 1)]
+    found, *halves = (_lowest(at, curve) for curve in curves())
     if found is None or None in halves:
         return None
-    around = np.interp([found - math.log(2), found + math.log(2)], at, loss.mean(axis=0))
-    risen = around.min() > _MIN_RISE * loss.mean(axis=0).min()
+    mean = loss.mean(axis=0)
+    known = np.isfinite(mean)
+    around = np.interp([found - math.log(2), found + math.log(2)], at[known], mean[known])
+    risen = around.min() > _MIN_RISE * mean[known].min()
     if not risen or abs(np.diff(np.array(halves, dtype=np.float64))[0]) > math.log(_MAX_FACTOR):
         return None
     return math.exp(found)
@@ -105,25 +116,19 @@ def _loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
         "height": 1,
         "params": [focal_length, 0.0, 0.0],
     }
-    ransac = {**_RANSAC, "seed": seed}
-    pose, _ = poselib.estimate_relative_pose(xa, xb, camera, camera, ransac, _REFINEMENT)
-    rotation, translation = np.asarray(pose.R), np.asarray(pose.t).reshape(3)
-    # Row by row the cross product with the translation.
-    essential = np.cross(translation, rotation, axisb=0).T
-    inverse = np.diag([1 / focal_length, 1 / focal_length, 1.0])
-    fundamental = inverse @ essential @ inverse
-    lines_b = np.column_stack([xa, np.ones(len(xa))]) @ fundamental.T
-    lines_a = np.column_stack([xb, np.ones(len(xb))]) @ fundamental
-    algebraic = np.einsum("ni,ni->n", xb, lines_b[:, :2]) + lines_b[:, 2]
-    gradient = (lines_a[:, :2] ** 2).sum(axis=1) + (lines_b[:, :2] ** 2).sum(axis=1)
-    # Sampson error (Hartley and Zisserman, eq. 11.9).
-    error = algebraic**2 / np.maximum(gradient, np.finfo(np.float64).tiny)
-    return float(np.log1p(error / _LOSS_SCALE**2).mean())
+    some = slice(_NUM_SEARCHED)
+    pose, _ = poselib.estimate_relative_pose(
+        xa[some], xb[some], camera, camera, {**_RANSAC, "seed": seed}, {"max_iterations": 0}
+    )
+    _, refined = poselib.refine_relative_pose(xa, xb, pose, camera, camera, _REFINEMENT)
+    # PoseLib's errors are on normalised coordinates: Sampson errors over the focal length.
+    scale = _LOSS_SCALE / focal_length
+    return float(refined["cost"]) / (scale * scale * len(xa))
 
 
 def _lowest(at: _Floats, value: _Floats) -> float | None:
-    """Where a sampled curve is lowest, by a parabola; None at an end."""
-    k = int(np.argmin(value))
+    """Where a curve is lowest, by a parabola; None at an end. Samples that are NaN are left out."""
+    k = int(np.nanargmin(value))
     if k in (0, len(at) - 1):
         return None
     before, least, after = value[k - 1 : k + 2]
