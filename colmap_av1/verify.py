@@ -133,6 +133,7 @@ class _View:
         flat: float64 [2, n] undistorted keypoints in pixels from the principal point; None
             without a focal length prior.
         focal: mean focal length in pixels.
+        to_flat: float64 [3, 3] takes pixels without distortion to `flat`.
         pinhole: the camera of `flat`, in PoseLib's words.
         place: int64 [n] place of each keypoint in an order that is spread over the image from
             its beginning on.
@@ -142,6 +143,7 @@ class _View:
     pixels: NDArray[np.float64]
     flat: NDArray[np.float64] | None
     focal: float
+    to_flat: NDArray[np.float64]
     pinhole: dict[str, Any]
     place: NDArray[np.int64]
 
@@ -167,7 +169,8 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
         "params": [focal, 0.0, 0.0],
     }
     place = _spread_order(pixels, (width, height), seed)
-    return _View(camera, np.ascontiguousarray(pixels.T), flat, focal, pinhole, place)
+    to_flat = np.diag([focal, focal, 1.0]) @ np.linalg.inv(camera.calibration_matrix())
+    return _View(camera, np.ascontiguousarray(pixels.T), flat, focal, to_flat, pinhole, place)
 
 
 def _spread_order(x: NDArray[np.float64], size: tuple[int, int], seed: int) -> NDArray[np.int64]:
@@ -304,12 +307,11 @@ def _verify_calibrated(
     num_needed = options.min_num_inliers
     assert a.flat is not None
     assert b.flat is not None
-    flat_a, flat_b = a.flat[:, matches[:, 0]], b.flat[:, matches[:, 1]]
+    flat_a, flat_b = a.flat.take(matches[:, 0], axis=1), b.flat.take(matches[:, 1], axis=1)
     # Some pixels of a wide lens have no ray in front of the camera.
     finite = np.isfinite(flat_a[0, search.order] + flat_b[0, search.order])
     search = replace(search, order=search.order[finite])
     E = _find_pose(a, b, flat_a, flat_b, search)
-    pixels_a, pixels_b = a.pixels[:, matches[:, 0]], b.pixels[:, matches[:, 1]]
 
     # F cannot have more inliers than there are matches: where E comes that close, the pair
     # is calibrated whatever F says.
@@ -319,7 +321,7 @@ def _verify_calibrated(
         start = None
         if E.matrix is not None and E.count > _TRUSTED_SHARE * len(matches):
             start = _on_pixels(E.matrix, a, b)
-        F = _find_fundamental(pixels_a, pixels_b, search, start)
+        F = _find_fundamental(*_pixels(a, b, matches), search, start)
         num_F = F.count
 
     calibrated = E.count >= num_needed and E.count > options.min_e_f_inlier_ratio * num_F
@@ -349,13 +351,20 @@ def _verify_calibrated(
         tvec = np.asarray(E.pose.t, dtype=np.float64).reshape(3)
     return TwoViewGeometry(
         config=config,
-        inlier_matches=np.ascontiguousarray(matches[chosen.inliers], dtype=np.uint32),
+        inlier_matches=matches.compress(chosen.inliers, axis=0).astype(np.uint32, copy=False),
         E=None if E.matrix is None else _on_rays(E.matrix, a, b),
         F=None if F is None else F.matrix,
-        H=None if H.matrix is None else _unit(np.linalg.inv(_to_flat(b)) @ H.matrix @ _to_flat(a)),
+        H=None if H.matrix is None else _unit(np.linalg.inv(b.to_flat) @ H.matrix @ a.to_flat),
         qvec=qvec,
         tvec=tvec,
     )
+
+
+def _pixels(
+    a: _View, b: _View, matches: NDArray[np.uint32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The matched keypoints of both images, float64 [2, n] each."""
+    return a.pixels.take(matches[:, 0], axis=1), b.pixels.take(matches[:, 1], axis=1)
 
 
 def _verify_uncalibrated(
@@ -368,7 +377,7 @@ def _verify_uncalibrated(
     one agrees with the other.
     """
     options = search.options
-    xa, xb = a.pixels[:, matches[:, 0]], b.pixels[:, matches[:, 1]]
+    xa, xb = _pixels(a, b, matches)
     F = _find_fundamental(xa, xb, search)
     shared = a.camera is b.camera
     H = _find_homography(xa, xb, search, F.count)
@@ -381,7 +390,7 @@ def _verify_uncalibrated(
             chosen = H
     return TwoViewGeometry(
         config=config,
-        inlier_matches=np.ascontiguousarray(matches[chosen.inliers], dtype=np.uint32),
+        inlier_matches=matches.compress(chosen.inliers, axis=0).astype(np.uint32, copy=False),
         F=F.matrix,
         H=H.matrix,
     )
@@ -395,12 +404,13 @@ def _find_pose(
     a: _View, b: _View, xa: NDArray[np.float64], xb: NDArray[np.float64], search: _Search
 ) -> _Model:
     """The essential matrix of a pair, on undistorted pixels from the principal points."""
-    sample, wider = search.sample, search.order
+    # Half of the sample is enough: what is found is refined on more than all of it.
+    sample, wider = search.sample[: max(_MIN_MATCHES, len(search.sample) // 2)], search.order
     if len(sample) < _MIN_MATCHES:
         return _no_model(xa)
     ransac = search.ransac(_MIN_ITERATIONS)
     pose, _ = poselib.estimate_relative_pose(
-        xa[:, sample].T, xb[:, sample].T, a.pinhole, b.pinhole, ransac, _REFINEMENT
+        xa[:, sample].T, xb[:, sample].T, a.pinhole, b.pinhole, ransac, {"max_iterations": 0}
     )
     found = _test(_epipolar_inliers, _on_flat(pose, a, b), xa, xb, search)
     found = replace(found, pose=pose)
@@ -544,13 +554,7 @@ def _transfer_inliers(
 
 def _on_pixels(E: NDArray[np.float64], a: _View, b: _View) -> NDArray[np.float64]:
     """The fundamental matrix of a pair's pixels, but for distortion, from `_find_pose`'s."""
-    return np.asarray(_to_flat(b).T @ E @ _to_flat(a))
-
-
-def _to_flat(view: _View) -> NDArray[np.float64]:
-    """Takes pixels without distortion to pixels from the principal point at the mean focal."""
-    scale = np.diag([view.focal, view.focal, 1.0])
-    return np.asarray(scale @ np.linalg.inv(view.camera.calibration_matrix()))
+    return np.asarray(b.to_flat.T @ E @ a.to_flat)
 
 
 def _on_rays(E: NDArray[np.float64], a: _View, b: _View) -> NDArray[np.float64]:
