@@ -67,6 +67,10 @@ from colmap_av1.view import (
     write_picture,
 )
 
+_ABOUT_NAMES = (
+    "'-' and '_' are alike in option names. COLMAP's spellings are accepted, such as "
+    "--ImageReader.camera_model."
+)
 _INTERRUPTED = 130
 _FAILED_CHECK = 1
 _BAD_INPUT = 2
@@ -138,13 +142,19 @@ def _make_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog=PROGRAM,
         description="Dense COLMAP matches read from the motion vectors of an AV1 video.",
-        epilog="'-' and '_' are alike in option names.",
+        epilog=_ABOUT_NAMES,
         allow_abbrev=False,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    command = _add_command(commands, "match", _run_match, "fill a COLMAP database from a video")
+    command = _add_command(
+        commands,
+        "match",
+        _run_match,
+        "fill a COLMAP database from a video",
+        "--database PATH --video PATH [--image_path PATH]",
+    )
     command.add_argument(
         "--database",
         "--database_path",
@@ -176,7 +186,11 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_quiet(command)
 
     command = _add_command(
-        commands, "reconstruct", _run_reconstruct, "make a dense model for 3D Gaussian splatting"
+        commands,
+        "reconstruct",
+        _run_reconstruct,
+        "make a dense model for 3D Gaussian splatting",
+        "--video PATH --output PATH",
     )
     _add_video(command, "a video; one that is not AV1 is converted first")
     _add_output(command, "folder for images/ and sparse/0/; that of an earlier run is gone on with")
@@ -193,11 +207,15 @@ def _make_parser() -> argparse.ArgumentParser:
         ReadOptions: "bitstream",
         EncodeOptions: "encoding of a video that is not AV1",
     }
-    add_options(command, stages, without=("on_existing",))
+    add_options(command, stages, without=("on_existing", "first_number", "single_camera"))
     _add_quiet(command)
 
     command = _add_command(
-        commands, "densify", _run_densify, "put dense points on the poses of a model that is there"
+        commands,
+        "densify",
+        _run_densify,
+        "put dense points on the poses of a model that is there",
+        "--model PATH --video PATH --output PATH",
     )
     command.add_argument(
         "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
@@ -207,13 +225,18 @@ def _make_parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--image_path", metavar="PATH", help="folder of its images, where names leave doubt"
     )
-    for kind in (MapperOptions, CameraOptions, PairOptions):
+    for kind in (MapperOptions, CameraOptions, PairOptions, VerifyOptions):
         del stages[kind]
-    add_options(command, stages, without=("on_existing",))
+    new_images = ("image_name", "num_images", "fps", "select", "skip_blurred")
+    add_options(command, stages, without=("on_existing", *new_images))
     _add_quiet(command)
 
     command = _add_command(
-        commands, "compare", _run_compare, "compare with SIFT and others on a video, with a report"
+        commands,
+        "compare",
+        _run_compare,
+        "compare with SIFT and others on a video, with a report",
+        "--video PATH --output PATH [--reference PATH]",
     )
     _add_video(command, "a video; one that is not AV1 is converted first")
     _add_output(command, "folder for the report; that of an earlier run is gone on with")
@@ -248,7 +271,13 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     _add_quiet(command)
 
-    command = _add_command(commands, "encode", _run_encode, "convert a video to a good AV1 stream")
+    command = _add_command(
+        commands,
+        "encode",
+        _run_encode,
+        "convert a video to a good AV1 stream",
+        "--video PATH --output PATH",
+    )
     _add_video(command, "a video that ffmpeg decodes")
     _add_output(command, "the stream: .mp4, .mkv, .webm or .ivf")
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
@@ -261,14 +290,22 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_quiet(command)
 
     command = _add_command(
-        commands, "info", _run_info, "tell what a stream is made of and whether it is any good"
+        commands,
+        "info",
+        _run_info,
+        "tell what a stream is made of and whether it is any good",
+        "--video PATH",
     )
     _add_video(command)
     add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
 
     command = _add_command(
-        commands, "check", _run_check, "tell what COLMAP's mappers will make of a database"
+        commands,
+        "check",
+        _run_check,
+        "tell what COLMAP's mappers will make of a database",
+        "--database PATH",
     )
     _add_database(command)
     command.add_argument(
@@ -277,21 +314,37 @@ def _make_parser() -> argparse.ArgumentParser:
         help="exit with status 1 where something stops the mappers",
     )
 
-    command = _add_command(commands, "motion", _run_motion, "write the motion of every frame")
+    command = _add_command(
+        commands,
+        "motion",
+        _run_motion,
+        "write the motion of every frame",
+        "--video PATH --output PATH",
+    )
     _add_video(command)
     _add_output(command, "a .npz or .h5 file")
     add_options(command, {ReadOptions: "bitstream"})
     _add_quiet(command)
 
     command = _add_command(
-        commands, "export", _run_export, "write a database's features and matches for hloc"
+        commands,
+        "export",
+        _run_export,
+        "write a database's features and matches for hloc",
+        "--database PATH --output PATH",
     )
     _add_database(command)
     _add_output(command, "folder for the files")
     add_options(command, {ExportOptions: "files"})
     _add_quiet(command)
 
-    command = _add_command(commands, "view", _run_view, "draw motion, tracks, matches or a model")
+    command = _add_command(
+        commands,
+        "view",
+        _run_view,
+        "draw motion, tracks, matches or a model",
+        "(--video PATH | --database PATH | --model PATH) --output PATH",
+    )
     subject = command.add_mutually_exclusive_group(required=True)
     subject.add_argument(
         "--video", "--video_path", metavar="PATH", help="draw motion and tracks of an AV1 video"
@@ -332,10 +385,20 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _add_command(
-    commands: Any, name: str, run: Callable[[argparse.Namespace], int | None], summary: str
+    commands: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int | None],
+    summary: str,
+    needed: str,
 ) -> argparse.ArgumentParser:
+    """Add a subcommand; `needed` are the options that its usage names."""
     command: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.", allow_abbrev=False
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        usage=f"%(prog)s {needed} [options]",
+        epilog=_ABOUT_NAMES,
+        allow_abbrev=False,
     )
     command.set_defaults(run=run)
     return command

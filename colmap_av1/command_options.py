@@ -20,6 +20,8 @@ _OPTION = "option."
 
 # Options under other names than their fields', and COLMAP's prefixes, which are accepted.
 _SPELLINGS = {"seed": ("--random_seed",)}
+# Options whose value is a file.
+_FILES = ("frame_list", "keep_stream")
 _PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
 
 
@@ -47,20 +49,19 @@ def add_options(
                 continue
             added.add(field.name)
             names = [*_SPELLINGS.get(field.name, ()), f"--{field.name}"]
-            if kind in _PREFIXES:
-                names.append(f"--{_PREFIXES[kind]}.{field.name}")
             parse, metavar = _value_parser(hints[field.name])
             default = _spell(field.default)
             how: dict[str, Any] = {"nargs": "?", "const": True} if hints[field.name] is bool else {}
+            how |= {"dest": f"{_OPTION}{field.name}", "type": parse, "default": argparse.SUPPRESS}
             group.add_argument(
                 *names,
-                dest=f"{_OPTION}{field.name}",
-                type=parse,
-                metavar=metavar,
-                default=argparse.SUPPRESS,
+                metavar="PATH" if field.name in _FILES else metavar,
                 help=f"{comments.get(field.name, '')} [{default}]".strip().replace("%", "%%"),
                 **how,
             )
+            if kind in _PREFIXES:  # accepted, but no reading for help
+                prefixed = f"--{_PREFIXES[kind]}.{field.name}"
+                command.add_argument(prefixed, help=argparse.SUPPRESS, **how)
 
 
 def given(namespace: argparse.Namespace, kind: type[_Options], **more: Any) -> _Options:
