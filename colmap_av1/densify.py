@@ -17,7 +17,7 @@ from colmap_av1.dense_points import (
     seen_in,
     triangulate_tracks,
 )
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError
 from colmap_av1.files import remove_leftovers, whole_folder
 from colmap_av1.images import size_of_images
 from colmap_av1.model import ModelImage, read_model, write_model
@@ -106,7 +106,16 @@ def densify(
         name: (int(cameras[i.camera_id].width), int(cameras[i.camera_id].height))
         for name, i in by_name.items()
     }
-    size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
+    if len(sizes) < 2:
+        raise ModelError(f"{model}: only one image has a pose: points need two or more")
+    try:
+        size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
+    except ImageError as error:
+        raise ImageError(f"{model}: {error}") from error
+    folder = Path(image_path) if image_path is not None else None
+    missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
+    if missing is not None:
+        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
 
     source = open_source(video, options.match, clock=clock, progress=progress)
     matching = chaining_for_points(options.match, options.triangulate)
@@ -116,7 +125,7 @@ def densify(
             tracked.tracks,
             options.match.images,
             existing=list(by_name),
-            folder=Path(image_path) if image_path is not None else None,
+            folder=folder,
             times=lambda: times_of_frames(source, tracked.tracks.num_frames),
             decode=lambda: decoded_pictures(source, options.match),
         )

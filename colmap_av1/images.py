@@ -79,8 +79,8 @@ def frames_of_images(
     if len(found) < len(numbers):
         unnumbered = names[numbers.index(None)]
         raise ImageError(
-            f"{counts}, and '{unnumbered}' has no frame number: extract every frame as an "
-            "image, or number the images by frame"
+            f"{counts}, and '{unnumbered}' has no frame number: list the images in a "
+            "--frame_list, or give their folder as --image_path, to tell them by what they show"
         )
     lowest, highest = min(found), max(found)
     if first_number is None:
@@ -126,8 +126,8 @@ def size_of_images(
         turned = first == video_size[::-1]
         raise ImageError(
             f"image '{first_name}' is {first[0]}x{first[1]}, the video's pictures are "
-            f"{width}x{height}{' as players turn them' if turned else ''}: use images of the "
-            "video's shape, or a new database and folder"
+            f"{width}x{height}{' as players turn them' if turned else ''}: give the video that "
+            "it comes from, or begin with a new database and folder"
         )
     return first
 
@@ -323,8 +323,9 @@ def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) ->
         return 1
     raise ImageError(
         f"{counts}, and the image numbers {lowest} to {highest} do not say which frames they "
-        "are: extract every frame, or number the images by frame and say with --first_number "
-        "how the first frame of the video is numbered"
+        "are: say with --first_number how the first frame of the video is numbered, list the "
+        "images in a --frame_list, or give their folder as --image_path, to tell them by what "
+        "they show"
     )
 
 

@@ -22,6 +22,7 @@ _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])
 _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
+_CAMERA_HEAD = 24
 _ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
 # Points written at a time; bounds memory.
 _CHUNK = 20_000
@@ -149,16 +150,23 @@ def read_model(model: str | os.PathLike[str]) -> Any:
     if not any(
         all((path / f"{name}{suffix}").is_file() for name in _FILES) for suffix in (".bin", ".txt")
     ):
-        inside = next((p for p in sorted(path.glob("**/cameras.bin")) if p.parent != path), None)
+        found = sorted(path.glob("**/cameras.bin"))
+        inside = next((p for p in found if ".stages" not in p.parts), None)
         hint = f": did you mean {inside.parent}?" if inside else ": give a folder a mapper wrote"
         raise ModelError(f"{path}: holds no COLMAP model (cameras, images, points3D){hint}")
+    unreadable = ModelError(
+        f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
+        "update pycolmap"
+    )
     try:
         reconstruction = pycolmap.Reconstruction(path)
     except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
-        raise ModelError(
-            f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
-            "update pycolmap"
-        ) from error
+        raise unreadable from error
+    cameras = path / "cameras.bin"
+    sizes = [_CAMERA_HEAD + 8 * len(c.params) for c in reconstruction.cameras.values()]
+    # pycolmap does not notice where this file ends early.
+    if cameras.is_file() and cameras.stat().st_size < 8 + sum(sizes):
+        raise unreadable
     if reconstruction.num_reg_images() == 0:
         raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
     return reconstruction

@@ -97,7 +97,7 @@ def test_sizes() -> None:
         size_of_images({"a": SIZE, "b": (96, 64)}, SIZE)
     with pytest.raises(ImageError, match="192x128 as players turn them"):
         size_of_images({"a": (128, 192)}, SIZE)
-    with pytest.raises(ImageError, match="use images of the video's shape"):
+    with pytest.raises(ImageError, match="give the video that it comes from"):
         size_of_images({"a": (192, 144)}, SIZE)
 
 

@@ -42,6 +42,12 @@ def test_what_is_no_model_is_refused(
     (model / "images.bin").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ModelError, match="cannot be read"):
         read_model(model)
+    (model / "images.bin").write_bytes(whole)
+    read_model(model)
+    whole = (model / "cameras.bin").read_bytes()
+    (model / "cameras.bin").write_bytes(whole[:-8])
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_model(model)
 
 
 def test_a_model_without_poses_is_refused(tmp_path: Path) -> None:
