@@ -100,7 +100,7 @@ def choose_images(
     if len(chosen.frames) < 2:
         raise ImageError(
             f"{len(chosen.frames)} of {tracks.num_frames} frames become images: matches need two "
-            "or more"
+            f"or more{': give a longer video' if tracks.num_frames < 2 else ''}"
         )
     return chosen
 

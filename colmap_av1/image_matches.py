@@ -16,9 +16,11 @@ from colmap_av1.focal import estimate_focal_length
 from colmap_av1.options import MatchOptions
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import MIN_LENGTH, Tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 
+# Frames of a video that may be too short for tracks.
+_SHORT = 8
 # The mapper's default limit for the translation along the axis of a first pair.
 _INIT_MAX_FORWARD_MOTION = 0.95
 # Camera models that a pinhole camera is a first guess of.
@@ -78,6 +80,12 @@ def pair_images(
     with clock.measure("pairs"):
         keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options.pairs)
+        if len(pairs) == 0 and tracks.num_frames < _SHORT:
+            raise VideoError(
+                f"{video}: no two images share {options.pairs.min_matches} tracks of "
+                f"{options.tracks.min_length or MIN_LENGTH} frames or more, as the video has "
+                f"{tracks.num_frames}: give a longer video, or --min_length 2"
+            )
         if len(pairs) == 0:
             raise VideoError(
                 f"{video}: no two images share {options.pairs.min_matches} tracks, so there is "

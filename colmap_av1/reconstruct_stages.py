@@ -22,7 +22,7 @@ from colmap_av1.dense_points import (
     triangulate_tracks,
 )
 from colmap_av1.density import select_tracks
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError
 from colmap_av1.image_matches import MatchedImages, pair_images, shared_focal_length, verify_images
 from colmap_av1.images import write_images
 from colmap_av1.mapper import adjust_model, map_poses
@@ -37,6 +37,10 @@ from colmap_av1.video import read_display
 from colmap_av1.video_tracks import VideoSource, decoded_pictures, times_of_frames, track_video
 
 _Image = NDArray[np.uint8]
+# A mapper may leave a bogus model of two images where it finds no start.
+_LEAST_IMAGES = 3
+# Of an image, below which a mapper that finds no start may lack them.
+_FEW_TRACKS = 100
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
@@ -81,6 +85,11 @@ def track_stage(run: Run) -> Kept:
                 folder=partial,
                 times=lambda: times_of_frames(source, tracks.num_frames),
                 decode=lambda: decoded_pictures(source, options),
+            )
+        if len(chosen.names) < _LEAST_IMAGES:
+            raise ImageError(
+                f"{len(chosen.names)} of {tracks.num_frames} frames become images: a model needs "
+                f"{_LEAST_IMAGES} or more"
             )
         unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
         if unfit is not None:
@@ -217,7 +226,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
                 num_images=num_images,
                 progress=progress,
             )
-        if not mapped.num_images:
+        if max(mapped.num_images, default=0) < _LEAST_IMAGES:
             raise ModelError(_why_no_start(matched.facts, mapper))
         return {
             "num_registered": mapped.num_images[0],
@@ -248,21 +257,23 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     """Why a mapper found no two images to start with, and what to try."""
     told = f"COLMAP's {mapper} mapper finds no start"
     other = "incremental" if mapper == "global" else "global"
-    if facts["num_verified_pairs"] < facts["num_pairs"] / 2 or facts["keypoints_per_image"] < 100:
-        return (
-            f"{told}: too few tracks, {facts['keypoints_per_image']:.0f} an image and "
-            f"{facts['num_verified_pairs']} of {facts['num_pairs']} pairs that agree with a rigid "
-            "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
-        )
-    if facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
+    most_agree = facts["num_verified_pairs"] >= facts["num_pairs"] / 2
+    if most_agree and facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
         return (
             f"{told}: too little parallax, in {facts['num_flat_pairs']} of "
             f"{facts['num_verified_pairs']} pairs the camera only turns or the scene is flat: film "
             "while moving sideways, or give a longer part of the video"
         )
+    if not most_agree or facts["keypoints_per_image"] < _FEW_TRACKS:
+        return (
+            f"{told}: too few tracks, {facts['keypoints_per_image']:.0f} an image and "
+            f"{facts['num_verified_pairs']} of {facts['num_pairs']} pairs that agree with a rigid "
+            "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
+        )
     if facts["guessed"]:
         return (
-            f"{told}: the focal length is a guess and may be far off, or the parallax too little: "
+            f"{told}: the focal length is a guess and may be far off, or the parallax too little, "
+            "as where the camera moves along its axis: "
             f"give --camera_model and --camera_params, or try --mapper {other}"
         )
     return (

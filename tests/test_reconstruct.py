@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import Encode
+from conftest import Encode, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
 
+from colmap_av1 import mapper as mapper_module
 from colmap_av1.cli import main
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.poses import model_poses, pose_errors
 from colmap_av1.model import read_model
 from colmap_av1.options import (
@@ -276,6 +277,30 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
     assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before
     assert not list((made.output / ".stages").glob("*.partial"))
     assert reconstruct(SCENE, made.output, options=OPTIONS).resumed[-1] == "model"
+
+
+def test_short_videos(encode: Encode, tmp_path: Path) -> None:
+    one, two, three = (encode(make_frames(n), tmp_path / f"{n}.mp4") for n in (1, 2, 3))
+    with pytest.raises(ImageError, match="matches need two or more: give a longer video"):
+        reconstruct(one, tmp_path / "out")
+    with pytest.raises(ImageError, match="2 of 2 frames become images: a model needs 3"):
+        reconstruct(two, tmp_path / "out")
+    with pytest.raises(VideoError, match="the video has 3: give a longer video"):
+        reconstruct(three, tmp_path / "out")
+
+
+def test_model_of_two_images_is_none(
+    made: ReconstructReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def map_two(*_: object, **__: object) -> mapper_module.MapperRun:
+        return mapper_module.MapperRun((2,))
+
+    shutil.copytree(made.output, tmp_path / "out")
+    stages = importlib.import_module("colmap_av1.reconstruct_stages")
+    monkeypatch.setattr(stages, "map_poses", map_two)
+    other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
+    with pytest.raises(ModelError, match="incremental mapper finds no start: .* try --mapper"):
+        reconstruct(SCENE, tmp_path / "out", options=other)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
