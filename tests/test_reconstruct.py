@@ -299,7 +299,7 @@ def test_model_of_two_images_is_none(
     stages = importlib.import_module("colmap_av1.reconstruct_stages")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
-    with pytest.raises(ModelError, match="incremental mapper finds no start: .* try --mapper"):
+    with pytest.raises(ModelError, match=r"incremental mapper finds no start: .* try --mapper"):
         reconstruct(SCENE, tmp_path / "out", options=other)
 
 
