@@ -19,8 +19,6 @@ from colmap_av1.progress import Clock, Progress
 from colmap_av1.tracks import MIN_LENGTH, Tracks
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 
-# Frames of a video that may be too short for tracks.
-_SHORT = 8
 # The mapper's default limit for the translation along the axis of a first pair.
 _INIT_MAX_FORWARD_MOTION = 0.95
 # Camera models that a pinhole camera is a first guess of.
@@ -80,10 +78,10 @@ def pair_images(
     with clock.measure("pairs"):
         keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options.pairs)
-        if len(pairs) == 0 and tracks.num_frames < _SHORT:
+        length = options.tracks.min_length or MIN_LENGTH
+        if tracks.num_frames < length:
             raise VideoError(
-                f"{video}: no two images share {options.pairs.min_matches} tracks of "
-                f"{options.tracks.min_length or MIN_LENGTH} frames or more, as the video has "
+                f"{video}: tracks are of {length} frames or more, the video has "
                 f"{tracks.num_frames}: give a longer video, or --min_length 2"
             )
         if len(pairs) == 0:

@@ -285,7 +285,7 @@ def test_short_videos(encode: Encode, tmp_path: Path) -> None:
         reconstruct(one, tmp_path / "out")
     with pytest.raises(ImageError, match="2 of 2 frames become images: a model needs 3"):
         reconstruct(two, tmp_path / "out")
-    with pytest.raises(VideoError, match="the video has 3: give a longer video"):
+    with pytest.raises(VideoError, match="of 4 frames or more, the video has 3: give a"):
         reconstruct(three, tmp_path / "out")
 
 
