@@ -56,6 +56,8 @@ class TrackBuilder:
         border: float,
         interpolation: float,
         bridge: float,
+        cells: int = 1,
+        seeding: int = 1,
     ) -> None: ...
     def add(self, **frame: Any) -> None: ...
     def finish(

@@ -22,14 +22,20 @@ LEAST_AGREEING = 0.5
 # Shown frames that a track is seen in at least which a point may come from: where rays meet at an
 # angle, points of three frames are as true as those of four and five.
 _TRACK_LENGTH = 3
+# Width in pixels of the squares that hold one track each: tracks that come near each other show
+# two points as long as they do not come nearer than this.
+_CELL = 2
 
 
 def chaining_for_points(options: MatchOptions, triangulate: TriangulateOptions) -> MatchOptions:
-    """The options with those tracks chained, too, that are only long enough for points."""
-    if options.tracks.min_length is not None:
-        return options
-    min_length = min(_TRACK_LENGTH, triangulate.min_observations)
-    return replace(options, tracks=replace(options.tracks, min_length=min_length))
+    """The options with more tracks, for points: short ones, and those that lie near another."""
+    tracks = options.tracks
+    if tracks.min_length is None:
+        min_length = min(_TRACK_LENGTH, triangulate.min_observations)
+        tracks = replace(tracks, min_length=min_length)
+    if tracks.cell is None:
+        tracks = replace(tracks, cell=min(_CELL, tracks.seeding))
+    return replace(options, tracks=tracks)
 
 
 def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:

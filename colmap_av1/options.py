@@ -71,6 +71,13 @@ class TrackOptions:
     # between them, where the motion on either side differs by less than this many pixels; None:
     # end them there
     bridge: float | None = 2.0
+    # width in pixels of the squares of a frame that hold one track each, 4, 2 or 1: of two tracks
+    # that come to lie in one the longer goes on. None: 4, and 2 where points of a dense model are
+    # wanted
+    cell: int | None = None
+    # width in pixels of the squares of a frame that a track starts in where they hold none: 4, 2
+    # or 1, not below that of a cell. Motion is coded for squares of 4
+    seeding: int = 4
 
 
 @dataclass(frozen=True)
@@ -213,6 +220,9 @@ class TriangulateOptions:
     max_reprojection_error: float = 2.0
     # smallest angle, in degrees, at which the widest two rays of a point meet
     min_angle: float = 1.5
+    # largest expected error of a point's distance from the cameras, as a share of it, by the
+    # angle and the reprojection error of its rays; None: any
+    max_depth_error: float | None = 0.07
     # observations a point needs
     min_observations: int = 3
 

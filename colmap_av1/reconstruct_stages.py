@@ -46,6 +46,8 @@ _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.5
+# Poses are told by rays, however unsure the points are that these meet in.
+_FOR_POSES = TriangulateOptions(max_depth_error=None)
 
 
 @dataclass(frozen=True)
@@ -299,7 +301,7 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
             points = triangulate_tracks(
                 *(seen, view, [placed.camera] * len(placed.images)),
                 *([i.cam_from_world for i in placed.images], None),
-                options=TriangulateOptions(),
+                options=_FOR_POSES,
                 num_threads=options.match.verify.num_threads,
                 progress=no_progress,
             )

@@ -16,6 +16,8 @@ from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.motion import FrameMotion
 from colmap_av1.options import TrackOptions
 
+# Width in pixels of the squares that motion is coded for.
+_UNIT = 4
 # Shown frames that a track is seen in at least where the options leave it open.
 MIN_LENGTH = 4
 
@@ -60,11 +62,12 @@ def build_tracks(
     The motion of a block holds for each of its 4x4 units. A unit carries on the track
     found where its displacement lands in the referenced frame, to the sub-pixel place
     that moves exactly onto it, and a track moves with its unit into a reference shown
-    later. Where two tracks want one unit the longer goes on. Frames are chained in display order
+    later. Where two tracks want one cell, a unit unless `options.cell` cuts it into parts, the
+    longer goes on. Frames are chained in display order
     and links to the nearest frame come first, so a frame that was coded far ahead is reached by
     the short steps between; frames that are never shown are chained through last. A unit without
     motion of its own moves as those on either side of it do, where these agree. A unit without a
-    track starts one at its centre. No unit holds two tracks, no frame sees a track twice. Frames
+    track starts one at its centre. No cell holds two tracks, no frame sees a track twice. Frames
     are consumed one by one; beyond a few frames of motion, memory grows with the observations
     only.
 
@@ -86,6 +89,7 @@ def build_tracks(
     """
     options = options if options is not None else TrackOptions()
     _check_options(options)
+    cell = options.cell or _UNIT
     builder = _core.TrackBuilder(
         min_length=MIN_LENGTH if options.min_length is None else options.min_length,
         cosine=-2.0 if options.cosine is None else options.cosine,
@@ -98,6 +102,8 @@ def build_tracks(
         border=_or_off(options.border),
         interpolation=_or_off(options.interpolation),
         bridge=_or_off(options.bridge),
+        cells=_UNIT // cell,
+        seeding=options.seeding // cell,
     )
     for count, frame in enumerate(motion, start=1):
         builder.add(
@@ -218,6 +224,16 @@ def _or_off(limit: _Limit | None) -> _Limit | int:
 def _check_options(options: TrackOptions) -> None:
     if options.min_length is not None and options.min_length < 1:
         raise OptionError(f"min_length is {options.min_length}: give 1 or more")
+    widths = (1, 2, _UNIT)
+    if options.cell not in (None, *widths) or options.seeding not in widths:
+        raise OptionError(
+            f"cell is {options.cell}, seeding {options.seeding}: give widths of 1, 2 or 4 pixels"
+        )
+    if options.seeding < (options.cell or _UNIT):
+        raise OptionError(
+            f"seeding is {options.seeding}, below cell {options.cell or _UNIT}: squares that "
+            "tracks start in cannot be smaller than those that hold one, give a smaller --cell"
+        )
     if options.cosine is not None and not -1.0 <= options.cosine <= 1.0:
         raise OptionError(f"cosine is {options.cosine}: give a value from -1 to 1, or None")
     if options.cosine_relative_to not in ("dominant", "none"):

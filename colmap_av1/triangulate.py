@@ -28,6 +28,8 @@ _CONVERGED = 0.999
 _SOFT_ERROR = 1.0
 # Error in pixels that an observation has however sure its motion is.
 _SIGMA_FLOOR = 0.3
+# Error of a ray, where a point is looked at for the wrong distance, to its mean reprojection error.
+_ERROR_TO_SIGMA = 2.0
 # Smallest eigenvalue of the normal equations, as a share of their trace, that is no plain
 # singularity.
 _SINGULAR = 1e-12
@@ -115,7 +117,9 @@ def triangulate(
     "Triangulation", 1997), judged by all observations; Gauss-Newton steps on the reprojection
     error follow, weighted by the expected error of each observation and by how well it agrees.
     Observations beyond `max_error`, or behind the camera, are dropped. What is dropped may be a
-    point of its own, where a track slid from one surface to another: it is tried once more.
+    point of its own, where a track slid from one surface to another: it is tried once more. Rays
+    that meet at an angle a and are off by e tell a distance to e / a of it; where that is too much
+    there is no point.
 
     Args:
         sightings: the tracks.
@@ -176,6 +180,10 @@ def check_triangulate_options(options: TriangulateOptions) -> None:
         )
     if not 0 <= options.min_angle < 90:
         raise OptionError(f"min_angle is {options.min_angle}: give degrees from 0 to below 90")
+    if options.max_depth_error is not None and not 0 < options.max_depth_error < math.inf:
+        raise OptionError(
+            f"max_depth_error is {options.max_depth_error}: give a share above 0, or None"
+        )
     if options.min_observations < 2:
         raise OptionError(f"min_observations is {options.min_observations}: give 2 or more")
 
@@ -214,12 +222,12 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
         xyz, kept, error, agrees = _solve(group, options)
         if attempt == 0:
             num_tried, num_agreeing = len(starts), int(agrees.sum())
-        good = _wide_enough(group, xyz, kept, options) & agrees
+        sizes = np.add.reduceat(kept.astype(np.int64), starts)
+        mean_error = np.add.reduceat(error, starts) / np.maximum(sizes, 1)
+        good = agrees & _is_sure(group, _widest_angle(group, xyz, kept), mean_error, options)
         used = kept & good[group.track]
-        sizes = np.add.reduceat(used.astype(np.int64), starts)
-        total = np.add.reduceat(np.where(used, error, 0.0), starts)
         owner = track[left[starts]]
-        found.append((owner[good], xyz[good], (total / np.maximum(sizes, 1))[good], sizes[good]))
+        found.append((owner[good], xyz[good], mean_error[good], sizes[good]))
         observations.append(left[used])
         left = left[~kept & agrees[group.track]]
     if not found:
@@ -393,10 +401,8 @@ def _directions(group: _Group, rows: NDArray[np.int64]) -> _Floats:
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def _wide_enough(
-    group: _Group, xyz: _Floats, kept: NDArray[np.bool_], options: TriangulateOptions
-) -> NDArray[np.bool_]:
-    """Whether the rays of the kept observations meet at a wide enough angle.
+def _widest_angle(group: _Group, xyz: _Floats, kept: NDArray[np.bool_]) -> _Floats:
+    """Angles in radians at which the rays of the kept observations meet, float64 [num_tracks].
 
     Measured against the first and the last of them, so at most a little less than the widest.
     """
@@ -413,4 +419,17 @@ def _wide_enough(
         narrowest = np.minimum(
             narrowest, np.minimum.reduceat(np.where(kept, cosine, 1.0), group.starts)
         )
-    return np.asarray(narrowest <= math.cos(math.radians(options.min_angle)))
+    return np.asarray(np.arccos(np.clip(narrowest, -1.0, 1.0)))
+
+
+def _is_sure(
+    group: _Group, angle: _Floats, error: _Floats, options: TriangulateOptions
+) -> NDArray[np.bool_]:
+    """Whether points of these angles and mean errors are where they seem to be."""
+    wide = angle >= math.radians(options.min_angle)
+    if options.max_depth_error is None:
+        return wide
+    # All observations of a track may be off alike, which its errors show only in part.
+    pixels = np.hypot(_SIGMA_FLOOR, _ERROR_TO_SIGMA * error)
+    focal = group.focal[:, group.starts].mean(axis=0)
+    return np.asarray(wide & (pixels <= options.max_depth_error * focal * angle))

@@ -415,6 +415,33 @@ def project(
     return xy, depth, visible
 
 
+def surface_distance(scene: Scene, points: FloatArray) -> FloatArray:
+    """[n] distances in metres of world points [n, 3] to the nearest surface."""
+    points = np.asarray(points, float)
+    nearest = np.full(len(points), np.inf)
+    for surface in scene.surfaces:
+        offset = points - surface.origin
+        if surface.kind == "sphere":
+            distance = np.abs(np.linalg.norm(offset, axis=1) - surface.radius)
+        elif surface.kind == "cylinder":
+            height = surface.size[1]
+            axis = surface.edge_v / height
+            along = offset @ axis
+            radial = np.linalg.norm(offset - along[:, None] * axis, axis=1) - surface.radius
+            distance = np.hypot(radial, along - np.clip(along, 0, height))
+        else:
+            uv = np.stack([offset @ e / (e @ e) for e in (surface.edge_u, surface.edge_v)], 1)
+            if surface.kind == "disc":
+                # The ellipse of the example is a circle.
+                away = np.linalg.norm(uv - 0.5, axis=1, keepdims=True)
+                uv = 0.5 + (uv - 0.5) * np.minimum(1, 0.5 / np.maximum(away, 1e-12))
+            uv = np.clip(uv, 0, 1)
+            foot = uv[:, :1] * surface.edge_u + uv[:, 1:] * surface.edge_v
+            distance = np.linalg.norm(offset - foot, axis=1)
+        nearest = np.minimum(nearest, distance)
+    return nearest
+
+
 def transfer(
     scene: Scene, xy: FloatArray, frame_a: int, frame_b: int
 ) -> tuple[FloatArray, NDArray[np.bool_]]:

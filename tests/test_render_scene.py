@@ -71,6 +71,17 @@ def test_projection_follows_the_stored_pose_and_intrinsics(truth, scene):
     assert depth[0] == pytest.approx(z)
 
 
+@pytest.mark.parametrize("frame", [0, 31])
+def test_surface_points_have_no_distance_to_the_surfaces(scene, frame):
+    points = render_scene.surface_points(scene, frame, _positions(scene, 3000, frame))
+    assert render_scene.surface_distance(scene, points).max() < 1e-9
+    pose = scene.cam_from_world[frame]
+    ray = points + pose[:, :3].T @ pose[:, 3]
+    before = render_scene.surface_distance(scene, points - 0.05 * ray)
+    assert (before <= 0.05 * np.linalg.norm(ray, axis=1) + 1e-9).all()
+    assert np.median(before) > 0.02
+
+
 @pytest.mark.parametrize("frame", [0, 24, 59])
 def test_surface_points_project_to_where_they_were_seen(scene, frame):
     xy = _positions(scene, 4000, frame)

@@ -158,7 +158,7 @@ def split(tracks: Tracks) -> list[tuple[NDArray[np.int32], NDArray[np.float32]]]
     ]
 
 
-def check_invariants(tracks: Tracks, min_length: int) -> None:
+def check_invariants(tracks: Tracks, min_length: int, cell: int = 4) -> None:
     lengths = np.diff(tracks.offsets)
     assert tracks.offsets[0] == 0
     assert tracks.offsets[-1] == len(tracks.frame) == len(tracks.xy)
@@ -173,8 +173,8 @@ def check_invariants(tracks: Tracks, min_length: int) -> None:
     assert (tracks.sigma >= 0).all()
     assert ((tracks.xy >= 0) & (tracks.xy < (tracks.width, tracks.height))).all()
     assert ((tracks.frame >= 0) & (tracks.frame < tracks.num_frames)).all()
-    units = np.column_stack([tracks.frame, np.floor(tracks.xy / 4).astype(np.int32)])
-    assert len(np.unique(units, axis=0)) == len(units)
+    cells = np.column_stack([tracks.frame, np.floor(tracks.xy / cell).astype(np.int32)])
+    assert len(np.unique(cells, axis=0)) == len(cells)
 
 
 def warp_units(motion: FrameMotion, params: Sequence[int]) -> FrameMotion:
@@ -499,7 +499,13 @@ def test_tracks_in_the_gap_between_blocks_go_on() -> None:
     assert (carried(None), carried(0.5), carried(2.0)) == (0, 0, 12)
 
 
-def test_of_two_tracks_the_longer_goes_on() -> None:
+@pytest.mark.parametrize(
+    ("cell", "going_on"),
+    [(4, [[6.0, 5.5, 5.5, 3.5]]), (2, [[6.0, 5.5, 5.5, 3.5], [2.0, 3.5, 1.5]])],
+)
+def test_of_two_tracks_in_one_cell_the_longer_goes_on(
+    cell: int, going_on: list[list[float]]
+) -> None:
     # Column 0 seeds tracks in frame 1 that come to x = 3.5; those of column 1 are from frame 0 and
     # lie at 5.5. In frame 3 one unit finds both, the young one nearer to its centre.
     steps = np.zeros((3, 12, 16, 2), np.int16)
@@ -510,10 +516,28 @@ def test_of_two_tracks_the_longer_goes_on() -> None:
     for index, col in ((1, 0), (3, 1)):
         frames[index].ref_frame[:, col] = (0, -1)
         frames[index].is_inter[:, col] = 0
-    tracks = build_tracks(frames, replace(OPEN, min_length=2))
-    check_invariants(tracks, 2)
+    tracks = build_tracks(frames, replace(OPEN, min_length=2, cell=cell))
+    check_invariants(tracks, 2, cell)
     paths = [xy[:, 0].tolist() for shown, xy in split(tracks) if shown[-1] == 3 and xy[-1, 0] < 4]
-    assert paths == [[6.0, 5.5, 5.5, 3.5]] * 12
+    assert sorted(paths) == sorted(going_on * 12)
+
+
+@pytest.mark.parametrize(("cell", "seeding"), [(4, 4), (2, 4), (1, 4), (2, 2), (1, 2), (1, 1)])
+def test_a_track_starts_in_every_empty_square(cell: int, seeding: int) -> None:
+    steps = [(1.0, 0.5)] * 3
+    options = replace(OPEN, min_length=1, cell=cell, seeding=seeding)
+    tracks = build_tracks(low_delay(steps), options)
+    check_invariants(tracks, 1, cell)
+    first = tracks.xy[tracks.offsets[:-1]]
+    at_once = tracks.frame[tracks.offsets[:-1]] == 0
+    assert at_once.sum() == 64 * 48 // seeding**2
+    assert (first % seeding == seeding / 2).all()
+    # What moves to the left and up leaves squares at the right and below.
+    assert (first[~at_once] >= np.array([64, 48]) - 3 * seeding).any(axis=1).all()
+    for shown, xy in split(tracks):
+        assert np.array_equal(xy, xy[0] - np.outer(shown - shown[0], steps[0]))
+    # Of a frame that nothing moves into every square has a track of its own.
+    assert np.bincount(tracks.frame).min() >= 60 * 46 // seeding**2
 
 
 def test_one_track_goes_to_one_unit_the_best_one() -> None:
@@ -857,6 +881,7 @@ any_options = st.builds(
     smoothness=st.sampled_from([None, 1.5]),
     border=st.sampled_from([None, 6.0]),
     interpolation=st.sampled_from([None, 1.5]),
+    cell=st.sampled_from([None, 4, 2, 1]),
 )
 
 
@@ -868,7 +893,7 @@ def test_any_motion_gives_valid_tracks(motion: list[FrameMotion], options: Track
             build_tracks(motion, options)
         return
     tracks = build_tracks(motion, options)
-    check_invariants(tracks, options.min_length)
+    check_invariants(tracks, options.min_length, options.cell or 4)
     again = build_tracks(iter(motion), options)
     for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
         assert getattr(tracks, name).tobytes() == getattr(again, name).tobytes()
@@ -897,6 +922,9 @@ def test_no_shown_frame_is_an_error() -> None:
         {"smoothness": math.nan},
         {"border": -1.0},
         {"interpolation": -1.0},
+        {"cell": 3},
+        {"seeding": 8},
+        {"seeding": 2, "cell": 4},
     ],
 )
 def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:

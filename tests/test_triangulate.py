@@ -110,6 +110,31 @@ def test_what_is_no_point(scene: tuple[np.ndarray, Views]) -> None:
     assert len(triangulate(nothing, seen_by).xyz) == 0
 
 
+def test_unsure_distances_are_no_points(scene: tuple[np.ndarray, Views]) -> None:
+    """What the angle and the errors of the rays tell of the distance decides."""
+    _, seen_by = scene
+    rng = np.random.default_rng(7)
+    xyz = np.column_stack(
+        [rng.uniform(-2, 3, (4000, 2)), 1.6 / np.radians(rng.uniform(2, 8, 4000))]
+    )
+    noise = rng.uniform(0, 2, 4000)
+    rays = rays_of(xyz, seen_by)
+    # Wrong alike in a part of the views, as tracks that drift are.
+    rays[:, 5:, 0] += (noise * rng.choice([-1, 1], 4000))[:, None] / FOCAL
+    every = TriangulateOptions(max_depth_error=None)
+    all_points = triangulate(sightings(rays), seen_by, every)
+    sure = triangulate(sightings(rays), seen_by, TriangulateOptions(max_depth_error=0.015))
+
+    def off(points: Points) -> np.ndarray:
+        return np.abs(points.xyz[:, 2] / xyz[owners(points, 9), 2] - 1)
+
+    dropped = ~np.isin(owners(all_points, 9), owners(sure, 9))
+    assert 0.2 < dropped.mean() < 0.8
+    assert np.quantile(off(sure), 0.99) < 3 * 0.015
+    assert np.median(off(all_points)[dropped]) > 2 * np.median(off(sure))
+    assert (sure.num_agreeing, sure.num_tracks) == (all_points.num_agreeing, 4000)
+
+
 def test_unusable_observations_are_ignored(scene: tuple[np.ndarray, Views]) -> None:
     xyz, seen_by = scene
     rays = rays_of(xyz, seen_by)
@@ -139,6 +164,7 @@ def test_threads_change_nothing() -> None:
         TriangulateOptions(max_reprojection_error=0),
         TriangulateOptions(min_angle=90),
         TriangulateOptions(min_observations=1),
+        TriangulateOptions(max_depth_error=0),
     ],
 )
 def test_options_that_cannot_work(

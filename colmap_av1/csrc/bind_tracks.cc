@@ -195,7 +195,8 @@ void bind_tracks(nb::module_& m) {
           "__init__",
           [](TrackBuilder* self, int min_length, double cosine, bool cosine_relative_to_dominant,
              double cosine_scale, int max_interval, int max_block_area, int max_uncoded_block_area,
-             double smoothness, double border, double interpolation, double bridge) {
+             double smoothness, double border, double interpolation, double bridge,
+             int cells, int seeding) {
             TrackBuilderOptions options;
             options.min_length = min_length;
             options.cosine = cosine;
@@ -208,12 +209,14 @@ void bind_tracks(nb::module_& m) {
             options.border = border;
             options.bridge = bridge;
             options.interpolation = interpolation;
+            options.cells = cells;
+            options.seeding = seeding;
             new (self) TrackBuilder(options);
           },
           nb::kw_only(), "min_length"_a, "cosine"_a, "cosine_relative_to_dominant"_a,
           "cosine_scale"_a, "max_interval"_a, "max_block_area"_a, "max_uncoded_block_area"_a,
           "smoothness"_a,
-          "border"_a, "interpolation"_a, "bridge"_a)
+          "border"_a, "interpolation"_a, "bridge"_a, "cells"_a = 1, "seeding"_a = 1)
       .def("add", &add_frame, nb::kw_only(), "decode_index"_a, "display_index"_a, "show_frame"_a,
            "width"_a,
            "height"_a, "coded_width"_a, "ref_decode_index"_a, "ref_display_index"_a,

@@ -91,6 +91,9 @@ TrackBuilderOptions read_options(Input& input) {
   options.smoothness = (choice & 64) != 0 ? 2.5 : -1;
   options.border = (choice & 128) != 0 ? 16 : -1;
   options.interpolation = (choice & 2) != 0 ? 2 : -1;
+  options.bridge = (choice & 1) != 0 ? 2 : -1;
+  options.cells = 1 << (((choice >> 3) & 1) + ((choice >> 5) & 1));
+  options.seeding = (choice & 64) != 0 ? options.cells : 1;
   return options;
 }
 

@@ -15,7 +15,6 @@ namespace colmap_av1::tracks {
 namespace {
 
 constexpr float kUnit = 4.F;
-constexpr float kHalfUnit = 2.F;
 constexpr int kMaxBridge = 8;  // units to the motion on either side
 constexpr std::size_t kMaxDominantSamples = 1024;
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
@@ -24,7 +23,13 @@ int block_area(int mi_size) { return av1::kBlockWidth[mi_size] * av1::kBlockHeig
 
 }  // namespace
 
-TrackBuilder::TrackBuilder(const TrackBuilderOptions& options) : options_(options) {}
+TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
+    : options_(options), half_cell_(kUnit / 2.F / static_cast<float>(options.cells)) {
+  const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
+  if (!is_part(options.cells) || !is_part(options.seeding) || options.seeding > options.cells) {
+    throw std::invalid_argument("cells and seeding are 1, 2 or 4, seeding not above cells");
+  }
+}
 
 void TrackBuilder::add(const CodedFrame& coded) {
   check_motion_field(coded.field);
@@ -122,6 +127,8 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
   frame.cols = field.mi_cols;
   frame.visible_rows = std::min(field.mi_rows, (field.height + 3) / 4);
   frame.visible_cols = std::min(field.mi_cols, (field.width + 3) / 4);
+  frame.cell_rows = options_.cells * frame.rows;
+  frame.cell_cols = options_.cells * frame.cols;
   frame.width = static_cast<float>(coded.width);
   frame.height = static_cast<float>(coded.height);
   frame.coded_width = static_cast<float>(field.width);
@@ -381,8 +388,8 @@ void TrackBuilder::chain_up_to(int display_index) {
 void TrackBuilder::chain_frame(Frame& frame) {
   current_ = &frame;
   frame.chained = true;
-  frame.cells.assign(frame.mi_size.size(), Cell{});
-  if (uses_cosine()) frame.velocity.assign(frame.mi_size.size(), Point{kNan, kNan});
+  frame.cells.assign(static_cast<std::size_t>(frame.cell_rows) * frame.cell_cols, Cell{});
+  if (uses_cosine()) frame.velocity.assign(frame.cells.size(), Point{kNan, kNan});
   find_links();
   for (Link& link : links_) {
     if (uses_cosine() && options_.cosine_relative_to_dominant) fit_dominant(link);
@@ -461,45 +468,89 @@ void TrackBuilder::fit_dominant(Link& link) {
   link.dominant = fit_dominant_motion(samples_, frame.coded_width, frame.height, scratch_);
 }
 
-// By the current frame's displacements: every free unit asks for the longest track that it
-// finds, every track goes to the unit that puts it nearest to its centre (a stable
-// matching, so the order of units does not matter).
+// By the current frame's displacements: every free cell asks for the longest track that it
+// finds, every track goes to the cell that puts it nearest to its centre (a stable
+// matching, so the order of cells does not matter).
 void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion[list];
-  bool found = false;
-  for (int row = 0; row < current_->visible_rows; ++row) {
-    for (int col = 0; col < current_->visible_cols; ++col) {
-      const int first = row * current_->cols + col;
-      if (current_->cells[first].track >= 0 || !link.refs[motion[first].ref]) continue;
-      if (!found) claims_.assign(link.other->cells.size(), Claim{});
-      found = true;
-      for (int unit = first; unit >= 0;) {
-        int cell = -1;
-        Claim claim;
-        if (reach == Reach::kOwn) {
-          best_cell(link, unit, motion[unit], &cell, &claim);
-        } else {
-          best_cell_beside(link, list, unit, &cell, &claim);
+  claims_.resize(link.other->cells.size());
+  note_open_units(*link.other);
+  for (int unit_row = 0; unit_row < current_->visible_rows; ++unit_row) {
+    for (int unit_col = 0; unit_col < current_->visible_cols; ++unit_col) {
+      const int unit = unit_row * current_->cols + unit_col;
+      if (!link.refs[motion[unit].ref] || !may_find_track(link, unit, motion[unit], reach)) {
+        continue;
+      }
+      for (int part = 0; part < options_.cells * options_.cells; ++part) {
+        const int row = options_.cells * unit_row + part / options_.cells;
+        const int col = options_.cells * unit_col + part % options_.cells;
+        if (current_->cells[row * current_->cell_cols + col].track >= 0) continue;
+        for (int cell = row * current_->cell_cols + col; cell >= 0;) {
+          int best = -1;
+          Claim claim;
+          if (reach == Reach::kOwn) {
+            find_track(link, cell, motion[unit_of(*current_, cell)], &best, &claim);
+          } else {
+            find_track_beside(link, list, cell, &best, &claim);
+          }
+          if (best < 0) break;
+          if (claims_[best].cell < 0) claimed_.push_back(best);
+          cell = std::exchange(claims_[best], claim).cell;
         }
-        if (cell < 0) break;
-        unit = std::exchange(claims_[cell], claim).unit;
       }
     }
   }
-  if (!found) return;
-  for (std::size_t cell = 0; cell < claims_.size(); ++cell) {
-    const Claim& claim = claims_[cell];
-    if (claim.unit >= 0) {
-      place(claim.unit, link.other->cells[cell].track, claim.position, claim.velocity,
-            claim.variance);
+  for (const int32_t cell : claimed_) {
+    const Claim claim = std::exchange(claims_[cell], Claim{});
+    place(claim.cell, link.other->cells[cell].track, claim.position, claim.velocity,
+          claim.variance);
+  }
+  claimed_.clear();
+}
+
+// The units of a frame with tracks that have no place in the current frame yet.
+void TrackBuilder::note_open_units(const Frame& other) {
+  open_units_.assign(other.mi_size.size(), 0);
+  int cell = 0;
+  for (int row = 0; row < other.cell_rows; ++row) {
+    uint8_t* open = open_units_.data() + row / options_.cells * other.cols;
+    for (int col = 0; col < other.cell_cols; ++col, ++cell) {
+      const int32_t track = other.cells[cell].track;
+      if (track >= 0 && tracks_[track].last_seen != frames_chained_) open[col / options_.cells] = 1;
     }
   }
 }
 
-// The same by the displacements of the units beside `unit`: where these point apart, tracks lie in
-// the gap that their blocks leave.
-void TrackBuilder::best_cell_beside(const Link& link, int list, int unit, int* best,
-                                    Claim* best_claim) const {
+// Whether the cells of a unit can find any track, to search them only then.
+bool TrackBuilder::may_find_track(const Link& link, int unit, const UnitMotion& motion,
+                                  Reach reach) const {
+  // A valid warp stretches a unit by less than half its size; beside it motion is alike.
+  float pixels = 0.75F * kUnit;
+  if (reach == Reach::kBeside) {
+    if (options_.bridge > kUnit) return true;
+    pixels += static_cast<float>(options_.bridge);
+  }
+  const Frame& other = *link.other;
+  const float scale_x = current_->coded_width / other.width;
+  const float scale_y = current_->height / other.height;
+  const Point centre = unit_centre(*current_, unit);
+  const Window window =
+      around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
+             pixels / scale_x, pixels / scale_y);
+  if (window.bottom < window.top || window.right < window.left) return false;
+  for (int row = window.top / options_.cells; row <= window.bottom / options_.cells; ++row) {
+    for (int col = window.left / options_.cells; col <= window.right / options_.cells; ++col) {
+      if (open_units_[row * other.cols + col] != 0) return true;
+    }
+  }
+  return false;
+}
+
+// The same by the displacements of the units beside the cell's: where these point apart, tracks lie
+// in the gap that their blocks leave.
+void TrackBuilder::find_track_beside(const Link& link, int list, int cell, int* best,
+                                     Claim* best_claim) const {
+  const int unit = unit_of(*current_, cell);
   const int row = unit / current_->cols;
   const int col = unit % current_->cols;
   const auto& motion = current_->motion[list];
@@ -510,23 +561,24 @@ void TrackBuilder::best_cell_beside(const Link& link, int list, int unit, int* b
           !moves_alike(motion[other], motion[unit])) {
         continue;
       }
-      best_cell(link, unit, motion[other], best, best_claim);
+      find_track(link, cell, motion[other], best, best_claim);
     }
   }
 }
 
 // By the other frame's displacements: every track moves with the unit it lies in, and a
-// free unit takes the longest one that lands in it.
+// free cell takes the longest one that lands in it.
 void TrackBuilder::chain_forward(const Link& link, int list) {
   const Frame& other = *link.other;
   const auto& motion = other.motion[list];
   const float scale_x = current_->coded_width / other.coded_width;
   const float scale_y = current_->height / other.height;
-  bool found = false;
-  for (int row = 0; row < other.visible_rows; ++row) {
-    for (int col = 0; col < other.visible_cols; ++col) {
-      const int unit = row * other.cols + col;
-      const Cell& cell = other.cells[unit];
+  claims_.resize(current_->cells.size());
+  for (int row = 0; row < options_.cells * other.visible_rows; ++row) {
+    for (int col = 0; col < options_.cells * other.visible_cols; ++col) {
+      const int index = row * other.cell_cols + col;
+      const int unit = row / options_.cells * other.cols + col / options_.cells;
+      const Cell& cell = other.cells[index];
       if (!link.refs[motion[unit].ref] || cell.track < 0 ||
           tracks_[cell.track].last_seen == frames_chained_) {
         continue;
@@ -534,75 +586,70 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
       const Point from{cell.position.x / other.upscale, cell.position.y};
       const Point moved = move(other, motion[unit], from);
       Claim claim;
-      claim.unit = unit;
+      claim.cell = index;
       claim.position = {moved.x * scale_x, moved.y * scale_y};
       claim.variance = cell.variance + motion[unit].variance;
       if (!is_in_picture(claim.position)) continue;
-      const int target = static_cast<int>(claim.position.y / kUnit) * current_->cols +
-                         static_cast<int>(claim.position.x / kUnit);
+      const float size = 2.F * half_cell_;
+      const int target = static_cast<int>(claim.position.y / size) * current_->cell_cols +
+                         static_cast<int>(claim.position.x / size);
       if (current_->cells[target].track >= 0) continue;
-      const Point centre = unit_centre(*current_, target);
-      claim.cost = distance(claim.position, centre);
-      if (!found) claims_.assign(current_->cells.size(), Claim{});
-      found = true;
+      claim.cost = distance(claim.position, cell_centre(*current_, target));
       const Claim& holder = claims_[target];
-      if ((holder.unit < 0 || is_preferred(cell, claim, other.cells[holder.unit], holder)) &&
-          passes_cosine(link, unit, from, moved, &claim)) {
+      if ((holder.cell < 0 || is_preferred(cell, claim, other.cells[holder.cell], holder)) &&
+          passes_cosine(link, index, from, moved, &claim)) {
+        if (holder.cell < 0) claimed_.push_back(target);
         claims_[target] = claim;
       }
     }
   }
-  if (!found) return;
-  for (std::size_t unit = 0; unit < claims_.size(); ++unit) {
-    const Claim& claim = claims_[unit];
-    if (claim.unit >= 0) {
-      place(static_cast<int>(unit), other.cells[claim.unit].track, claim.position,
-            claim.velocity, claim.variance);
-    }
+  for (const int32_t cell : claimed_) {
+    const Claim claim = std::exchange(claims_[cell], Claim{});
+    place(cell, other.cells[claim.cell].track, claim.position, claim.velocity, claim.variance);
   }
+  claimed_.clear();
 }
 
-// The longest track that `unit` has a better claim on than the unit that holds it; what `best`
-// holds already is kept where it is longer.
-void TrackBuilder::best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
-                             Claim* best_claim) const {
+// The longest track that `cell` has a better claim on than the cell that holds it, by the motion
+// of a unit; what `best` holds already is kept where it is longer.
+void TrackBuilder::find_track(const Link& link, int cell, const UnitMotion& motion, int* best,
+                              Claim* best_claim) const {
   const Frame& other = *link.other;
   const float scale_x = current_->coded_width / other.width;
   const float scale_y = current_->height / other.height;
-  const Point centre = unit_centre(*current_, unit);
-  // A valid warp stretches a unit by less than half its size.
-  const float reach = motion.warp < 0 ? kHalfUnit : 1.5F * kHalfUnit;
+  const Point centre = cell_centre(*current_, cell);
+  // A valid warp stretches a unit by less than half its size, about the unit's centre.
+  const float reach = motion.warp < 0 ? half_cell_ : half_cell_ + kUnit / 4.F;
   const Window window =
       around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
              reach / scale_x, reach / scale_y);
   for (int row = window.top; row <= window.bottom; ++row) {
     for (int col = window.left; col <= window.right; ++col) {
-      const int cell = row * other.cols + col;
-      const Cell& found = other.cells[cell];
+      const int index = row * other.cell_cols + col;
+      const Cell& found = other.cells[index];
       if (found.track < 0) continue;
       const Point target{found.position.x * scale_x, found.position.y * scale_y};
       Claim claim;
       if (!move_back(*current_, motion, target, &claim.position) ||
-          !is_in_unit(claim.position, centre)) {
+          !is_in_cell(claim.position, centre)) {
         continue;
       }
-      claim.unit = unit;
+      claim.cell = cell;
       claim.cost = distance(claim.position, centre);
       claim.variance = found.variance + motion.variance;
       if ((*best >= 0 && !is_preferred(found, claim, other.cells[*best], *best_claim)) ||
-          !is_in_picture(claim.position) ||
-          !is_better(claim, claims_[cell], *current_) ||
+          !is_in_picture(claim.position) || !is_better(claim, claims_[index]) ||
           tracks_[found.track].last_seen == frames_chained_ ||
-          !passes_cosine(link, cell, claim.position, target, &claim)) {
+          !passes_cosine(link, index, claim.position, target, &claim)) {
         continue;
       }
-      *best = cell;
+      *best = index;
       *best_claim = claim;
     }
   }
 }
 
-// Of two tracks that want one unit the longer goes on: another one can start at any time.
+// Of two tracks that want one cell the longer goes on: another one can start at any time.
 bool TrackBuilder::is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
                                 const Claim& other_claim) const {
   const int32_t length = tracks_[cell.track].length;
@@ -610,13 +657,13 @@ bool TrackBuilder::is_preferred(const Cell& cell, const Claim& claim, const Cell
   return length != other_length ? length > other_length : claim.cost < other_claim.cost;
 }
 
-// The vectors of small blocks are the better ones. `frame` has the claiming units.
-bool TrackBuilder::is_better(const Claim& claim, const Claim& holder, const Frame& frame) {
-  if (holder.unit < 0) return true;
+// The vectors of small blocks are the better ones.
+bool TrackBuilder::is_better(const Claim& claim, const Claim& holder) const {
+  if (holder.cell < 0) return true;
   if (claim.cost != holder.cost) return claim.cost < holder.cost;
-  const int area = block_area(frame.mi_size[claim.unit]);
-  const int holder_area = block_area(frame.mi_size[holder.unit]);
-  return area != holder_area ? area < holder_area : claim.unit < holder.unit;
+  const int area = block_area(current_->mi_size[unit_of(*current_, claim.cell)]);
+  const int holder_area = block_area(current_->mi_size[unit_of(*current_, holder.cell)]);
+  return area != holder_area ? area < holder_area : claim.cell < holder.cell;
 }
 
 float TrackBuilder::distance(Point a, Point b) {
@@ -627,11 +674,11 @@ float TrackBuilder::distance(Point a, Point b) {
 // between the motion of this step, `from` to `moved` in the frame whose displacement it
 // is, and the one predicted from the step before: the same motion relative to the
 // dominant one. Sets the claim's relative velocity.
-bool TrackBuilder::passes_cosine(const Link& link, int other_unit, Point from, Point moved,
+bool TrackBuilder::passes_cosine(const Link& link, int other_cell, Point from, Point moved,
                                  Claim* claim) const {
   if (!uses_cosine()) return true;
   // Velocities are kept in pixels of the picture they belong to.
-  const Point stored = link.other->velocity[other_unit];
+  const Point stored = link.other->velocity[other_cell];
   const float picture_scale = current_->width / link.other->width;
   const Point previous{stored.x * picture_scale,
                        stored.y * current_->height / link.other->height};
@@ -657,20 +704,31 @@ bool TrackBuilder::passes_cosine(const Link& link, int other_unit, Point from, P
   return vx * px + vy * py + s2 >= options_.cosine * norm;
 }
 
-void TrackBuilder::place(int unit, int32_t track, Point position, Point velocity,
+void TrackBuilder::place(int cell, int32_t track, Point position, Point velocity,
                          float variance) {
-  current_->cells[unit] = {track, {position.x * current_->upscale, position.y}, variance};
-  if (uses_cosine()) current_->velocity[unit] = velocity;
+  current_->cells[cell] = {track, {position.x * current_->upscale, position.y}, variance};
+  if (uses_cosine()) current_->velocity[cell] = velocity;
   tracks_[track].last_seen = frames_chained_;
   ++tracks_[track].frames;
 }
 
+// In the centre of every square of `seeding` x `seeding` cells that holds no track.
 void TrackBuilder::seed() {
-  for (int row = 0; row < current_->visible_rows; ++row) {
-    for (int col = 0; col < current_->visible_cols; ++col) {
-      const int unit = row * current_->cols + col;
-      const Point centre = unit_centre(*current_, unit);
-      if (current_->cells[unit].track >= 0 || !is_in_picture(centre)) continue;
+  const int size = options_.seeding;
+  const float half = half_cell_ * static_cast<float>(size);
+  const auto is_empty = [&](int row, int col) {
+    for (int r = row; r < row + size; ++r) {
+      for (int c = col; c < col + size; ++c) {
+        if (current_->cells[r * current_->cell_cols + c].track >= 0) return false;
+      }
+    }
+    return true;
+  };
+  for (int row = 0; row < options_.cells * current_->visible_rows; row += size) {
+    for (int col = 0; col < options_.cells * current_->visible_cols; col += size) {
+      const Point centre{2.F * half_cell_ * static_cast<float>(col) + half,
+                         2.F * half_cell_ * static_cast<float>(row) + half};
+      if (!is_in_picture(centre) || !is_empty(row, col)) continue;
       int32_t track = static_cast<int32_t>(tracks_.size());
       if (free_tracks_.empty()) {
         tracks_.emplace_back();
@@ -680,7 +738,8 @@ void TrackBuilder::seed() {
         tracks_[track] = Track{};
       }
       tracks_[track].serial = next_serial_++;
-      place(unit, track, centre, {kNan, kNan}, 0.F);
+      const int cell = (row + size / 2) * current_->cell_cols + col + size / 2;
+      place(cell, track, centre, {kNan, kNan}, 0.F);
     }
   }
 }
@@ -752,7 +811,7 @@ void TrackBuilder::release(Frame& frame) {
 // The cells within reach of a position of the picture, the reach itself left out on the
 // right and below.
 TrackBuilder::Window TrackBuilder::around(const Frame& frame, Point position, float reach_x,
-                                          float reach_y) {
+                                          float reach_y) const {
   // Far outside there are no cells; the clamp keeps the cast defined.
   const auto first = [](float cell, int count) {
     const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
@@ -763,22 +822,34 @@ TrackBuilder::Window TrackBuilder::around(const Frame& frame, Point position, fl
     const int floor = static_cast<int>(clamped);
     return (static_cast<float>(floor) == clamped ? floor : floor + 1) - 1;
   };
-  const float unit_width = kUnit * frame.upscale;
-  return {first((position.y - reach_y) / kUnit, frame.rows),
-          last((position.y + reach_y) / kUnit, frame.rows),
-          first((position.x - reach_x) / unit_width, frame.cols),
-          last((position.x + reach_x) / unit_width, frame.cols)};
+  const float height = 2.F * half_cell_;
+  const float width = height * frame.upscale;
+  return {first((position.y - reach_y) / height, frame.cell_rows),
+          last((position.y + reach_y) / height, frame.cell_rows),
+          first((position.x - reach_x) / width, frame.cell_cols),
+          last((position.x + reach_x) / width, frame.cell_cols)};
+}
+
+int TrackBuilder::unit_of(const Frame& frame, int cell) const {
+  if (options_.cells == 1) return cell;
+  return cell / frame.cell_cols / options_.cells * frame.cols +
+         cell % frame.cell_cols / options_.cells;
 }
 
 TrackBuilder::Point TrackBuilder::unit_centre(const Frame& frame, int unit) {
-  return {kUnit * static_cast<float>(unit % frame.cols) + kHalfUnit,
-          kUnit * static_cast<float>(unit / frame.cols) + kHalfUnit};
+  return {kUnit * (static_cast<float>(unit % frame.cols) + 0.5F),
+          kUnit * (static_cast<float>(unit / frame.cols) + 0.5F)};
 }
 
-// Half-open, so that touching units share no position.
-bool TrackBuilder::is_in_unit(Point position, Point centre) {
-  return position.x >= centre.x - kHalfUnit && position.x < centre.x + kHalfUnit &&
-         position.y >= centre.y - kHalfUnit && position.y < centre.y + kHalfUnit;
+TrackBuilder::Point TrackBuilder::cell_centre(const Frame& frame, int cell) const {
+  return {half_cell_ * static_cast<float>(2 * (cell % frame.cell_cols) + 1),
+          half_cell_ * static_cast<float>(2 * (cell / frame.cell_cols) + 1)};
+}
+
+// Half-open, so that touching cells share no position.
+bool TrackBuilder::is_in_cell(Point position, Point centre) const {
+  return position.x >= centre.x - half_cell_ && position.x < centre.x + half_cell_ &&
+         position.y >= centre.y - half_cell_ && position.y < centre.y + half_cell_;
 }
 
 bool TrackBuilder::is_in_picture(Point position) const {

@@ -27,6 +27,8 @@ struct TrackBuilderOptions {
   double interpolation = -1;
   double border = -1;
   double bridge = -1;
+  int cells = 1;    // along either side of a unit
+  int seeding = 1;  // along either side of a square of them that a track starts in; divides cells
 };
 
 // One coded frame. Borrowed for the call.
@@ -78,8 +80,8 @@ class TrackBuilder {
     float x = 0.F;
     float y = 0.F;
   };
-  // What one 4x4 unit of a frame holds: at most one track, at its sub-pixel place in
-  // pixels of the picture.
+  // What a unit, or one of the equal parts that a unit is cut into, holds: at most one track, at
+  // its sub-pixel place in pixels of the picture.
   struct Cell {
     int32_t track = -1;
     Point position;
@@ -101,6 +103,8 @@ class TrackBuilder {
     int cols = 0;
     int visible_rows = 0;
     int visible_cols = 0;
+    int cell_rows = 0;
+    int cell_cols = 0;
     float width = 0.F;
     float height = 0.F;
     float coded_width = 0.F;
@@ -143,10 +147,10 @@ class TrackBuilder {
     int interval = 0;                   // other less current display index, 0 if unknown
     DominantMotion dominant;            // of the field that the displacements come from
   };
-  // What a unit would do with a track, and how well it fits.
+  // What a cell would do with a track, and how well it fits.
   struct Claim {
-    int32_t unit = -1;  // of the frame whose displacement it is
-    float cost = 0.F;   // distance from the claiming unit's centre, in coded pixels
+    int32_t cell = -1;  // of the frame whose displacement it is
+    float cost = 0.F;   // distance from the claiming cell's centre, in coded pixels
     Point position;  // in the current frame, coded pixels
     Point velocity;
     float variance = 0.F;
@@ -164,7 +168,7 @@ class TrackBuilder {
     int right = -1;
   };
 
-  // Whose displacements a unit looks for tracks by: its own, or those of the units beside it.
+  // Whose displacements a cell looks for tracks by: its unit's, or those of the units beside.
   enum class Reach { kOwn, kBeside };
 
   bool uses_cosine() const { return options_.cosine >= -1; }
@@ -184,30 +188,35 @@ class TrackBuilder {
   void fit_dominant(Link& link);
   void chain_backward(const Link& link, int list, Reach reach);
   void chain_forward(const Link& link, int list);
-  void best_cell(const Link& link, int unit, const UnitMotion& motion, int* best,
-                 Claim* best_claim) const;
-  void best_cell_beside(const Link& link, int list, int unit, int* best,
-                        Claim* best_claim) const;
+  void note_open_units(const Frame& other);
+  bool may_find_track(const Link& link, int unit, const UnitMotion& motion, Reach reach) const;
+  void find_track(const Link& link, int cell, const UnitMotion& motion, int* best,
+                  Claim* best_claim) const;
+  void find_track_beside(const Link& link, int list, int cell, int* best,
+                         Claim* best_claim) const;
   bool is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
                     const Claim& other_claim) const;
-  static bool is_better(const Claim& claim, const Claim& holder, const Frame& frame);
+  bool is_better(const Claim& claim, const Claim& holder) const;
   static float distance(Point a, Point b);
-  bool passes_cosine(const Link& link, int other_unit, Point from, Point moved,
+  bool passes_cosine(const Link& link, int other_cell, Point from, Point moved,
                      Claim* claim) const;
-  void place(int unit, int32_t track, Point position, Point velocity, float variance);
+  void place(int cell, int32_t track, Point position, Point velocity, float variance);
   void seed();
   void observe();
   void release_frames(const int32_t* slots);
   void release(Frame& frame);
-  static Window around(const Frame& frame, Point position, float reach_x, float reach_y);
+  Window around(const Frame& frame, Point position, float reach_x, float reach_y) const;
+  int unit_of(const Frame& frame, int cell) const;
   static Point unit_centre(const Frame& frame, int unit);
-  static bool is_in_unit(Point position, Point centre);
+  Point cell_centre(const Frame& frame, int cell) const;
+  bool is_in_cell(Point position, Point centre) const;
   bool is_in_picture(Point position) const;
   static Point move(const Frame& frame, const UnitMotion& motion, Point position);
   static bool move_back(const Frame& frame, const UnitMotion& motion, Point target,
                         Point* source);
 
   TrackBuilderOptions options_;
+  float half_cell_;  // half a cell's width, in coded pixels
   int width_ = 0;  // of the output's coordinates
   int height_ = 0;
   int num_frames_ = 0;
@@ -225,7 +234,9 @@ class TrackBuilder {
   // The frame being chained, and buffers that are kept from frame to frame.
   Frame* current_ = nullptr;
   std::vector<Link> links_;
-  std::vector<Claim> claims_;
+  std::vector<Claim> claims_;      // by cell, free between links
+  std::vector<int32_t> claimed_;   // those that are not
+  std::vector<uint8_t> open_units_;
   std::vector<UnitMotion> block_motion_;
   std::vector<MotionSample> samples_;
   std::vector<float> scratch_;
