@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,10 @@ from colmap_av1.tracks import Tracks, keep_observations
 # observation from outweighing many good ones.
 _SIGMA_FLOOR = 0.3
 # What an observation tells of the cameras is its motion beside its error: one that moved far may
-# be less sure, as the wide views that poses need are where the camera moves quickly.
+# be less sure, up to this share of the way.
 _MAX_ERROR_SHARE = 1 / 30
+# An observation is wide that moved at least this share of what those that moved farthest did.
+_WIDE = 0.8
 
 
 @dataclass(frozen=True)
@@ -29,14 +32,15 @@ class _Limits:
     spacing: float
     min_length: int
     max_sigma: float
+    wide_tracks: int
 
 
 # max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
 # as errors grow from step to step.
 _PRESETS = {
-    "sparse": _Limits(max_tracks_per_image=1500, spacing=12.0, min_length=3, max_sigma=0.8),
-    "default": _Limits(max_tracks_per_image=3000, spacing=8.0, min_length=3, max_sigma=0.8),
-    "dense": _Limits(max_tracks_per_image=0, spacing=0.0, min_length=1, max_sigma=0.0),
+    "sparse": _Limits(1500, spacing=12.0, min_length=3, max_sigma=0.8, wide_tracks=300),
+    "default": _Limits(2500, spacing=9.0, min_length=3, max_sigma=0.8, wide_tracks=300),
+    "dense": _Limits(0, spacing=0.0, min_length=1, max_sigma=0.0, wide_tracks=0),
 }
 
 
@@ -44,7 +48,9 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
     """Choose tracks that are long, sure and spread over every image.
 
     Observations less sure than `max_sigma`, against the first one of their track, are left out
-    unless the error is a thirtieth of the way from there or less. Then tracks are taken best
+    but for those of wide views: of each image, so many as `wide_tracks` that moved nearly as far
+    from there as any of its do, the surest beside their way, and all that are as sure; where the
+    error is a thirtieth of the way or less. Then tracks are taken best
     first, the weight of an observation being its inverse expected variance. One is used where at
     least half of its observations lie in images that are not full, and there in cells, `spacing`
     wide, that no better track lies in; it loses the observations in full images.
@@ -67,8 +73,9 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         max_variance = limits.max_sigma**2
         if options.max_sigma is None:
             max_variance *= _frames_between_images(tracks)
-        allowed = np.maximum(max_variance, _MAX_ERROR_SHARE**2 * _squared_way_since_first(tracks))
-        sure = variance <= allowed
+        way = _way_since_first(tracks)
+        share = _error_shares(tracks, np.sqrt(variance), way, limits.wide_tracks)
+        sure = variance <= np.maximum(max_variance, (share[tracks.frame] * way) ** 2)
         tracks, variance = keep_observations(tracks, sure), variance[sure]
     weight = 1.0 / (_SIGMA_FLOOR**2 + variance)
     total = np.concatenate([[0.0], np.cumsum(weight)])
@@ -93,10 +100,32 @@ def _variance_since_first(tracks: Tracks) -> NDArray[np.float64]:
     return np.asarray(np.maximum(variance - first, 0.0), np.float64)
 
 
-def _squared_way_since_first(tracks: Tracks) -> NDArray[np.float64]:
-    """Squared distance of each observation to the first of its track that is left, in px^2."""
+def _way_since_first(tracks: Tracks) -> NDArray[np.float64]:
+    """Distance of each observation to the first of its track that is left, in px."""
     first = np.repeat(tracks.xy[tracks.offsets[:-1]], np.diff(tracks.offsets), axis=0)
-    return np.asarray(((tracks.xy - first).astype(np.float64) ** 2).sum(1), np.float64)
+    return np.asarray(np.linalg.norm((tracks.xy - first).astype(np.float64), axis=1))
+
+
+def _error_shares(
+    tracks: Tracks, error: NDArray[np.float64], way: NDArray[np.float64], wide_tracks: int
+) -> NDArray[np.float64]:
+    """Error allowed in each frame as a share of the way, [num_frames]: what its wide views need."""
+    if wide_tracks == 0:
+        return np.zeros(tracks.num_frames)
+    shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE)
+    usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * way)
+    usable = usable[np.argsort(tracks.frame[usable], kind="stable")]
+    bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))
+    for frame, (start, stop) in enumerate(pairwise(bounds)):
+        own = usable[start:stop]
+        if len(own) <= wide_tracks:
+            continue
+        farthest = np.partition(way[own], -wide_tracks)[-wide_tracks]
+        wide = own[(way[own] >= _WIDE * farthest) & (way[own] > 0)]
+        if len(wide) > wide_tracks:
+            share = error[wide] / way[wide]
+            shares[frame] = np.partition(share, wide_tracks - 1)[wide_tracks - 1]
+    return shares
 
 
 def _frames_between_images(tracks: Tracks) -> float:
@@ -107,7 +136,7 @@ def _frames_between_images(tracks: Tracks) -> float:
 def _limits(options: DensityOptions) -> _Limits:
     if options.preset not in _PRESETS:
         raise OptionError(f"preset is {options.preset!r}: give 'sparse', 'default' or 'dense'")
-    names = ("max_tracks_per_image", "spacing", "min_length", "max_sigma")
+    names = [field.name for field in fields(_Limits)]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():
         if not 0 <= value < math.inf:

@@ -106,9 +106,11 @@ class DensityOptions:
     spacing: float | None = None
     # images a track is seen in at least
     min_length: int | None = None
-    # largest expected error of a position against its track's first, in pixels, where it moved
-    # little: a thirtieth of the way is allowed, too; 0: any
+    # largest expected error of a position against its track's first, in pixels; 0: any
     max_sigma: float | None = None
+    # tracks an image keeps beyond that, for views from far apart: those that moved nearly as far
+    # as any, with errors up to a thirtieth of the way; 0: none
+    wide_tracks: int | None = None
 
 
 @dataclass(frozen=True)
@@ -155,8 +157,8 @@ class VerifyOptions:
 class CameraOptions:
     """The camera written for new images."""
 
-    # name of one of COLMAP's camera models; None: SIMPLE_RADIAL, or OPENCV, which has two
-    # focal lengths, where the video's pixels are not square
+    # name of one of COLMAP's camera models; None: RADIAL, with camera_params SIMPLE_RADIAL; or
+    # OPENCV, which has two focal lengths, where the video's pixels are not square
     camera_model: str | None = None
     # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: the focal length that
     # the tracks tell, else 1.2 times the longer side, to be refined; principal point in the centre

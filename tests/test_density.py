@@ -115,18 +115,45 @@ def test_presets_follow_the_distance_of_images() -> None:
     assert len(select_tracks(late, DensityOptions(**ANY | {"max_sigma": 0.2})).frame) > 0
 
 
+def moving(tracks: Tracks, pixels: float) -> Tracks:
+    """The tracks with every second one moving so far from each frame to the next."""
+    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    step = np.arange(len(track)) - tracks.offsets[:-1][track]
+    way = np.float32([pixels, 0]) * (step * (track % 2 == 0))[:, None].astype(np.float32)
+    return replace(tracks, xy=tracks.xy + way)
+
+
 def test_errors_are_held_against_the_way() -> None:
     tracks = random_tracks()
-    options = DensityOptions(**ANY | {"max_sigma": 0.5})
+    options = DensityOptions(**ANY | {"max_sigma": 0.5, "wide_tracks": 10**6})
     near = select_tracks(tracks, options)
-    # Half of the tracks move by 40 px a frame, by far more than thirty times their error.
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
-    moves = track % 2 == 0
-    step = np.arange(len(track)) - tracks.offsets[:-1][track]
-    xy = tracks.xy + np.float32([40, 0]) * (step * moves)[:, None].astype(np.float32)
-    quick = select_tracks(replace(tracks, xy=xy), options)
+    # By far more than thirty times their error.
+    quick = select_tracks(moving(tracks, 40), options)
+    moves = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets)) % 2 == 0
     assert len(near.frame) < 0.9 * len(tracks.frame)
     assert len(quick.frame) == moves.sum() + ((tracks.sigma <= 0.5) & ~moves).sum()
+
+
+def test_images_keep_the_surest_of_their_widest_tracks() -> None:
+    tracks = moving(random_tracks(4000), 40)
+    sizes: list[int] = []
+    for wide_tracks in (0, 20, 60):
+        options = DensityOptions(**ANY | {"max_sigma": 0.3, "wide_tracks": wide_tracks})
+        chosen = select_tracks(tracks, options)
+        start = np.repeat(chosen.xy[chosen.offsets[:-1], 0], np.diff(chosen.offsets))
+        unsure = chosen.sigma > 0.3
+        way = chosen.xy[:, 0] - start
+        for frame in range(12, FRAMES):
+            own = chosen.frame == frame
+            farthest = np.sort(way[own])[-wide_tracks:].min() if wide_tracks else np.inf
+            # So many, and some more that are as sure and moved less far.
+            assert np.count_nonzero(own & (way >= 0.8 * farthest)) >= wide_tracks
+            assert (wide_tracks > 0) == np.any(own & unsure)
+            if wide_tracks:
+                assert np.count_nonzero(own & unsure & (way < 0.8 * farthest)) < 10 * wide_tracks
+        sizes.append(len(chosen.frame))
+    assert sizes == sorted(set(sizes))
+    assert sizes[-1] < 0.9 * len(tracks.frame)
 
 
 def test_kept_observations_stay_with_their_tracks() -> None:
@@ -167,6 +194,7 @@ def test_selection_is_repeatable() -> None:
         {"spacing": math.nan},
         {"min_length": -2},
         {"max_sigma": -0.5},
+        {"wide_tracks": -1},
     ],
 )
 def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
