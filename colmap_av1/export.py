@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from colmap_av1.database import (
 )
 from colmap_av1.database_file import check_layout, is_new, open_unaltered
 from colmap_av1.errors import DatabaseError, HlocError, OptionError
+from colmap_av1.hdf5 import new_hdf5
 from colmap_av1.options import ExportOptions
 from colmap_av1.progress import Progress, no_progress
 
@@ -35,6 +36,8 @@ FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 # files of its first versions.
 _SEPARATOR, _OLD_SEPARATOR = "/", "_"
 _NO_MATCH = -1
+# Writes a dataset of a file.
+_Write = Callable[..., h5py.Dataset]
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ def _pair_part(name: str) -> str:
 
 
 @contextlib.contextmanager
-def _complete_files(folder: Path) -> Iterator[tuple[h5py.File, h5py.File, Any]]:
+def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
     """Open the three files under other names, which they lose at the end."""
     made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     targets = [folder / name for name in (FEATURES, MATCHES, PAIRS)]
@@ -145,8 +148,8 @@ def _complete_files(folder: Path) -> Iterator[tuple[h5py.File, h5py.File, Any]]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (
-            h5py.File(partial[0], "w", libver="latest") as features,
-            h5py.File(partial[1], "w", libver="latest") as matches,
+            new_hdf5(partial[0]) as features,
+            new_hdf5(partial[1]) as matches,
             open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
         ):
             yield features, matches, pairs
@@ -164,9 +167,7 @@ def _complete_files(folder: Path) -> Iterator[tuple[h5py.File, h5py.File, Any]]:
                     parent.rmdir()
 
 
-def _write_features(
-    connection: Any, path: Path, file: h5py.File, report: Progress
-) -> dict[int, int]:
+def _write_features(connection: Any, path: Path, write: _Write, report: Progress) -> dict[int, int]:
     """Write all images, with or without keypoints; returns how many each has."""
     rows = connection.execute(
         "SELECT image_id, name, COALESCE(width, 0), COALESCE(height, 0) FROM images "
@@ -181,9 +182,8 @@ def _write_features(
         if row is not None and row[0]:
             xy = keypoints_from_row(path, image_id, *row)[:, :2]
         counts[image_id] = len(xy)
-        group = file.create_group(name)
-        _write(group, "keypoints", _to_hloc(xy)).attrs["uncertainty"] = 1.0
-        _write(group, "image_size", np.array([width, height], dtype=np.int64))
+        write(f"{name}/keypoints", _to_hloc(xy)).attrs["uncertainty"] = 1.0
+        write(f"{name}/image_size", np.array([width, height], dtype=np.int64))
         report("images", done, len(rows))
     return counts
 
@@ -200,7 +200,7 @@ def _to_hloc(xy: NDArray[np.float32]) -> NDArray[Any]:
 def _write_pairs(
     connection: Any,
     path: Path,
-    file: h5py.File,
+    write: _Write,
     pairs: Any,
     *,
     names: dict[int, str],
@@ -231,17 +231,12 @@ def _write_pairs(
         narrow = counts[j] <= np.iinfo(np.int16).max
         matches0 = np.full(counts[i], _NO_MATCH, dtype=np.int16 if narrow else np.int32)
         matches0[found[:, 0]] = found[:, 1]
-        group = file.create_group(f"{_pair_part(names[i])}{_SEPARATOR}{_pair_part(names[j])}")
-        _write(group, "matches0", matches0)
-        _write(group, "matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
+        group = f"{_pair_part(names[i])}{_SEPARATOR}{_pair_part(names[j])}"
+        write(f"{group}/matches0", matches0)
+        write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
         pairs.write(f"{names[i]} {names[j]}\n")
         report("pairs", done, len(pair_ids))
     return len(pair_ids)
-
-
-def _write(group: h5py.Group, name: str, data: NDArray[Any]) -> h5py.Dataset:
-    # Without times the same database gives the same bytes.
-    return group.create_dataset(name, data=data, track_times=False)
 
 
 def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str]) -> HlocMatches:

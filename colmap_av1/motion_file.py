@@ -10,12 +10,12 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.files import remove_leftovers, whole_file
+from colmap_av1.hdf5 import new_hdf5
 from colmap_av1.motion import FrameMotion, read_motion
 from colmap_av1.options import ReadOptions
 
@@ -93,11 +93,11 @@ def _open_npz(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
 
 @contextmanager
 def _open_h5(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
-    with h5py.File(path, "w", libver="latest") as file:
+    with new_hdf5(path) as write_dataset:
 
         def write(name: str, array: NDArray[Any]) -> None:
             how = {"compression": "gzip", "compression_opts": 1} if array.size > 1 else {}
-            file.create_dataset(name, data=array, track_times=False, **how)
+            write_dataset(name, array, **how)
 
         yield write
 
