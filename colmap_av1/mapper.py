@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from colmap_av1.errors import ModelError
+from colmap_av1.model import read_model
 from colmap_av1.processes import bound
 from colmap_av1.progress import Progress
 
@@ -95,6 +97,8 @@ def map_poses(
     _run_apart(
         settings, told, log, failed=f"COLMAP's {mapper} mapper", hint="try the other --mapper"
     )
+    if sizes:
+        _check_whole(output)
     progress("poses", num_images, num_images)
     return MapperRun(tuple(sizes))
 
@@ -131,6 +135,18 @@ def adjust_model(
         "num_threads": num_threads,
     }
     _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
+    _check_whole(model)
+
+
+def _check_whole(model: Path) -> None:
+    """Refuse a model that was cut short, as on a full disk: COLMAP does not say so."""
+    try:
+        read_model(model)
+    except ModelError as error:
+        raise ModelError(
+            f"{model}: was not written to its end: see that the disk has space, and run the same "
+            "command again"
+        ) from error
 
 
 def _run_apart(
@@ -144,7 +160,7 @@ def _run_apart(
     """Do what the settings say in a process; `told` gets the words and values it prints."""
     # The package is found where this one was.
     path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), *sys.path])
-    done = False
+    done, reason = False, ""
     with (
         log.open("wb") as file,
         subprocess.Popen(
@@ -160,14 +176,16 @@ def _run_apart(
             for line in process.stdout:
                 word, _, value = line.strip().partition(" ")
                 done = word == "done"
-                if told is not None:
+                if word == "failed":
+                    reason = f" ({value})"
+                elif told is not None:
                     told(word, value)
         except BaseException:
             process.kill()
             raise
     if not done:
         raise ModelError(
-            f"{failed} stopped with status {process.returncode}: {log} tells where; {hint}"
+            f"{failed} stopped with status {process.returncode}{reason}: {log} tells where; {hint}"
         )
 
 
@@ -182,10 +200,14 @@ def run_child(settings: dict[str, Any]) -> None:
     import pycolmap  # noqa: PLC0415
 
     pycolmap.set_random_seed(settings["seed"])
-    if settings["task"] == "adjustment":
-        _adjust(settings)
-    else:
-        _map(settings, channel)
+    try:
+        if settings["task"] == "adjustment":
+            _adjust(settings)
+        else:
+            _map(settings, channel)
+    except Exception as error:
+        channel.write(f"failed {' '.join(str(error).split())}\n")
+        raise
     channel.write("done\n")
     channel.close()
 
@@ -197,6 +219,8 @@ def _map(settings: dict[str, Any], channel: TextIO) -> None:
         channel.write("placed\n")
 
     database, output = settings["database"], settings["model"]
+    each = Path(output) / "each"
+    each.mkdir()
     refine = settings["refine_intrinsics"]
     common = {"random_seed": settings["seed"], "num_threads": settings["num_threads"]}
     if settings["task"] == "incremental":
@@ -210,8 +234,8 @@ def _map(settings: dict[str, Any], channel: TextIO) -> None:
             options.mapper.init_max_forward_motion = 1.0
         models = pycolmap.incremental_mapping(
             database,
-            output,
-            output,
+            each,
+            each,
             options=options,
             initial_image_pair_callback=placed,
             next_image_callback=placed,
@@ -220,10 +244,11 @@ def _map(settings: dict[str, Any], channel: TextIO) -> None:
         options = pycolmap.GlobalPipelineOptions(**common)
         options.mapper.bundle_adjustment.refine_focal_length = refine
         options.mapper.bundle_adjustment.refine_extra_params = refine
-        models = pycolmap.global_mapping(database, output, output, options=options)
+        models = pycolmap.global_mapping(database, each, each, options=options)
     found = sorted(models.values(), key=lambda m: -m.num_reg_images())
     if found:
         found[0].write_binary(output)
+    shutil.rmtree(each)
     channel.write(f"models {json.dumps([m.num_reg_images() for m in found])}\n")
 
 

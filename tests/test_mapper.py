@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +41,7 @@ def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> Non
 
 def test_mapper_that_fails(tmp_path: Path) -> None:
     (tmp_path / "no.db").write_bytes(b"no database")
-    with pytest.raises(ModelError, match="log tells where"):
+    with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log tells where"):
         mapper_module.map_poses(
             tmp_path / "no.db",
             tmp_path / "poses",
@@ -81,3 +83,25 @@ def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path:
     assert errors.rotation < min(bent.rotation / 3, before.rotation + 0.05)
     assert errors.ate < min(bent.ate / 3, before.ate * 1.5)
     assert adjusted.cameras[1].mean_focal_length() == focal_length
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
+def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
+    """COLMAP says nothing of what it cannot write."""
+    import resource  # noqa: PLC0415 - there is none on Windows
+
+    shutil.copytree(made.output / ".stages" / "adjusted", tmp_path / "model")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(ModelError, match="was not written to its end: see that the disk has"):
+            mapper_module.adjust_model(
+                tmp_path / "model",
+                refine_intrinsics=False,
+                loss_scale=0.5,
+                seed=0,
+                num_threads=1,
+                log=tmp_path / "log",
+            )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
