@@ -5,6 +5,7 @@
 #include <cstdlib>
 #include <limits>
 #include <stdexcept>
+#include <type_traits>
 #include <utility>
 
 #include "av1/constants.h"
@@ -70,31 +71,26 @@ TrackArrays TrackBuilder::finish() {
   std::sort(kept_.begin(), kept_.end(),
             [](const Kept& a, const Kept& b) { return a.serial < b.serial; });
 
-  TrackArrays out;
+  TrackArrays out = std::move(done_);
   out.num_frames = num_frames_;
   out.width = width_;
   out.height = height_;
   out.offsets.reserve(kept_.size() + 1);
   out.offsets.push_back(0);
   for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
-  const auto total = static_cast<std::size_t>(out.offsets.back());
-  out.frame.reserve(total);
-  out.xy.reserve(2 * total);
-  out.sigma.reserve(total);
-  std::vector<Observation> path;
-  for (const Kept& kept : kept_) {
-    path.clear();
-    for (int32_t o = kept.last_observation; o >= 0; o = observations_[o].previous) {
-      path.push_back(observations_[o]);
+  // One array after the other, the largest first: that takes the least memory.
+  const auto sort = [this](auto& values, std::ptrdiff_t width) {
+    std::remove_reference_t<decltype(values)> sorted;
+    sorted.reserve(values.size());
+    for (const Kept& kept : kept_) {
+      const auto first = values.begin() + width * kept.first;
+      sorted.insert(sorted.end(), first, first + width * kept.length);
     }
-    std::reverse(path.begin(), path.end());
-    for (const Observation& o : path) {
-      out.frame.push_back(o.frame);
-      out.xy.push_back(o.position.x);
-      out.xy.push_back(o.position.y);
-      out.sigma.push_back(o.sigma);
-    }
-  }
+    values = std::move(sorted);
+  };
+  sort(out.xy, 2);
+  sort(out.frame, 1);
+  sort(out.sigma, 1);
   *this = TrackBuilder(options_);
   return out;
 }
@@ -474,11 +470,14 @@ void TrackBuilder::fit_dominant(Link& link) {
 void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion[list];
   claims_.resize(link.other->cells.size());
-  note_open_units(*link.other);
+  // A cell as large as its unit is searched in no more time than the unit is judged.
+  const bool judges_units = options_.cells > 1;
+  if (judges_units) note_open_units(*link.other);
   for (int unit_row = 0; unit_row < current_->visible_rows; ++unit_row) {
     for (int unit_col = 0; unit_col < current_->visible_cols; ++unit_col) {
       const int unit = unit_row * current_->cols + unit_col;
-      if (!link.refs[motion[unit].ref] || !may_find_track(link, unit, motion[unit], reach)) {
+      if (!link.refs[motion[unit].ref] ||
+          (judges_units && !may_find_track(link, unit, motion[unit], reach))) {
         continue;
       }
       for (int part = 0; part < options_.cells * options_.cells; ++part) {
@@ -750,22 +749,28 @@ void TrackBuilder::observe() {
   for (const Cell& cell : current_->cells) {
     if (cell.track < 0) continue;
     Track& track = tracks_[cell.track];
-    int32_t index = free_observation_;
-    if (index >= 0) {
-      free_observation_ = observations_[index].previous;
-    } else {
-      if (observations_.size() >= std::numeric_limits<int32_t>::max()) {
-        throw std::length_error("too many observations for one run: cut the video");
-      }
-      index = static_cast<int32_t>(observations_.size());
-      observations_.emplace_back();
-    }
-    observations_[index] = {track.last_observation, current_->display_index,
-                            {cell.position.x * scale_x, cell.position.y * scale_y},
-                            std::sqrt(cell.variance) * scale_y};
-    track.last_observation = index;
+    const int place = track.length % kStretch;
+    if (place == 0) start_stretch(track);
+    stretches_[track.last_stretch].observations[place] = {
+        current_->display_index,
+        {cell.position.x * scale_x, cell.position.y * scale_y},
+        std::sqrt(cell.variance) * scale_y};
     ++track.length;
   }
+}
+
+void TrackBuilder::start_stretch(Track& track) {
+  auto index = static_cast<int32_t>(stretches_.size());
+  if (!free_stretches_.empty()) {
+    index = free_stretches_.back();
+    free_stretches_.pop_back();
+  } else if (stretches_.size() < std::numeric_limits<int32_t>::max()) {
+    stretches_.emplace_back();
+  } else {
+    throw std::length_error("too many observations at a time: cut the video");
+  }
+  stretches_[index].previous = track.last_stretch;
+  track.last_stretch = index;
 }
 
 // Lets go of the frames that no frame to come can be linked to.
@@ -795,16 +800,28 @@ void TrackBuilder::release(Frame& frame) {
     Track& track = tracks_[cell.track];
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
-    if (track.length >= options_.min_length) {
-      kept_.push_back({track.serial, track.last_observation, track.length});
-      continue;
+    if (track.length >= options_.min_length) keep(track);
+    for (int32_t s = track.last_stretch; s >= 0; s = stretches_[s].previous) {
+      free_stretches_.push_back(s);
     }
-    for (int32_t o = track.last_observation; o >= 0;) {
-      const int32_t previous = observations_[o].previous;
-      observations_[o].previous = free_observation_;
-      free_observation_ = o;
-      o = previous;
-    }
+  }
+}
+
+void TrackBuilder::keep(const Track& track) {
+  const std::size_t first = done_.frame.size();
+  kept_.push_back({track.serial, static_cast<std::ptrdiff_t>(first), track.length});
+  const std::size_t end = first + static_cast<std::size_t>(track.length);
+  done_.frame.resize(end);
+  done_.xy.resize(2 * end);
+  done_.sigma.resize(end);
+  int32_t stretch = track.last_stretch;
+  for (int i = track.length - 1; i >= 0; --i) {
+    const Observation& observation = stretches_[stretch].observations[i % kStretch];
+    done_.frame[first + i] = observation.frame;
+    done_.xy[2 * (first + i)] = observation.position.x;
+    done_.xy[2 * (first + i) + 1] = observation.position.y;
+    done_.sigma[first + i] = observation.sigma;
+    if (i % kStretch == 0) stretch = stretches_[stretch].previous;
   }
 }
 

@@ -4,6 +4,7 @@
 #define COLMAP_AV1_TRACKS_TRACK_BUILDER_H_
 
 #include <array>
+#include <cstddef>
 #include <cstdint>
 #include <memory>
 #include <vector>
@@ -122,19 +123,24 @@ class TrackBuilder {
   struct Track {
     int64_t serial = 0;
     int64_t last_seen = -1;  // number of the frame in the order of chaining
-    int32_t last_observation = -1;
+    int32_t last_stretch = -1;
     int32_t length = 0;
     int32_t frames = 0;  // that hold it
   };
   struct Observation {
-    int32_t previous = -1;
     int32_t frame = 0;
     Point position;
     float sigma = 0.F;
   };
+  // Observations of a track that lives, some at a time: they lie far apart in memory.
+  static constexpr int kStretch = 4;
+  struct Stretch {
+    std::array<Observation, kStretch> observations;
+    int32_t previous = -1;
+  };
   struct Kept {
     int64_t serial = 0;
-    int32_t last_observation = -1;
+    std::ptrdiff_t first = 0;  // of its observations among those that are done
     int32_t length = 0;
   };
   // A frame with tracks that displacements link to the frame being chained: from the
@@ -205,6 +211,8 @@ class TrackBuilder {
   void observe();
   void release_frames(const int32_t* slots);
   void release(Frame& frame);
+  void start_stretch(Track& track);
+  void keep(const Track& track);
   Window around(const Frame& frame, Point position, float reach_x, float reach_y) const;
   int unit_of(const Frame& frame, int cell) const;
   static Point unit_centre(const Frame& frame, int unit);
@@ -225,8 +233,9 @@ class TrackBuilder {
   int64_t next_serial_ = 0;
   std::vector<Track> tracks_;
   std::vector<int32_t> free_tracks_;
-  std::vector<Observation> observations_;
-  int32_t free_observation_ = -1;
+  std::vector<Stretch> stretches_;
+  std::vector<int32_t> free_stretches_;
+  TrackArrays done_;  // observations of the kept tracks, in the order in which these ended
   std::vector<Kept> kept_;
   std::vector<std::unique_ptr<Frame>> frames_;       // in bitstream order
   std::vector<std::unique_ptr<Frame>> idle_frames_;  // their memory is used again
