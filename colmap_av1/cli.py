@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import os
 import signal
 import sys
 import threading
@@ -97,6 +98,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status: int | None = namespace.run(namespace)
         except ColmapAv1Error as error:
             print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+            return _BAD_INPUT
+        except OSError as error:
+            if error.filename is None:
+                raise
+            what = f"{os.fsdecode(error.filename)}: {error.strerror}"
+            print(f"{PROGRAM}: error: {what}: mend that, or give another path", file=sys.stderr)
             return _BAD_INPUT
         except KeyboardInterrupt:
             print(f"{PROGRAM}: interrupted", file=sys.stderr)

@@ -98,6 +98,9 @@ def densify(
     check_triangulate_options(options.triangulate)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise OptionError(f"{output}: is there and not empty: give a new folder")
+    above = next(folder for folder in output.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise OptionError(f"{output}: cannot be made in {above}: give another folder")
     remove_leftovers(output.parent, output.name)
     reconstruction = read_model(model)
     by_name = {i.name: i for i in reconstruction.images.values() if i.has_pose}

@@ -181,6 +181,15 @@ def test_help_gives_the_comments_of_the_options(capsys: pytest.CaptureFixture[st
     assert "so many frames a second, by the time stamps" in text
 
 
+def test_path_that_the_system_refuses(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = str(tmp_path / ("a" * 300))
+    assert main(["match", "--video", str(clip), "--database", database]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "File name too long: " in line
+
+
 def test_interrupt_exits_with_130(encode: Encode, tmp_path: Path) -> None:
     long = encode(make_frames(80, 640, 384), tmp_path / "long.mp4")
     words = ["match", "--database", "a.db", "--video", str(long), "--image_path", "frames"]

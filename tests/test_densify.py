@@ -113,6 +113,8 @@ def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: P
     few = true_model(tmp_path / "few", truth, range(20))
     with pytest.raises(ImageError, match="do not say which frames"):
         densify(few, SCENE, tmp_path / "dense")
+    with pytest.raises(OptionError, match="cannot be made in"):
+        densify(model, SCENE, model / "cameras.bin" / "dense")
     with pytest.raises(OptionError, match="not empty"):
         densify(model, SCENE, model)
     names = {p.name for p in tmp_path.iterdir()}
