@@ -87,10 +87,11 @@ class MatchReport:
     @property
     def next_commands(self) -> tuple[str, str]:
         """Shell lines that map the database: with COLMAP, and with pycolmap."""
-        output = str(self.database.with_name(f"{self.database.stem}_model"))
-        images = str(self.image_path) if self.image_path is not None else "IMAGES"
+        database = _no_option(self.database)
+        output = _no_option(self.database.with_name(f"{self.database.stem}_model"))
+        images = _no_option(self.image_path) if self.image_path is not None else "IMAGES"
         mapper = [
-            *("colmap", "mapper", "--database_path", str(self.database)),
+            *("colmap", "mapper", "--database_path", database),
             *("--image_path", images, "--output_path", output),
         ]
         if self.forward_motion:
@@ -102,7 +103,7 @@ class MatchReport:
                 "0",
             ]
         script = [
-            *("python", "examples/map_with_pycolmap.py", "--database", str(self.database)),
+            *("python", "examples/map_with_pycolmap.py", "--database", database),
             *("--image_path", images, "--output", output),
         ]
         if self.forward_motion:
@@ -221,6 +222,11 @@ def match(
         seconds=clock.seconds,
         warnings=tuple(notes),
     )
+
+
+def _no_option(path: Path) -> str:
+    """The path, spelled so that programs do not take it for an option."""
+    return f"./{path}" if str(path).startswith("-") else str(path)
 
 
 def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseImage]:
