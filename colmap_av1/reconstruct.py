@@ -18,6 +18,7 @@ from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.reconstruct_stages import (
     Run,
     adjustment_stage,
+    files_of,
     match_stage,
     model_stage,
     pose_stage,
@@ -115,7 +116,9 @@ def reconstruct(
     _check_reconstruct_options(options)
     with open_stages(output) as stages:
         source = open_source(video, options.match, clock=clock, progress=progress)
-        report = _run_stages(Run(source, output, stages, options, clock, progress))
+        report = _run_stages(
+            Run(source, files_of(source), output, stages, options, clock, progress)
+        )
         _write_report(report)
     return report
 

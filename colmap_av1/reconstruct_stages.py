@@ -22,7 +22,7 @@ from colmap_av1.dense_points import (
     triangulate_tracks,
 )
 from colmap_av1.density import select_tracks
-from colmap_av1.errors import ImageError, ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.image_matches import MatchedImages, pair_images, shared_focal_length, verify_images
 from colmap_av1.images import write_images
 from colmap_av1.mapper import adjust_model, map_poses
@@ -58,6 +58,7 @@ class Run:
 
     Attributes:
         source: the video.
+        files: what tells its files from such as take their place.
         output: the folder that is made.
         stages: the folder in it that holds what later runs go on from.
         options: options of every stage.
@@ -66,6 +67,7 @@ class Run:
     """
 
     source: VideoSource
+    files: list[tuple[str, int, int]]
     output: Path
     stages: Path
     options: ReconstructOptions
@@ -101,6 +103,7 @@ def track_stage(run: Run) -> Kept:
         with (partial / "tracks.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
             np.savez(file, **vars(tracks), names=np.array(chosen.names), frames=chosen.frames)
+        _check_unchanged(run)
         return {
             "num_frames": tracks.num_frames,
             "num_images": len(chosen.names),
@@ -114,11 +117,28 @@ def track_stage(run: Run) -> Kept:
     return run_stage(
         run.stages,
         "tracks",
-        [*map(_identity, (source.stream, source.pictures)), given, listed],
+        [*run.files, given, listed],
         into=run.stages,
         products=["tracks.npz"],
         make=make,
     )
+
+
+def files_of(source: VideoSource) -> list[tuple[str, int, int]]:
+    """What tells a video's files from such as take their place."""
+    return [_identity(path) for path in (source.stream, source.pictures)]
+
+
+def _check_unchanged(run: Run) -> None:
+    try:
+        same = files_of(run.source) == run.files
+    except OSError:
+        same = False
+    if not same:
+        raise VideoError(
+            f"{run.source.pictures}: changed or went while it was read: let it be, and run the "
+            "same command again"
+        )
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -420,6 +440,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 change=change,
                 progress=lambda done: progress("images", done, len(names)),
             )
+        _check_unchanged(run)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)

@@ -111,6 +111,8 @@ def run_stage(
         (partial / record.name).write_text(text)
         (partial / record.name).replace(record)
     except OSError as error:
+        if error.filename is not None and stages.parent not in Path(error.filename).parents:
+            raise  # of what is read
         raise ModelError(
             f"{into}: cannot be written: {error.strerror or error}: the stages before are kept, "
             "run the same command again once that is mended"

@@ -303,6 +303,22 @@ def test_model_of_two_images_is_none(
         reconstruct(SCENE, tmp_path / "out", options=other)
 
 
+def test_video_that_changes(tmp_path: Path) -> None:
+    """Tracks of one video and images of another do not come together."""
+    video = tmp_path / "v.mp4"
+    shutil.copyfile(SCENE, video)
+    changed = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
+
+    def change(stage: str, done: int, total: int | None) -> None:
+        if stage == "images" and done == 2:
+            video.touch()
+
+    with pytest.raises(VideoError, match="changed or went while it was read"):
+        reconstruct(video, tmp_path / "out", options=changed, progress=change)
+    assert not (tmp_path / "out" / "sparse").exists()
+    assert not list((tmp_path / "out" / ".stages").glob("*.partial"))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
 def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
     """The mapper ends with it, and the next run makes of the rest what one run makes."""
