@@ -153,13 +153,17 @@ def match(
         video, folder, options, listed=existing, clock=clock, progress=progress
     )
     source, display, chosen = prepared.source, prepared.display, prepared.chosen
-    tracked, tracks, size = prepared.tracked, prepared.tracks, prepared.size
+    size, pixel_aspect = prepared.size, prepared.pixel_aspect
+    notes, num_coded_frames = list(prepared.tracked.warnings), prepared.tracked.num_coded_frames
 
     with clock.measure("pairs"):
-        seen = np.isin(tracks.frame, chosen.frames)
-        tracks = select_tracks(keep_observations(tracks, seen), options.density)
-    pixel_aspect = prepared.pixel_aspect
+        seen = np.isin(prepared.tracks.frame, chosen.frames)
+        tracks = select_tracks(keep_observations(prepared.tracks, seen), options.density)
+    # All tracks of a video are its largest arrays: they make room for the matches.
+    del prepared, seen
     paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
+    num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
+    del tracks
     focal_length = None
     if not listed:
         focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
@@ -168,7 +172,7 @@ def match(
         pixel_aspect=pixel_aspect,
         focal_length=focal_length,
     )
-    notes = [*tracked.warnings, *_camera_notes(cameras, listed, pixel_aspect)]
+    notes += _camera_notes(cameras, listed, pixel_aspect)
     matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
 
     num_written = 0
@@ -196,7 +200,6 @@ def match(
             geometries=matched.geometries,
             on_existing=options.on_existing,
         )
-    lengths = np.diff(tracks.offsets)
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
@@ -205,8 +208,8 @@ def match(
         video=video,
         stream=source.stream,
         image_path=folder,
-        num_frames=tracks.num_frames,
-        num_coded_frames=tracked.num_coded_frames,
+        num_frames=num_frames,
+        num_coded_frames=num_coded_frames,
         num_images=len(matched.keypoints),
         num_written_images=num_written,
         num_tracks=len(lengths),

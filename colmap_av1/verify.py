@@ -99,14 +99,20 @@ def verify_pairs(
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):
         raise ValueError("give one camera for each image and one array of matches for each pair")
-    views = [
-        _view(k, camera, _seed(options.seed, index))
-        for index, (k, camera) in enumerate(zip(keypoints, cameras, strict=True))
-    ]
+    views: dict[int, _View] = {}  # from the first pair that needs one to the last
+    last_pair = {int(image): index for index, pair in enumerate(pairs) for image in pair}
+
+    def view(image: int) -> _View:
+        found = views.get(image)
+        if found is None:
+            # Where two threads make it at a time, both make the same.
+            seed = _seed(options.seed, image)
+            found = views[image] = _view(keypoints[image], cameras[image], seed)
+        return found
 
     def verify(index: int) -> TwoViewGeometry:
         i, j = (int(k) for k in pairs[index])
-        return _verify_pair(views[i], views[j], matches[index], (i, j), options)
+        return _verify_pair(view(i), view(j), matches[index], (i, j), options)
 
     geometries: list[TwoViewGeometry] = []
     num_threads = options.num_threads if options.num_threads is not None else _num_cpus()
@@ -114,6 +120,9 @@ def verify_pairs(
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
             for geometry in executor.map(verify, range(len(pairs))):
+                for image in pairs[len(geometries)].tolist():
+                    if last_pair[image] == len(geometries):
+                        views.pop(image, None)
                 geometries.append(geometry)
                 if progress is not None:
                     progress(len(geometries))
@@ -129,23 +138,23 @@ class _View:
 
     Attributes:
         camera: the image's camera.
-        pixels: float64 [2, n] keypoints.
+        xy: float32 [n, 2] keypoints.
         flat: float64 [2, n] undistorted keypoints in pixels from the principal point; None
             without a focal length prior.
         focal: mean focal length in pixels.
         to_flat: float64 [3, 3] takes pixels without distortion to `flat`.
         pinhole: the camera of `flat`, in PoseLib's words.
-        place: int64 [n] place of each keypoint in an order that is spread over the image from
+        place: int32 [n] place of each keypoint in an order that is spread over the image from
             its beginning on.
     """
 
     camera: pycolmap.Camera
-    pixels: NDArray[np.float64]
+    xy: NDArray[np.float32]
     flat: NDArray[np.float64] | None
     focal: float
     to_flat: NDArray[np.float64]
     pinhole: dict[str, Any]
-    place: NDArray[np.int64]
+    place: NDArray[np.int32]
 
 
 def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _View:
@@ -168,9 +177,9 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
         "height": height,
         "params": [focal, 0.0, 0.0],
     }
-    place = _spread_order(pixels, (width, height), seed)
+    place = _spread_order(pixels, (width, height), seed).astype(np.int32)
     to_flat = np.diag([focal, focal, 1.0]) @ np.linalg.inv(camera.calibration_matrix())
-    return _View(camera, np.ascontiguousarray(pixels.T), flat, focal, to_flat, pinhole, place)
+    return _View(camera, keypoints.xy, flat, focal, to_flat, pinhole, place)
 
 
 def _spread_order(x: NDArray[np.float64], size: tuple[int, int], seed: int) -> NDArray[np.int64]:
@@ -351,7 +360,7 @@ def _verify_calibrated(
         tvec = np.asarray(E.pose.t, dtype=np.float64).reshape(3)
     return TwoViewGeometry(
         config=config,
-        inlier_matches=matches.compress(chosen.inliers, axis=0).astype(np.uint32, copy=False),
+        inlier_matches=_inliers(matches, chosen),
         E=None if E.matrix is None else _on_rays(E.matrix, a, b),
         F=None if F is None else F.matrix,
         H=None if H.matrix is None else _unit(np.linalg.inv(b.to_flat) @ H.matrix @ a.to_flat),
@@ -360,11 +369,18 @@ def _verify_calibrated(
     )
 
 
+def _inliers(matches: NDArray[np.uint32], model: _Model) -> NDArray[np.uint32]:
+    """The matches that agree with a model; the same object where all do."""
+    chosen = matches if model.count == len(matches) else matches.compress(model.inliers, axis=0)
+    return chosen.astype(np.uint32, copy=False)
+
+
 def _pixels(
     a: _View, b: _View, matches: NDArray[np.uint32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The matched keypoints of both images, float64 [2, n] each."""
-    return a.pixels.take(matches[:, 0], axis=1), b.pixels.take(matches[:, 1], axis=1)
+    xa, xb = a.xy.take(matches[:, 0], axis=0), b.xy.take(matches[:, 1], axis=0)
+    return np.ascontiguousarray(xa.T, np.float64), np.ascontiguousarray(xb.T, np.float64)
 
 
 def _verify_uncalibrated(
@@ -390,7 +406,7 @@ def _verify_uncalibrated(
             chosen = H
     return TwoViewGeometry(
         config=config,
-        inlier_matches=matches.compress(chosen.inliers, axis=0).astype(np.uint32, copy=False),
+        inlier_matches=_inliers(matches, chosen),
         F=F.matrix,
         H=H.matrix,
     )
