@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.evaluate.clouds import cloud_distances, model_points
+from colmap_av1.evaluate.clouds import cloud_distances, depth_differences, model_points
 from colmap_av1.evaluate.poses import fit_similarity, image_poses
 
 
@@ -32,6 +32,25 @@ def test_one_stray_point_moves_the_hausdorff_distance_alone() -> None:
     assert distances.hausdorff > 49
     assert distances.robust_hausdorff == 0
     assert distances.completeness == 0
+
+
+def test_depths_are_compared_with_points_beside() -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=6, num_points3D=400)
+    pycolmap.set_random_seed(0)
+    truth = pycolmap.synthesize_dataset(options)
+    assert np.nanmax(depth_differences(truth, truth)) < 1e-9
+    # Away from the cameras' image centres by 3 % of the depth in the middle image of each track.
+    moved = copy.deepcopy(truth)
+    for point in moved.points3D.values():
+        ids = sorted(e.image_id for e in point.track.elements)
+        centre = moved.images[ids[len(ids) // 2]].projection_center()
+        point.xyz = centre + 1.03 * (point.xyz - centre)
+    # Points beside are others now and then.
+    assert np.nanmedian(depth_differences(moved, truth, pixels=0.5)) == pytest.approx(0.03)
+    far = copy.deepcopy(truth)
+    for point in far.points3D.values():
+        point.xyz = point.xyz + np.array([0, 0, 1000.0])
+    assert np.isnan(depth_differences(far, truth, pixels=1e-6)).all()
 
 
 def test_empty_clouds_have_no_distance() -> None:

@@ -1,4 +1,4 @@
-"""Distances between point clouds in the same coordinates."""
+"""Distances between point clouds in the same coordinates, and between depths in the same images."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+
+# Images that a point is seen in at least to be compared with, and points that are nearest to one.
+_REFERENCE_LENGTH = 4
+_NEAREST = 3
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,55 @@ def cloud_distances(
         robust_hausdorff=float(max(np.quantile(to_reference, 0.95), np.quantile(to_points, 0.95))),
         extent=float(np.linalg.norm(middle[1] - middle[0])),
     )
+
+
+def depth_differences(model: Any, reference: Any, *, pixels: float = 5.0) -> NDArray[np.float64]:
+    """How far the depths of a model's points are from those of points beside them.
+
+    A point is looked at in the image in the middle of its track, and so are the three points of the
+    reference that lie nearest to it there, of those that four images or more see. The one of the
+    three that is nearest in depth counts, as at an edge others lie on what is behind.
+
+    Args:
+        model: a pycolmap.Reconstruction.
+        reference: another one on the same poses, whose images have the same ids.
+        pixels: how far in the image the points of the reference may be.
+
+    Returns:
+        float64 [num_points], in the order of the ids: the difference as a share of the
+        reference's depth; NaN where no point of the reference is near.
+    """
+    ids = sorted(model.points3D)
+    xyz = model_points(model)
+    middle = np.array([_middle_image(model.points3D[i].track) for i in ids], np.int64)
+    difference = np.full(len(ids), np.nan)
+    for image_id in np.unique(middle):
+        seen = [
+            (p.xy, reference.points3D[p.point3D_id].xyz)
+            for p in reference.images[image_id].points2D
+            if p.has_point3D()
+            and reference.points3D[p.point3D_id].track.length() >= _REFERENCE_LENGTH
+        ]
+        if not seen:
+            continue
+        image = model.images[image_id]
+        pose = np.asarray(image.cam_from_world().matrix())
+        own = np.flatnonzero(middle == image_id)
+        in_camera = xyz[own] @ pose[:, :3].T + pose[:, 3]
+        own, in_camera = own[in_camera[:, 2] > 0], in_camera[in_camera[:, 2] > 0]
+        xy, there = (np.array(column) for column in zip(*seen, strict=True))
+        depth = np.append(there @ pose[2, :3] + pose[2, 3], np.nan)
+        projected = np.asarray(model.cameras[image.camera_id].img_from_cam(in_camera))
+        # The index one beyond the last stands for none.
+        _, near = KDTree(xy).query(projected, k=_NEAREST, distance_upper_bound=pixels)
+        off = np.abs(in_camera[:, 2:] / depth[near] - 1)
+        difference[own] = np.fmin.reduce(off, axis=1)
+    return difference
+
+
+def _middle_image(track: Any) -> int:
+    image_ids = sorted(int(element.image_id) for element in track.elements)
+    return image_ids[len(image_ids) // 2]
 
 
 def model_points(model: Any) -> NDArray[np.float64]:
