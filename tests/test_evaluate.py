@@ -17,6 +17,7 @@ from colmap_av1.errors import DatabaseError, EvaluationError, OptionError, Video
 from colmap_av1.evaluate import (
     MapperSettings,
     database_tracks,
+    densify_model,
     map_database,
     model_figures,
     model_poses,
@@ -25,7 +26,6 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
     track_statistics,
-    triangulate_database,
 )
 from colmap_av1.evaluate.resume import kept
 from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, TrackOptions
@@ -233,14 +233,12 @@ def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     assert errors.ate < 0.01
     assert errors.rotation < 0.2
 
-    folder = tmp_path / "triangulated"
-    given = (run.database, mapper.model, scene_footage.image_path, folder)
-    triangulated = triangulate_database(*given)
-    assert triangulate_database(*given) == triangulated
-    again = pycolmap.Reconstruction(triangulated.model)
+    dense = densify_model(mapper.model, scene_footage, tmp_path / "dense")
+    assert densify_model(mapper.model, scene_footage, tmp_path / "dense") == dense
+    again = pycolmap.Reconstruction(dense.model)
     np.testing.assert_allclose(model_poses(again, 60), model_poses(model, 60), atol=1e-12)
-    assert model_figures(again).num_points > 0.9 * figures.num_points
-    assert model_figures(again).mean_error < 1.1 * figures.mean_error
+    assert model_figures(again).num_points > 3000
+    assert model_figures(again).mean_error < 1
 
 
 def test_a_database_that_makes_no_model(clip, tmp_path):

@@ -16,7 +16,6 @@ from colmap_av1.evaluate.mapping import (
     densify_model,
     map_database,
     model_figures,
-    triangulate_database,
 )
 from colmap_av1.evaluate.measure import Measured, run_measured
 from colmap_av1.evaluate.poses import PoseErrors, model_poses, pose_errors
@@ -63,5 +62,4 @@ __all__ = [
     "split_images",
     "track_statistics",
     "train_gaussians",
-    "triangulate_database",
 ]

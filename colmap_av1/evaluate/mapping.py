@@ -1,4 +1,4 @@
-"""COLMAP's incremental mapper and triangulation on a database, and the figures of their models."""
+"""COLMAP's incremental mapper on a database, dense points on its poses, figures of models."""
 
 from __future__ import annotations
 
@@ -108,42 +108,6 @@ def map_database(
     return MapperRun(model if result["num_models"] else None, **result)
 
 
-def triangulate_database(
-    database: Path, model: Path, image_path: Path, folder: Path, *, seed: int = 0
-) -> MapperRun:
-    """Triangulate the tracks of a database on the poses of a model, which stay as they are.
-
-    A finished run is not repeated.
-
-    Args:
-        database: COLMAP database with verified matches; a copy of it is used.
-        model: folder of the model; its images are found in the database by their names.
-        image_path: folder of the images, for the points' colours.
-        folder: gets the model, `log.txt` and the figures.
-        seed: the random seed.
-
-    Raises:
-        EvaluationError: the triangulation failed.
-    """
-    output = folder / "model"
-
-    def work() -> dict[str, Any]:
-        copy = folder / "triangulated.db"
-        shutil.copyfile(database, copy)
-        arguments = (copy, model, image_path, output, seed)
-        measured = run_measured(_triangulate, *arguments, log=folder / "log.txt")
-        copy.unlink()
-        return {
-            "num_models": measured.result,
-            "seconds": measured.seconds,
-            "cpu_seconds": measured.cpu_seconds,
-            "peak_memory": measured.peak_memory,
-        }
-
-    inputs = [content_of(path) for path in (database, *sorted(model.glob("*.bin")))]
-    return MapperRun(output, **kept(folder, (inputs, seed, pycolmap.__version__), work))
-
-
 def densify_model(
     model: Path, footage: Footage, folder: Path, options: DensifyOptions | None = None
 ) -> MapperRun:
@@ -220,13 +184,3 @@ def _map(database: Path, image_path: Path, output: Path, settings: MapperSetting
 
 def _densify(model: Path, video: Path, output: Path, options: DensifyOptions) -> None:
     densify(model, video, output, options=options)
-
-
-def _triangulate(database: Path, model: Path, image_path: Path, output: Path, seed: int) -> int:
-    pycolmap.set_random_seed(seed)
-    options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
-    output.mkdir()
-    pycolmap.triangulate_points(
-        read_model(model), database, image_path, output, options=options, refine_intrinsics=False
-    )
-    return 1

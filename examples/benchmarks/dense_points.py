@@ -11,8 +11,6 @@ front-end. The rows add, one after the other, what makes points more and surer.
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ from typing import Any
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 from numpy.typing import NDArray
+from tracks import load_render_scene
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
@@ -144,17 +143,6 @@ def true_model(scene: Any, folder: Path) -> Path:
     )
     write_model(folder, {1: camera}, images, nothing)
     return folder
-
-
-def load_render_scene() -> Any:
-    """The script that rendered the example clip, as a module."""
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 if __name__ == "__main__":

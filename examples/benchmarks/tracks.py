@@ -28,7 +28,14 @@ import pycolmap
 from numpy.typing import NDArray
 from rich.console import Console
 
-from colmap_av1 import CameraOptions, ColmapAv1Error, Tracks
+from colmap_av1 import (
+    CameraOptions,
+    ColmapAv1Error,
+    DensifyOptions,
+    MatchOptions,
+    RefineOptions,
+    Tracks,
+)
 from colmap_av1.evaluate import (
     FRONTENDS,
     SPANS,
@@ -40,6 +47,7 @@ from colmap_av1.evaluate import (
     PoseErrors,
     TrackStatistics,
     database_tracks,
+    densify_model,
     epipolar_errors,
     exact_errors,
     map_database,
@@ -50,7 +58,6 @@ from colmap_av1.evaluate import (
     read_sequence,
     run_frontend,
     track_statistics,
-    triangulate_database,
 )
 from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.model import read_model
@@ -63,8 +70,11 @@ FROM_SOURCE = {
     "sift-sequential-source": "sift-sequential",
     "sift-exhaustive-source": "sift-exhaustive",
 }
-# Where few and sure tracks give the poses, these are triangulated on them.
-DENSE = {"av1-sparse": "av1-dense", "av1-refined-sparse": "av1-refined-dense"}
+# Where few and sure tracks give the poses, all are triangulated on them.
+ALL_TRACKS = {
+    "av1-sparse": DensifyOptions(),
+    "av1-refined-sparse": DensifyOptions(match=MatchOptions(refine=RefineOptions(refine="lk"))),
+}
 ENCODING = (
     "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
     "-pix_fmt yuv420p -an"
@@ -130,7 +140,7 @@ class Row:
     model: ModelFigures | None
     pose_errors: PoseErrors | None
     poses_are_true: bool
-    dense: tuple[FrontendRun, MapperRun, ModelFigures] | None
+    dense: tuple[MapperRun, ModelFigures] | None
 
 
 def main() -> int:
@@ -228,8 +238,11 @@ def measure_case(
             if mapping:
                 where = folder / f"{name}-model"
                 mapper = map_database(run.database, given.image_path, where, settings)
-                if mapper.model is not None and name in DENSE:
-                    dense = triangulate_all(DENSE[name], footage, folder, mapper.model)
+                if mapper.model is not None and name in ALL_TRACKS:
+                    where = folder / f"{name}-all-tracks"
+                    made = densify_model(mapper.model, footage, where, ALL_TRACKS[name])
+                    assert made.model is not None
+                    dense = made, model_figures(made.model)
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {name}: {error}", markup=False)
             continue
@@ -344,17 +357,6 @@ def reference_model(
     return read_model(mapper.model)
 
 
-def triangulate_all(
-    name: str, footage: Footage, folder: Path, model: Path
-) -> tuple[FrontendRun, MapperRun, ModelFigures]:
-    """Every track of a front-end on the poses of a model."""
-    run = run_frontend(name, footage, folder / name)
-    where = folder / f"{name}-triangulated"
-    mapper = triangulate_database(run.database, model, footage.image_path, where)
-    assert mapper.model is not None
-    return run, mapper, model_figures(mapper.model)
-
-
 def measure_row(
     run: FrontendRun,
     mapper: MapperRun | None,
@@ -464,11 +466,10 @@ def models_table(rows: Sequence[Row]) -> str:
         if dense is None:
             body.append([*cells, "-", "-", *cost, "-"])
             continue
-        run, triangulation, figures = dense
+        made, figures = dense
         cells.append(f"{figures.num_points:,}{times(figures.num_points, base_points)}")
         cells.append(f"{figures.mean_error:.3f} / {figures.median_error:.3f}")
-        seconds = {**run.seconds, "triangulation": triangulation.seconds}
-        cost.append(took(run.cpu_seconds + triangulation.cpu_seconds, seconds))
+        cost.append(took(made.cpu_seconds, made.seconds))
         body.append([*cells, *cost])
     return markdown(header, body)
 
