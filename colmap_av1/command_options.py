@@ -70,7 +70,8 @@ def given(namespace: argparse.Namespace, kind: type[_Options], **more: Any) -> _
     given = {
         k.removeprefix(_OPTION): v for k, v in vars(namespace).items() if k.startswith(_OPTION)
     }
-    return kind(**{k: v for k, v in given.items() if k in names}, **more)
+    # `refine` is an option and, in MatchOptions, the kind of options that has it.
+    return kind(**{k: v for k, v in given.items() if k in names and k not in more}, **more)
 
 
 def underscored(word: str) -> str:

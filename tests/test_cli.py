@@ -52,6 +52,14 @@ def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:
     assert (PROJECT / script[1]).is_file()
 
 
+def test_refinement_is_an_option(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip), "--refine", "lk"]
+    assert main(words) == 0
+    assert float(read_table(capsys.readouterr().out)["seconds, refinement"]) > 0
+
+
 def test_spellings_of_options(clip: Path, tmp_path: Path) -> None:
     words = [
         *("match", f"--database_path={tmp_path / 'a.db'}", "--video-path", str(clip)),
