@@ -517,6 +517,8 @@ def _run_compare(namespace: argparse.Namespace) -> None:
     for column in result.columns:
         if column.error:
             print_warning(f"{column.name}: {column.error}")
+    for reason in sorted({column.training_error for column in result.columns} - {""}):
+        print_warning(f"nothing is trained: {reason}")
     _print_result(namespace, compare_rows(result), result.warnings)
 
 

@@ -87,8 +87,8 @@ def pair_images(
         if len(pairs) == 0:
             raise VideoError(
                 f"{video}: no two images share {options.pairs.min_matches} tracks, so there is "
-                "nothing to match: 'colmap-av1 info --video' says what the stream lacks, "
-                "--reencode 1 converts it first"
+                "nothing to match: let more frames be images, or see 'colmap-av1 info --video' for "
+                "what the stream lacks; --reencode 1 converts it first"
             )
         matches = []
         for i, j in pairs:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBars
 from rich.table import Table
+from rich.text import Text
 
 from colmap_av1.match import MatchReport
 from colmap_av1.progress import Progress, no_progress
@@ -54,7 +55,7 @@ def print_summary(rows: Rows) -> None:
         return
     table = Table(show_header=False)
     for name, value in rows:
-        table.add_row(name, value)
+        table.add_row(Text(name), Text(value))  # as they are: in brackets is no markup
     Console().print(table)
 
 

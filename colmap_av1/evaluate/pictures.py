@@ -127,9 +127,7 @@ def cost_chart(columns: Sequence[Column]) -> bytes:
         axis.invert_yaxis()
         axis.margins(x=0.1)
         axis.set_title("CPU time, s", loc="left", fontsize=9)
-        axis.legend(
-            frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(shades), fontsize=8
-        )
+        _add_legend(axis, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(shades))
         return _svg(figure)
 
 
@@ -160,8 +158,13 @@ def length_chart(columns: Sequence[Column]) -> bytes:
         axis.set_xlabel("images")
         axis.set_title("points that so many images or more see", loc="left", fontsize=9)
         axis.grid(alpha=0.25)
-        axis.legend(frameon=False, fontsize=8)
+        _add_legend(axis)
         return _svg(figure)
+
+
+def _add_legend(axis: Any, **how: Any) -> None:
+    if axis.get_legend_handles_labels()[0]:  # else matplotlib warns
+        axis.legend(frameon=False, fontsize=8, **how)
 
 
 def training_chart(columns: Sequence[Column]) -> bytes | None:
@@ -180,7 +183,7 @@ def training_chart(columns: Sequence[Column]) -> bytes | None:
         axis.set_xlabel("seconds of training")
         axis.set_title("PSNR-Y of the test images, dB", loc="left", fontsize=9)
         axis.grid(alpha=0.25)
-        axis.legend(frameon=False, fontsize=8)
+        _add_legend(axis)
         return _svg(figure)
 
 

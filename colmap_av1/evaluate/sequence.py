@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ImageError, VideoError
 
+_WHAT_TO_GIVE = "give lines of 'name tx ty tz qx qy qz qw', or the folder of a COLMAP model"
+
 
 @dataclass(frozen=True)
 class Sequence:
@@ -115,8 +117,10 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
     try:
         lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImageError(f"{path}: holds no poses that can be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise ImageError(f"{path}: is no text: {_WHAT_TO_GIVE}") from error
+    except OSError as error:
+        raise ImageError(f"{path}: {error.strerror}: {_WHAT_TO_GIVE}") from error
     for line in lines:
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -128,8 +132,6 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
             values = np.array(words[1:], dtype=np.float64)
             rotation = Rotation.from_quat(values[3:7]).as_matrix().T
         except ValueError as error:
-            raise ImageError(
-                f"{path}: '{line}' is no pose: give lines of 'name tx ty tz qx qy qz qw'"
-            ) from error
+            raise ImageError(f"{path}: '{line[:80]}' is no pose: {_WHAT_TO_GIVE}") from error
         cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
     return cam_from_world
