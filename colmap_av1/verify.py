@@ -272,6 +272,10 @@ class _Search:
         """The matches that models are found on."""
         return self.order[: self.options.max_samples]
 
+    def part(self, share: float) -> NDArray[np.int64]:
+        """A share of a full sample, as spread as all of it is."""
+        return self.order[: max(_MIN_MATCHES, round(share * self.options.max_samples))]
+
     def ransac(self, min_iterations: int) -> dict[str, Any]:
         """PoseLib's words for it."""
         return {
@@ -420,8 +424,8 @@ def _find_pose(
     a: _View, b: _View, xa: NDArray[np.float64], xb: NDArray[np.float64], search: _Search
 ) -> _Model:
     """The essential matrix of a pair, on undistorted pixels from the principal points."""
-    # Half of the sample is enough: what is found is refined on more than all of it.
-    sample, wider = search.sample[: max(_MIN_MATCHES, len(search.sample) // 2)], search.order
+    # A part of the sample is enough: what is found is refined on more than all of it.
+    sample, wider = search.part(0.5), search.order
     if len(sample) < _MIN_MATCHES:
         return _no_model(xa)
     ransac = search.ransac(_MIN_ITERATIONS)
@@ -455,13 +459,15 @@ def _find_fundamental(
     start: NDArray[np.float64] | None = None,
 ) -> _Model:
     """The fundamental matrix of a pair; from `start`, if given, without a search."""
-    sample, wider = search.sample, search.order
+    sample, wider = search.part(0.75), search.order
     if len(sample) < _MIN_MATCHES:
         return _no_model(xa)
     F = start
     if F is None:
         ransac = search.ransac(_MIN_ITERATIONS)
-        F, _ = poselib.estimate_fundamental(xa[:, sample].T, xb[:, sample].T, ransac, _REFINEMENT)
+        F, _ = poselib.estimate_fundamental(
+            xa[:, sample].T, xb[:, sample].T, ransac, {"max_iterations": 0}
+        )
     found = _test(_epipolar_inliers, F, xa, xb, search)
     used = wider[found.inliers[wider]]
     if found.matrix is None or len(used) < _MIN_MATCHES:

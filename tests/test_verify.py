@@ -173,6 +173,14 @@ def test_bytes_do_not_depend_on_threads_but_on_the_seed() -> None:
     assert run(seed=0) != run(seed=1)
 
 
+def test_order_of_the_pairs_does_not_matter() -> None:
+    keypoints, pairs, matches = prepare(make_scene(num_points=200))
+    forwards = verify_pairs(keypoints, pairs, matches, UNKNOWN)
+    order = np.random.default_rng(0).permutation(len(pairs))
+    mixed = verify_pairs(keypoints, pairs[order], [matches[k] for k in order], UNKNOWN)
+    assert [as_bytes(mixed[k]) for k in np.argsort(order)] == [as_bytes(g) for g in forwards]
+
+
 def test_samples_stand_for_all_matches() -> None:
     keypoints, pairs, matches = prepare(make_scene(num_points=6000), outliers=0.2)
     for g, h in zip(
