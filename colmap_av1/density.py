@@ -98,7 +98,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         max_tracks_per_image=limits.max_tracks_per_image,
         min_length=limits.min_length,
     )
-    return keep_observations(tracks, kept.astype(np.bool_))
+    return keep_observations(tracks, kept.view(np.bool_))
 
 
 def _variance_since_first(tracks: Tracks) -> NDArray[np.float64]:

@@ -181,8 +181,9 @@ def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
     """
     if kept.all():
         return tracks
-    counts = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
-    lengths = np.diff(counts)
+    so_far = np.zeros(len(kept) + 1, dtype=np.min_scalar_type(len(kept)))
+    np.cumsum(kept, out=so_far[1:])
+    lengths = np.diff(so_far[tracks.offsets].astype(np.int64))
     return replace(
         tracks,
         offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),

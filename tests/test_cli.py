@@ -29,6 +29,16 @@ def read_table(text: str) -> dict[str, str]:
     return dict(line.split("\t") for line in text.splitlines())
 
 
+def test_start_waits_for_nothing_that_only_comparisons_need(tmp_path: Path) -> None:
+    listing = "import sys, colmap_av1.cli; print(*{name.split('.')[0] for name in sys.modules})"
+    run = subprocess.run(
+        [sys.executable, "-c", listing], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    loaded = set(run.stdout.split())
+    assert "pycolmap" in loaded
+    assert not loaded & {"scipy", "matplotlib"}
+
+
 def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:
     words = ["match", "--database", "a.db", "--video", str(clip), "--image_path", "my frames"]
     run = subprocess.run(
