@@ -169,6 +169,10 @@ def main() -> int:
         metavar="NAME",
         help=f"of {', '.join([*FRONTENDS, *FROM_SOURCE])}",
     )
+    parser.add_argument(
+        "--camera_model",
+        help="COLMAP's camera model where the intrinsics are unknown; without, that of match",
+    )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
     arguments = parser.parse_args()
     console = Console(stderr=True)
@@ -182,9 +186,7 @@ def main() -> int:
                 console.print(f"{case.name}: not measured, {SEQUENCES / case.name} is absent")
                 continue
             try:
-                rows, about = measure_case(
-                    case, cache / case.name, arguments.frontends, not arguments.no_mapping, console
-                )
+                rows, about = measure_case(case, cache / case.name, arguments, console)
             except ColmapAv1Error as error:
                 console.print(f"error: {case.name}: {error}", markup=False)
                 failed = True
@@ -199,12 +201,13 @@ def main() -> int:
 
 
 def measure_case(
-    case: Case, folder: Path, frontends: Sequence[str], mapping: bool, console: Console
+    case: Case, folder: Path, arguments: argparse.Namespace, console: Console
 ) -> tuple[list[Row], str]:
     """Rows of one sequence, and a line on what they are measured against."""
+    mapping = not arguments.no_mapping
     folder.mkdir(parents=True, exist_ok=True)
     material = rendered_clip() if case.name == "scene" else real_sequence(case, folder, console)
-    intrinsics = CameraOptions()
+    intrinsics = CameraOptions(camera_model=arguments.camera_model)
     if material.camera is not None:
         camera = material.camera
         params = ",".join(map(str, camera.params))
@@ -224,7 +227,7 @@ def measure_case(
         model = reference_model(footage, folder, settings, console)
         truth = with_reference(truth, model, material.num_frames)
     rows = []
-    for name in frontends:
+    for name in arguments.frontends:
         console.print(f"{case.name}: {name}", markup=False)
         if name in FROM_SOURCE and material.source is None:
             continue
