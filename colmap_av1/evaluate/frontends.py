@@ -93,7 +93,8 @@ def run_frontend(
             "peak_memory": measured.peak_memory,
         }
 
-    given = (content_of(footage.video), footage.frames, footage.camera)
+    camera = replace(footage.camera, camera_model=_camera_model(footage))
+    given = (content_of(footage.video), footage.frames, camera)
     result = kept(folder, (name, *given, *frontend.depends_on(footage)), work)
     if not database.is_file():
         raise EvaluationError(f"{folder}: its database is gone: remove the folder, run again")
@@ -107,11 +108,15 @@ def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str,
     return match(database, footage.video, image_path=folder, options=options).seconds
 
 
+def _camera_model(footage: Footage) -> str:
+    """COLMAP's name of the camera model that every front-end's images get."""
+    return str(make_camera(footage.camera, *footage.size, footage.pixel_aspect).model_name)
+
+
 def _list_images(footage: Footage, database: Path) -> None:
     """Make a database of the images, as COLMAP does."""
     reader = pycolmap.ImageReaderOptions()
-    camera = make_camera(footage.camera, *footage.size, footage.pixel_aspect)
-    reader.camera_model = camera.model_name
+    reader.camera_model = _camera_model(footage)
     reader.camera_params = footage.camera.camera_params or ""
     pycolmap.Database.open(database).close()
     # Threads of the extraction would number the images in the order in which they finish.
