@@ -25,7 +25,9 @@ int block_area(int mi_size) { return av1::kBlockWidth[mi_size] * av1::kBlockHeig
 }  // namespace
 
 TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
-    : options_(options), half_cell_(kUnit / 2.F / static_cast<float>(options.cells)) {
+    : options_(options),
+      log_cells_(options.cells / 2),  // of 1, 2 and 4
+      half_cell_(kUnit / 2.F / static_cast<float>(options.cells)) {
   const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
   if (!is_part(options.cells) || !is_part(options.seeding) || options.seeding > options.cells) {
     throw std::invalid_argument("cells and seeding are 1, 2 or 4, seeding not above cells");
@@ -472,17 +474,19 @@ void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
   claims_.resize(link.other->cells.size());
   // A cell as large as its unit is searched in no more time than the unit is judged.
   const bool judges_units = options_.cells > 1;
-  if (judges_units) note_open_units(*link.other);
+  bool noted = false;
   for (int unit_row = 0; unit_row < current_->visible_rows; ++unit_row) {
     for (int unit_col = 0; unit_col < current_->visible_cols; ++unit_col) {
       const int unit = unit_row * current_->cols + unit_col;
-      if (!link.refs[motion[unit].ref] ||
-          (judges_units && !may_find_track(link, unit, motion[unit], reach))) {
-        continue;
+      if (!link.refs[motion[unit].ref]) continue;
+      if (judges_units) {
+        if (!noted) note_open_units(*link.other);
+        noted = true;
+        if (!may_find_track(link, unit, motion[unit], reach)) continue;
       }
       for (int part = 0; part < options_.cells * options_.cells; ++part) {
-        const int row = options_.cells * unit_row + part / options_.cells;
-        const int col = options_.cells * unit_col + part % options_.cells;
+        const int row = options_.cells * unit_row + (part >> log_cells_);
+        const int col = options_.cells * unit_col + (part & (options_.cells - 1));
         if (current_->cells[row * current_->cell_cols + col].track >= 0) continue;
         for (int cell = row * current_->cell_cols + col; cell >= 0;) {
           int best = -1;
@@ -510,12 +514,13 @@ void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
 // The units of a frame with tracks that have no place in the current frame yet.
 void TrackBuilder::note_open_units(const Frame& other) {
   open_units_.assign(other.mi_size.size(), 0);
-  int cell = 0;
+  const Cell* cell = other.cells.data();
   for (int row = 0; row < other.cell_rows; ++row) {
-    uint8_t* open = open_units_.data() + row / options_.cells * other.cols;
-    for (int col = 0; col < other.cell_cols; ++col, ++cell) {
-      const int32_t track = other.cells[cell].track;
-      if (track >= 0 && tracks_[track].last_seen != frames_chained_) open[col / options_.cells] = 1;
+    uint8_t* unit = open_units_.data() + static_cast<std::ptrdiff_t>(row >> log_cells_) * other.cols;
+    for (int col = 0; col < other.cols; ++col, ++unit) {
+      for (const Cell* end = cell + options_.cells; cell < end; ++cell) {
+        if (cell->track >= 0 && tracks_[cell->track].last_seen != frames_chained_) *unit = 1;
+      }
     }
   }
 }
@@ -537,8 +542,8 @@ bool TrackBuilder::may_find_track(const Link& link, int unit, const UnitMotion& 
       around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
              pixels / scale_x, pixels / scale_y);
   if (window.bottom < window.top || window.right < window.left) return false;
-  for (int row = window.top / options_.cells; row <= window.bottom / options_.cells; ++row) {
-    for (int col = window.left / options_.cells; col <= window.right / options_.cells; ++col) {
+  for (int row = window.top >> log_cells_; row <= window.bottom >> log_cells_; ++row) {
+    for (int col = window.left >> log_cells_; col <= window.right >> log_cells_; ++col) {
       if (open_units_[row * other.cols + col] != 0) return true;
     }
   }
@@ -576,7 +581,7 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
   for (int row = 0; row < options_.cells * other.visible_rows; ++row) {
     for (int col = 0; col < options_.cells * other.visible_cols; ++col) {
       const int index = row * other.cell_cols + col;
-      const int unit = row / options_.cells * other.cols + col / options_.cells;
+      const int unit = (row >> log_cells_) * other.cols + (col >> log_cells_);
       const Cell& cell = other.cells[index];
       if (!link.refs[motion[unit].ref] || cell.track < 0 ||
           tracks_[cell.track].last_seen == frames_chained_) {
@@ -849,8 +854,9 @@ TrackBuilder::Window TrackBuilder::around(const Frame& frame, Point position, fl
 
 int TrackBuilder::unit_of(const Frame& frame, int cell) const {
   if (options_.cells == 1) return cell;
-  return cell / frame.cell_cols / options_.cells * frame.cols +
-         cell % frame.cell_cols / options_.cells;
+  const int row = cell / frame.cell_cols;
+  const int col = cell - row * frame.cell_cols;
+  return (row >> log_cells_) * frame.cols + (col >> log_cells_);
 }
 
 TrackBuilder::Point TrackBuilder::unit_centre(const Frame& frame, int unit) {

@@ -224,6 +224,7 @@ class TrackBuilder {
                         Point* source);
 
   TrackBuilderOptions options_;
+  int log_cells_;    // to the base 2, of the cells along either side of a unit
   float half_cell_;  // half a cell's width, in coded pixels
   int width_ = 0;  // of the output's coordinates
   int height_ = 0;
