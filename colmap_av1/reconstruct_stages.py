@@ -254,7 +254,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
             raise ModelError(_why_no_start(matched.facts, mapper))
         return {
             "num_registered": mapped.num_images[0],
-            "other_models": list(mapped.num_images[1:]),
+            "other_models": [n for n in mapped.num_images[1:] if n >= _LEAST_IMAGES],
             "mapper": mapper,
             "poses": "poses",
         }
