@@ -79,8 +79,8 @@ def _end(process: BaseProcess) -> None:
     """End a process, and those it started."""
     if hasattr(os, "killpg") and process.pid is not None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGTERM)
-    process.terminate()
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()  # pycolmap would answer SIGTERM with a stack trace
 
 
 def _call(

@@ -361,7 +361,8 @@ def _cloud_figures(
         for kind, picture in drawn.items():
             _, encoded = cv2.imencode(".png", picture)
             name = f"{column.name.replace(' ', '')}_{kind}.png"
-            figures.append(_Figure(name, told, encoded.tobytes()))
+            seen = {"view": "", "plan": ", from above"}[kind]
+            figures.append(_Figure(name, f"{told}{seen}", encoded.tobytes()))
     return figures
 
 
