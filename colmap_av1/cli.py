@@ -73,6 +73,7 @@ _ABOUT_NAMES = (
     "--ImageReader.camera_model."
 )
 _INTERRUPTED = 130
+_BROKEN_PIPE = 141
 _FAILED_CHECK = 1
 _BAD_INPUT = 2
 
@@ -84,7 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; None: those of this process.
 
     Returns:
-        Exit status: 0, 1 where a check fails, 2 for bad input, 130 when interrupted.
+        Exit status: 0, 1 where a check fails, 2 for bad input, 130 when interrupted, 141 where
+        nobody reads the output to its end.
 
     Raises:
         SystemExit: the process is told to end.
@@ -96,9 +98,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # argparse exits by itself, with status 2 and one line, on words it does not know.
             namespace = parser.parse_args([underscored(word) for word in words])
             status: int | None = namespace.run(namespace)
+            sys.stdout.flush()
         except ColmapAv1Error as error:
             print(f"{PROGRAM}: error: {error}", file=sys.stderr)
             return _BAD_INPUT
+        except BrokenPipeError:  # as before `head`, which has read enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _BROKEN_PIPE
         except OSError as error:
             if error.filename is None:
                 raise

@@ -103,7 +103,7 @@ def compare(
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
     _check_training(options)
-    with open_stages(output), _writing(output):
+    with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
             video,
             output / "footage",

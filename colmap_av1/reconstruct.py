@@ -114,7 +114,7 @@ def reconstruct(
     clock = Clock()
     check_options(options.match, picture_size(video))
     _check_reconstruct_options(options)
-    with open_stages(output) as stages:
+    with open_stages(output, "reconstruct") as stages:
         source = open_source(video, options.match, clock=clock, progress=progress)
         report = _run_stages(
             Run(source, files_of(source), output, stages, options, clock, progress)

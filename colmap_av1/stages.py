@@ -34,8 +34,12 @@ class Kept:
 
 
 @contextmanager
-def open_stages(output: Path) -> Iterator[Path]:
+def open_stages(output: Path, command: str) -> Iterator[Path]:
     """The folder of the stages in an output folder, both made where they are missing.
+
+    Args:
+        output: the output folder.
+        command: the command whose output it is.
 
     Raises:
         OptionError: the output folder holds something else, cannot be made, or another run
@@ -54,7 +58,11 @@ def open_stages(output: Path) -> Iterator[Path]:
             stages.mkdir(parents=True, exist_ok=True)
             if not os.access(output, os.W_OK | os.X_OK):
                 raise PermissionError(None, "no permission")
-            alone = running.enter_context(only_run(stages / "lock"))
+            lock = stages / f"{command}.lock"
+            other = next((p.stem for p in stages.glob("*.lock") if p != lock), None)
+            if other is not None:
+                raise OptionError(f"{output}: is the output of {other}: give another folder")
+            alone = running.enter_context(only_run(lock))
         except OSError as error:
             raise OptionError(f"{output}: cannot be written: {error.strerror}") from error
         if not alone:

@@ -208,6 +208,19 @@ def test_path_that_the_system_refuses(
     assert "File name too long: " in line
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+def test_output_that_nobody_reads(clip: Path, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "colmap_av1", "info", "--video", str(clip)]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+
+
 def test_interrupt_exits_with_130(encode: Encode, tmp_path: Path) -> None:
     long = encode(make_frames(80, 640, 384), tmp_path / "long.mp4")
     words = ["match", "--database", "a.db", "--video", str(long), "--image_path", "frames"]

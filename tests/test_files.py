@@ -49,12 +49,17 @@ def test_what_the_killed_left_is_removed(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
 def test_one_run_at_a_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    with open_stages(output):
-        with pytest.raises(OptionError, match="another run is at work in it"), open_stages(output):
+    with open_stages(output, "a"):
+        with (
+            pytest.raises(OptionError, match="another run is at work in it"),
+            open_stages(output, "a"),
+        ):
             pass
-        with open_stages(tmp_path / "other"):
+        with open_stages(tmp_path / "other", "a"):
             pass
+    with pytest.raises(OptionError, match="is the output of a:"), open_stages(output, "b"):
+        pass
     left = output / f".report.json.{dead_process()}.partial"
     left.write_text("half")
-    with open_stages(output):
+    with open_stages(output, "a"):
         assert not left.exists()
