@@ -33,11 +33,10 @@ from colmap_av1.options import CameraOptions, OnExisting
 from colmap_av1.pairs import ImageKeypoints
 from colmap_av1.verify import TwoViewConfig, TwoViewGeometry
 
-# Models of new cameras. With one parameter for the distortion, as in COLMAP's choice, what a lens
-# does beyond it bends focal length and path; the simplest with two focal lengths has four.
-_MODEL, _MODEL_OF_OBLONG_PIXELS = "RADIAL", "OPENCV"
-# The one that parameters are of where no model is named, as in COLMAP.
-_MODEL_OF_PARAMS = "SIMPLE_RADIAL"
+# Models of new cameras: COLMAP's own choice; where the focal length is known, one with two
+# parameters for the distortion, as what a lens does beyond one bends focal length and path; and the
+# simplest with two focal lengths that knows distortion.
+_MODEL, _MODEL_OF_KNOWN_FOCAL_LENGTH, _MODEL_OF_OBLONG_PIXELS = "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 # Encoders that scale pictures round their display size: a few tenths of a percent.
 _SQUARE_TOLERANCE = 5e-3
 # COLMAP's kinds of two-view geometry beside those of TwoViewConfig.
@@ -99,7 +98,8 @@ def make_camera(
     names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     name = options.camera_model
     if name is None:
-        square = _MODEL if options.camera_params is None else _MODEL_OF_PARAMS
+        told = focal_length is not None and options.camera_params is None
+        square = _MODEL_OF_KNOWN_FOCAL_LENGTH if told else _MODEL
         name = square if is_square(pixel_aspect) else _MODEL_OF_OBLONG_PIXELS
     if name not in names:
         raise OptionError(f"unknown camera model {name!r}: give one of {', '.join(names)}")

@@ -157,8 +157,8 @@ class VerifyOptions:
 class CameraOptions:
     """The camera written for new images."""
 
-    # name of one of COLMAP's camera models; None: RADIAL, with camera_params SIMPLE_RADIAL; or
-    # OPENCV, which has two focal lengths, where the video's pixels are not square
+    # name of one of COLMAP's camera models; None: RADIAL where the tracks tell the focal length,
+    # else SIMPLE_RADIAL; OPENCV, which has two focal lengths, where pixels are not square
     camera_model: str | None = None
     # its parameters as COLMAP spells them, such as 'f,cx,cy,k'; None: the focal length that
     # the tracks tell, else 1.2 times the longer side, to be refined; principal point in the centre

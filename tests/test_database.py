@@ -498,14 +498,21 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
     assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
 
 
-def test_default_camera_has_colmaps_guess() -> None:
+def test_default_camera_is_colmaps_guess() -> None:
     camera = make_camera(CameraOptions(), 450, 800)
-    assert camera.model_name == "RADIAL"
-    assert camera.params.tolist() == [960, 225, 400, 0, 0]
-    # Parameters alone are those of COLMAP's default model.
-    given = make_camera(CameraOptions(camera_params="500,225,400,0.1"), 450, 800)
-    assert given.model_name == "SIMPLE_RADIAL"
+    assert camera.model_name == "SIMPLE_RADIAL"
+    assert camera.params.tolist() == [960, 225, 400, 0]
     assert not camera.has_prior_focal_length
+
+
+def test_told_focal_length_lets_two_parameters_be_found() -> None:
+    camera = make_camera(CameraOptions(), 450, 800, focal_length=500)
+    assert camera.model_name == "RADIAL"
+    assert camera.params.tolist() == [500, 225, 400, 0, 0]
+    assert camera.has_prior_focal_length
+    # Parameters alone are those of COLMAP's default model.
+    given = make_camera(CameraOptions(camera_params="480,225,400,0.1"), 450, 800, focal_length=500)
+    assert (given.model_name, given.params[0]) == ("SIMPLE_RADIAL", 480)
 
 
 @pytest.mark.parametrize(

@@ -319,7 +319,7 @@ def test_images_whose_pixels_were_made_square(
     assert (report.num_images, report.num_written_images, report.warnings) == (10, 0, ())
     with sqlite3.connect(tmp_path / "a.db") as connection:
         row = connection.execute("SELECT model, width, height, params FROM cameras").fetchone()
-    assert row[:3] == (3, 288, 128)
+    assert row[:3] == (2, 288, 128)
     assert np.frombuffer(row[3])[0] == pytest.approx(1.2 * 288)
     match(tmp_path / "b.db", clip, options=ALL_TRACKS)
     for square, stored in zip(

@@ -109,7 +109,7 @@ def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str,
 
 
 def _camera_model(footage: Footage) -> str:
-    """COLMAP's name of the camera model that every front-end's images get."""
+    """COLMAP's name of the camera model of images whose focal length no front-end tells."""
     return str(make_camera(footage.camera, *footage.size, footage.pixel_aspect).model_name)
 
 

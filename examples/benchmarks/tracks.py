@@ -171,7 +171,8 @@ def main() -> int:
     )
     parser.add_argument(
         "--camera_model",
-        help="COLMAP's camera model where the intrinsics are unknown; without, that of match",
+        help="COLMAP's camera model where the intrinsics are unknown; without, SIMPLE_RADIAL, "
+        "and RADIAL where match tells the focal length",
     )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
     arguments = parser.parse_args()
