@@ -38,7 +38,8 @@ class _Limits:
 # max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
 # as errors grow from step to step.
 _PRESETS = {
-    "sparse": _Limits(1500, spacing=12.0, min_length=3, max_sigma=0.8, wide_tracks=300),
+    # Poses need views from far apart; points do not, and long tracks take a mapper's time.
+    "sparse": _Limits(1500, spacing=12.0, min_length=3, max_sigma=0.8, wide_tracks=1000),
     "default": _Limits(2500, spacing=9.0, min_length=3, max_sigma=0.8, wide_tracks=300),
     "dense": _Limits(0, spacing=0.0, min_length=1, max_sigma=0.0, wide_tracks=0),
 }

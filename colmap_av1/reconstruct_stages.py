@@ -41,8 +41,6 @@ _Image = NDArray[np.uint8]
 _LEAST_IMAGES = 3
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
-# Wide tracks that an image gives to the poses, fewer where it has fewer tracks in all.
-_WIDE_POSE_TRACKS = 1000
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
@@ -169,8 +167,6 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
         preset="sparse",
         max_tracks_per_image=options.mapping.pose_tracks_per_image,
         spacing=options.mapping.pose_spacing,
-        # What drifts still ties distant images together; poses bend without.
-        wide_tracks=_WIDE_POSE_TRACKS,
     )
 
     def make(partial: Path) -> dict[str, Any]:
