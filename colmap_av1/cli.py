@@ -17,7 +17,7 @@ from colmap_av1.check import check
 from colmap_av1.command_options import add_options, given, underscored
 from colmap_av1.densify import densify
 from colmap_av1.encode import encode
-from colmap_av1.errors import ColmapAv1Error, OptionError
+from colmap_av1.errors import ColmapAv1Error, EvaluationError, OptionError
 from colmap_av1.export import export_hloc
 from colmap_av1.info import inspect as inspect_stream
 from colmap_av1.match import match
@@ -526,6 +526,10 @@ def _run_compare(namespace: argparse.Namespace) -> None:
     for reason in sorted({column.training_error for column in result.columns} - {""}):
         print_warning(f"nothing is trained: {reason}")
     _print_result(namespace, compare_rows(result), result.warnings)
+    if all(column.model is None for column in result.columns):
+        raise EvaluationError(
+            f"{result.output}: no front-end gave a model: report.md there says why of each"
+        )
 
 
 def _run_encode(namespace: argparse.Namespace) -> None:

@@ -72,8 +72,10 @@ def compare(
 ) -> CompareReport:
     """Compare this package's matches with those of other front-ends on one video.
 
-    Every front-end gets the same images and camera and fills a database, each of these is
-    mapped by COLMAP's incremental mapper with the same settings, and the models are measured.
+    Every front-end gets the same images, and the same camera where its model or parameters are
+    given, and fills a database; each of these is mapped by COLMAP's incremental mapper with the
+    same settings, and the models are measured. Where no model is given, that is SIMPLE_RADIAL, and
+    RADIAL where this package's tracks tell the focal length.
     The folder gets `report.html`, `report.md` and `results.json`, and keeps what every stage
     made: another run does only what is missing or depends on what has changed. A front-end that
     fails leaves a line in its column; the others stand.

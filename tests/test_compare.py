@@ -64,6 +64,14 @@ def compared(video, truth, tmp_path_factory):
     return output
 
 
+def test_no_model_at_all_is_an_error(video, tmp_path, capsys):
+    words = ["--frontends", "broken=no.h5:none.h5", "--every", "6", "--quiet"]
+    output = tmp_path / "report"
+    assert main(["compare", "--video", str(video), "--output", str(output), *words]) == 2
+    assert "no front-end gave a model" in capsys.readouterr().err.splitlines()[-1]
+    assert "no.h5: no such file" in (output / "report.md").read_text()
+
+
 def run_again(video, output, truth, *frontends):
     names = frontends or ("av1", "sift-exhaustive", "broken=no.h5:none.h5")
     options = CompareOptions(match=OPTIONS, frontends=names)
