@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.model import ModelPoints
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.progress import Progress
-from colmap_av1.tracks import Tracks, keep_observations
+from colmap_av1.tracks import Tracks, keep_frames
 from colmap_av1.triangulate import Points, Sightings, Views, triangulate
 
 _Image = NDArray[np.uint8]
@@ -42,7 +42,7 @@ def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[
     """The tracks in some frames only, and the index into `frames` of each observation."""
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))
-    seen = keep_observations(tracks, place[tracks.frame] >= 0)
+    seen = keep_frames(tracks, frames)
     return seen, place[seen.frame]
 
 

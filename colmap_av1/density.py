@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks import Tracks, keep_observations
+from colmap_av1.tracks import Tracks, keep_observations, order_by_frame
 
 # Error in pixels that an observation has however sure its motion is; keeps one sure
 # observation from outweighing many good ones.
@@ -128,9 +128,7 @@ def _error_shares(
         return np.zeros(tracks.num_frames)
     shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE)
     usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * way)
-    # A type of two bytes is sorted by radix, in a quarter of the time.
-    frame_of = tracks.frame[usable].astype(np.min_scalar_type(tracks.num_frames))
-    usable = usable[np.argsort(frame_of, kind="stable")]
+    usable = usable[order_by_frame(tracks.frame[usable], tracks.num_frames)]
     bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))
     for frame, (start, stop) in enumerate(pairwise(bounds)):
         own = usable[start:stop]

@@ -26,7 +26,7 @@ from colmap_av1.image_matches import pair_images, shared_focal_length, verify_im
 from colmap_av1.images import write_images
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.progress import Clock, Progress, no_progress
-from colmap_av1.tracks import keep_observations
+from colmap_av1.tracks import keep_frames
 from colmap_av1.video_images import prepare_images
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -157,10 +157,9 @@ def match(
     notes, num_coded_frames = list(prepared.tracked.warnings), prepared.tracked.num_coded_frames
 
     with clock.measure("pairs"):
-        seen = np.isin(prepared.tracks.frame, chosen.frames)
-        tracks = select_tracks(keep_observations(prepared.tracks, seen), options.density)
+        tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
     # All tracks of a video are its largest arrays: they make room for the matches.
-    del prepared, seen
+    del prepared
     paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
     num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
     del tracks

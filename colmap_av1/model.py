@@ -66,6 +66,14 @@ class ModelPoints:
     xy: NDArray[np.float64]
 
 
+def no_points() -> ModelPoints:
+    """What a model of poses alone has."""
+    return ModelPoints(
+        *(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0)),
+        *(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 2))),
+    )
+
+
 def write_model(
     folder: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
 ) -> None:

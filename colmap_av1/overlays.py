@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.tracks import Tracks, keep_observations
+from colmap_av1.tracks import Tracks, keep_observations, order_by_frame
 
 # Pixels that nothing over the picture moves by: the finest step of a motion vector.
 _STILL = 0.125
@@ -48,9 +48,7 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     step /= np.diff(tracks.frame)[within[1:]]
     frame = tracks.frame[within]
     count = np.bincount(frame, minlength=tracks.num_frames)
-    # A type of two bytes is sorted by radix, in a quarter of the time.
-    order = np.argsort(frame.astype(np.min_scalar_type(tracks.num_frames)), kind="stable")
-    by_frame = np.split(step[order], np.cumsum(count)[:-1])
+    by_frame = np.split(step[order_by_frame(frame, tracks.num_frames)], np.cumsum(count)[:-1])
     motion = np.zeros(tracks.num_frames)
     for index in np.flatnonzero(count):
         middle = len(by_frame[index]) // 2

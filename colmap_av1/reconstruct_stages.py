@@ -30,7 +30,7 @@ from colmap_av1.model import ModelImage, read_model, write_model
 from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.stages import Kept, run_stage
-from colmap_av1.tracks import MIN_LENGTH, Tracks, keep_long_tracks, keep_observations
+from colmap_av1.tracks import MIN_LENGTH, Tracks, keep_frames, keep_long_tracks
 from colmap_av1.triangulate import Points
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
 from colmap_av1.video import read_display
@@ -171,8 +171,7 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("pairs"):
-            seen = np.isin(tracks.frame, chosen.frames)
-            sparse = select_tracks(keep_observations(tracks, seen), density)
+            sparse = select_tracks(keep_frames(tracks, chosen.frames), density)
         video = run.source.pictures
         paired = pair_images(video, sparse, chosen, options.match, clock=clock, progress=progress)
         size = (tracks.width, tracks.height)
@@ -312,18 +311,12 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
 
     def make(partial: Path) -> dict[str, Any]:
         placed = _read_placed(run, posed, chosen)
-        seen = keep_observations(tracks, np.isin(tracks.frame, placed.frames))
-        chosen_tracks = select_tracks(seen, _ADJUSTED)
+        spread = select_tracks(keep_frames(tracks, placed.frames), _ADJUSTED)
         with run.clock.measure("adjustment"):
-            seen, view = seen_in(chosen_tracks, placed.frames)
-            points = triangulate_tracks(
-                *(seen, view, [placed.camera] * len(placed.images)),
-                *([i.cam_from_world for i in placed.images], None),
-                options=_FOR_POSES,
-                num_threads=options.match.verify.num_threads,
-                progress=no_progress,
+            seen, view = seen_in(spread, placed.frames)
+            points = _triangulate(
+                *(run, placed, seen, view), pinhole=None, options=_FOR_POSES, progress=no_progress
             )
-            _check_any_point(points)
             folder = partial / "adjusted"
             folder.mkdir()
             black = np.zeros((len(points.xyz), 3), np.uint8)
@@ -387,19 +380,36 @@ def _read_placed(run: Run, posed: Kept, chosen: ChosenImages) -> _Placed:
     return _Placed(images, chosen.frames[index], camera)
 
 
-def _check_any_point(points: Points) -> None:
+def _triangulate(
+    run: Run,
+    placed: _Placed,
+    seen: Tracks,
+    view: NDArray[np.int64],
+    *,
+    pinhole: Any | None,
+    options: TriangulateOptions,
+    progress: Progress,
+) -> Points:
+    """Points of tracks in the images that have a pose, one at least; see `triangulate_tracks`."""
+    points = triangulate_tracks(
+        *(seen, view, [placed.camera] * len(placed.images)),
+        *([image.cam_from_world for image in placed.images], pinhole),
+        options=options,
+        num_threads=run.options.match.verify.num_threads,
+        progress=progress,
+    )
     if len(points.xyz) == 0:
         raise ModelError(
             f"none of the {points.num_tracks} tracks agrees with the poses: try the other "
             "--mapper, or give --camera_params"
         )
+    return points
 
 
 def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
     """Triangulate all tracks and write the images and the model that trainers open."""
     options, clock, progress = run.options, run.clock, run.progress
     source = run.source
-    num_threads = options.match.verify.num_threads
 
     def make(partial: Path) -> dict[str, Any]:
         placed = _read_placed(run, posed, chosen)
@@ -409,14 +419,12 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
         names = [image.name for image in images]
         seen, view = seen_in(tracks, frames)
         with clock.measure("points"):
-            points = triangulate_tracks(
-                *(seen, view, [distorted] * len(images)),
-                *([i.cam_from_world for i in images], camera),
+            points = _triangulate(
+                *(run, placed, seen, view),
+                pinhole=camera,
                 options=options.triangulate,
-                num_threads=num_threads,
                 progress=progress,
             )
-        _check_any_point(points)
         colours = Colours(seen, view, points, len(images))
         undistort = undistortion(distorted, camera)
         image_of_frame = {int(frame): i for i, frame in enumerate(frames)}
@@ -431,7 +439,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 partial / "images",
                 names,
                 frames.tolist(),
-                num_threads=num_threads,
+                num_threads=options.match.verify.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=change,
                 progress=lambda done: progress("images", done, len(names)),

@@ -194,10 +194,23 @@ def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
     )
 
 
+def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
+    """The tracks with the observations in these frames only, as `keep_observations`."""
+    wanted = np.zeros(tracks.num_frames, dtype=np.bool_)
+    wanted[frames] = True
+    return keep_observations(tracks, wanted[tracks.frame])
+
+
 def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
     """The tracks that are seen in `min_length` frames or more, in their former order."""
     lengths = np.diff(tracks.offsets)
     return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
+
+
+def order_by_frame(frame: NDArray[np.int32], num_frames: int) -> NDArray[np.int64]:
+    """Indices of observations by their frames, those of a frame in their former order."""
+    # A type of two bytes is sorted by radix, in a quarter of the time.
+    return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")
 
 
 def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:

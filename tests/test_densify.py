@@ -10,18 +10,9 @@ from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError
-from colmap_av1.model import ModelImage, ModelPoints, write_model
+from colmap_av1.model import ModelImage, no_points, write_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions
 from colmap_av1.video import decode_frames
-
-NO_POINTS = ModelPoints(
-    np.empty((0, 3)),
-    np.empty((0, 3), np.uint8),
-    np.empty(0),
-    np.zeros(1, np.int64),
-    np.empty(0, np.int64),
-    np.empty((0, 2)),
-)
 
 
 def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -> Path:
@@ -31,7 +22,7 @@ def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -
         ModelImage(100 - i, f"{frame:04d}.png", 7, truth.cam_from_world[frame * shuffle % 60])
         for i, frame in enumerate(frames)
     ]
-    write_model(folder, {7: truth.camera}, images, NO_POINTS)
+    write_model(folder, {7: truth.camera}, images, no_points())
     return folder
 
 
@@ -107,7 +98,7 @@ def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: P
     with pytest.raises(ModelError, match="holds no COLMAP model"):
         densify(tmp_path, SCENE, tmp_path / "dense")
     (tmp_path / "empty").mkdir()
-    write_model(tmp_path / "empty", {7: truth.camera}, [], NO_POINTS)
+    write_model(tmp_path / "empty", {7: truth.camera}, [], no_points())
     with pytest.raises(ModelError, match="no image of the model has a pose"):
         densify(tmp_path / "empty", SCENE, tmp_path / "dense")
     few = true_model(tmp_path / "few", truth, range(20))

@@ -13,7 +13,23 @@ from colmap_av1 import mapper as mapper_module
 from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.poses import model_poses, pose_errors
 from colmap_av1.model import read_model
+from colmap_av1.progress import Progress, no_progress
 from colmap_av1.reconstruct import ReconstructReport
+
+
+def run_mapper(folder: Path, database: Path, mapper: str, progress: Progress) -> None:
+    mapper_module.map_poses(
+        database,
+        folder / "poses",
+        mapper=mapper,
+        refine_intrinsics=True,
+        forward_motion=False,
+        seed=0,
+        num_threads=1,
+        log=folder / "log",
+        num_images=NUM_IMAGES,
+        progress=progress,
+    )
 
 
 def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> None:
@@ -24,36 +40,14 @@ def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> Non
     copy = tmp_path / "mapped.db"
     copy.write_bytes(made.database.read_bytes())
     with pytest.raises(KeyboardInterrupt):
-        mapper_module.map_poses(
-            copy,
-            tmp_path / "poses",
-            mapper="incremental",
-            refine_intrinsics=True,
-            forward_motion=False,
-            seed=0,
-            num_threads=1,
-            log=tmp_path / "log",
-            num_images=NUM_IMAGES,
-            progress=interrupt,
-        )
+        run_mapper(tmp_path, copy, "incremental", interrupt)
     assert not list((tmp_path / "poses").glob("*.bin"))
 
 
 def test_mapper_that_fails(tmp_path: Path) -> None:
     (tmp_path / "no.db").write_bytes(b"no database")
     with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log tells where"):
-        mapper_module.map_poses(
-            tmp_path / "no.db",
-            tmp_path / "poses",
-            mapper="global",
-            refine_intrinsics=True,
-            forward_motion=False,
-            seed=0,
-            num_threads=1,
-            log=tmp_path / "log",
-            num_images=3,
-            progress=lambda *_: None,
-        )
+        run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
     assert (tmp_path / "log").stat().st_size > 0
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from colmap_av1.database import make_camera
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import ImageError, VideoError
@@ -23,7 +21,7 @@ from colmap_av1.options import (
     PairOptions,
 )
 from colmap_av1.progress import Clock, Progress, no_progress
-from colmap_av1.tracks import keep_observations
+from colmap_av1.tracks import keep_frames
 from colmap_av1.video import picture_size, read_display
 from colmap_av1.video_images import PreparedImages, prepare_images
 
@@ -184,7 +182,7 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     if options.camera.camera_params is None:
         return False
     tracks, chosen = prepared.tracks, prepared.chosen
-    seen = keep_observations(tracks, np.isin(tracks.frame, chosen.frames))
+    seen = keep_frames(tracks, chosen.frames)
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
     try:
         paired = pair_images(

@@ -24,7 +24,7 @@ from tracks import load_render_scene
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
 from colmap_av1.evaluate.clouds import depth_differences, model_points
-from colmap_av1.model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
 
 EXAMPLES = Path(__file__).resolve().parents[1]
@@ -133,15 +133,7 @@ def true_model(scene: Any, folder: Path) -> Path:
         ModelImage(frame + 1, f"{frame:04d}.png", 1, pose)
         for frame, pose in enumerate(scene.cam_from_world)
     ]
-    nothing = ModelPoints(
-        np.empty((0, 3)),
-        np.empty((0, 3), np.uint8),
-        np.empty(0),
-        np.zeros(1, np.int64),
-        np.empty(0, np.int64),
-        np.empty((0, 2)),
-    )
-    write_model(folder, {1: camera}, images, nothing)
+    write_model(folder, {1: camera}, images, no_points())
     return folder
 
 
