@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,12 +21,13 @@ from colmap_av1.dense_points import (
 from colmap_av1.errors import ImageError, ModelError, OptionError
 from colmap_av1.files import remove_leftovers, whole_folder
 from colmap_av1.images import size_of_images
-from colmap_av1.model import ModelImage, read_model, write_model
+from colmap_av1.model import posed_images, read_model, write_model
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import DensifyOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import scale_tracks
 from colmap_av1.triangulate import check_triangulate_options
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import picture_size, read_display
 from colmap_av1.video_tracks import decoded_pictures, open_source, times_of_frames, track_video
 
@@ -84,7 +86,7 @@ def densify(
     Raises:
         ModelError: there is no readable model with poses, it is not of this video, or the
             dense one cannot be written.
-        VideoError: the video cannot be read.
+        VideoError: the video cannot be read, or changes meanwhile.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: the model's images do not say which frames they are.
         OptionError: an option has a value that cannot work, or the folder is not empty.
@@ -92,81 +94,55 @@ def densify(
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress
     model, video, output = Path(model), Path(video), Path(output)
-    clock = Clock()
-    video_size = picture_size(video)
-    check_options(options.match, video_size)
-    check_triangulate_options(options.triangulate)
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise OptionError(f"{output}: is there and not empty: give a new folder")
-    above = next(folder for folder in output.absolute().parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{output}: cannot be made in {above}: give another folder")
-    remove_leftovers(output.parent, output.name)
-    reconstruction = read_model(model)
-    by_name = {i.name: i for i in reconstruction.images.values() if i.has_pose}
-    cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in by_name.values()}
-    sizes = {
-        name: (int(cameras[i.camera_id].width), int(cameras[i.camera_id].height))
-        for name, i in by_name.items()
-    }
-    if len(sizes) < 2:
-        raise ModelError(f"{model}: only one image has a pose: points need two or more")
-    try:
-        size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
-    except ImageError as error:
-        raise ImageError(f"{model}: {error}") from error
     folder = Path(image_path) if image_path is not None else None
-    missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
-    if missing is not None:
-        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
-
-    source = open_source(video, options.match, clock=clock, progress=progress)
-    matching = chaining_for_points(options.match, options.triangulate)
-    tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
-    with clock.measure("choice"):
-        chosen = choose_images(
-            tracked.tracks,
-            options.match.images,
-            existing=list(by_name),
-            folder=folder,
-            times=lambda: times_of_frames(source, tracked.tracks.num_frames),
-            decode=lambda: decoded_pictures(source, options.match),
-        )
-    tracks = scale_tracks(tracked.tracks, size)
-    images = [
-        ModelImage(
-            int(by_name[name].image_id),
-            name,
-            int(by_name[name].camera_id),
-            np.asarray(by_name[name].cam_from_world().matrix()),
-        )
-        for name in chosen.names
-    ]
-    seen, view = seen_in(tracks, chosen.frames)
-    with clock.measure("points"):
-        points = triangulate_tracks(
-            *(seen, view, [cameras[i.camera_id] for i in images]),
-            *([i.cam_from_world for i in images], None),
-            options=options.triangulate,
-            num_threads=options.match.verify.num_threads,
-            progress=progress,
-        )
-    agreeing = points.num_agreeing / max(points.num_tracks, 1)
-    if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
-        raise ModelError(
-            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses and "
-            f"{len(points.xyz)} give a point: give the video that the model's images come from, "
-            "and see that their names count its frames (--first_number, --frame_list)"
-        )
-    with clock.measure("colours"):
-        colours = Colours(seen, view, points, len(images))
-        image_of_frame = {int(frame): i for i, frame in enumerate(chosen.frames)}
-        for frame, picture in decoded_pictures(source, options.match):
-            progress("colours", frame + 1, tracks.num_frames)
-            if frame in image_of_frame:
-                colours.add(image_of_frame[frame], picture)
-            if frame >= chosen.frames[-1]:
-                break
+    clock = Clock()
+    _check_output(output)
+    reconstruction = read_model(model)
+    posed = posed_images(reconstruction)
+    cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
+    camera_of_name = {name: cameras[image.camera_id] for name, image in posed.items()}
+    sizes = {name: (int(c.width), int(c.height)) for name, c in camera_of_name.items()}
+    with unchanged(video):
+        size = _check_input(model, video, folder, sizes, options)
+        source = open_source(video, options.match, clock=clock, progress=progress)
+        with unchanged(source.stream):
+            matching = chaining_for_points(options.match, options.triangulate)
+            tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
+            with clock.measure("choice"):
+                chosen = choose_images(
+                    tracked.tracks,
+                    options.match.images,
+                    existing=list(posed),
+                    folder=folder,
+                    times=lambda: times_of_frames(source, tracked.tracks.num_frames),
+                    decode=lambda: decoded_pictures(source, options.match),
+                )
+        images = [posed[name] for name in chosen.names]
+        seen, view = seen_in(scale_tracks(tracked.tracks, size), chosen.frames)
+        with clock.measure("points"):
+            points = triangulate_tracks(
+                *(seen, view, [cameras[i.camera_id] for i in images]),
+                *([i.cam_from_world for i in images], None),
+                options=options.triangulate,
+                num_threads=options.match.verify.num_threads,
+                progress=progress,
+            )
+        agreeing = points.num_agreeing / max(points.num_tracks, 1)
+        if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
+            raise ModelError(
+                f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses "
+                f"and {len(points.xyz)} give a point: give the video that the model's images come "
+                "from, and see that their names count its frames (--first_number, --frame_list)"
+            )
+        with clock.measure("colours"):
+            colours = Colours(seen, view, points, len(images))
+            image_of_frame = {int(frame): i for i, frame in enumerate(chosen.frames)}
+            for frame, picture in decoded_pictures(source, options.match):
+                progress("colours", frame + 1, seen.num_frames)
+                if frame in image_of_frame:
+                    colours.add(image_of_frame[frame], picture)
+                if frame >= chosen.frames[-1]:
+                    break
     with clock.measure("writing"):
         xy = seen.xy[points.observation].astype(np.float64)
         dense = model_points(points, colours.mean(), view, xy)
@@ -187,3 +163,36 @@ def densify(
         seconds=clock.seconds,
         warnings=tracked.warnings,
     )
+
+
+def _check_output(output: Path) -> None:
+    """Refuse a folder that cannot be made, or is no new one."""
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise OptionError(f"{output}: is there and not empty: give a new folder")
+    above = next(folder for folder in output.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise OptionError(f"{output}: cannot be made in {above}: give another folder")
+    remove_leftovers(output.parent, output.name)
+
+
+def _check_input(
+    model: Path,
+    video: Path,
+    folder: Path | None,
+    sizes: Mapping[str, tuple[int, int]],
+    options: DensifyOptions,
+) -> tuple[int, int]:
+    """Refuse what does not fit before the long work; (width, height) of the model's images."""
+    video_size = picture_size(video)
+    check_options(options.match, video_size)
+    check_triangulate_options(options.triangulate)
+    if len(sizes) < 2:
+        raise ModelError(f"{model}: only one image has a pose: points need two or more")
+    try:
+        size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
+    except ImageError as error:
+        raise ImageError(f"{model}: {error}") from error
+    missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
+    if missing is not None:
+        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
+    return size

@@ -23,6 +23,7 @@ from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.options import EncodeOptions
 from colmap_av1.processes import bound
 from colmap_av1.progress import Progress, no_progress
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import VideoFacts, count_frames, open_stream, video_facts
 
 # Whether an encoder works is found out by encoding so many frames.
@@ -219,7 +220,7 @@ def encode(
         return count
 
     try:
-        with whole_file(output) as partial:
+        with whole_file(output) as partial, unchanged(video):
             count = convert(partial)
             readable = _readable_frames(video, facts, count, strict)
             if readable < count:

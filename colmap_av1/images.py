@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.display import Display
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError, OptionError, VideoError
 from colmap_av1.files import remove_leftovers, whole_file
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import decode_frames
 
 _WRITE_PARAMETERS = {
@@ -252,6 +254,8 @@ def write_images(
         ImageError: an image cannot be written, the frames change their size, or the decoder
             gives fewer frames than asked for.
         BitstreamError: the stream cannot be decoded up to the last frame asked for.
+        VideoError: the video cannot be read, or changes meanwhile; then what was written of it
+            is removed.
     """
     root = Path(folder)
     wanted = {
@@ -260,9 +264,12 @@ def write_images(
         if not image_file(root, name).exists()
     }
     num_kept = len(names) - len(wanted)
-    done = num_kept
-    if progress is not None:
-        progress(done)
+
+    def report(num_written: int) -> None:
+        if progress is not None:
+            progress(num_kept + num_written)
+
+    report(0)
     if not wanted:
         return 0
     for parent in {path.parent for path in wanted.values()}:
@@ -271,47 +278,61 @@ def write_images(
         except OSError as error:
             raise ImageError(f"{parent}: cannot be made: {error.strerror}") from error
         remove_leftovers(parent)
+    try:
+        with unchanged(Path(video)):
+            decoded = decode_frames(
+                video, operating_point=operating_point, num_threads=num_threads, display=display
+            )
+            with contextlib.closing(decoded):
+                _write_frames(decoded, wanted, change, num_threads or os.cpu_count() or 1, report)
+    except VideoError:  # images of two videos would be kept as those of one
+        for path in wanted.values():
+            path.unlink(missing_ok=True)
+        raise
+    return len(wanted)
 
-    last = max(wanted)
+
+def _write_frames(
+    decoded: Iterator[tuple[int, NDArray[np.uint8]]],
+    wanted: Mapping[int, Path],
+    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None,
+    num_threads: int,
+    report: Callable[[int], None],
+) -> None:
+    """Write the wanted ones of the frames, on threads; `report` is told how many are written."""
     size: tuple[int, ...] | None = None
-    workers = num_threads or os.cpu_count() or 1
     queue: list[Future[None]] = []
-    decoded = decode_frames(
-        video, operating_point=operating_point, num_threads=num_threads, display=display
-    )
+    num_taken = 0
+    last = max(wanted)
     # OpenCV releases the interpreter lock while it compresses.
-    with ThreadPoolExecutor(max_workers=workers) as executor:
+    with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
             for index, picture in decoded:
-                image = picture
-                size = size or image.shape
-                if image.shape != size:
+                size = size or picture.shape
+                if picture.shape != size:
                     raise ImageError(
-                        f"frame {index} is {image.shape[1]}x{image.shape[0]}, those before "
+                        f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, those before "
                         f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
                         "re-encode the video at one size"
                     )
                 if index in wanted:
-                    image = change(index, image) if change is not None else image
-                    queue.append(executor.submit(_write_image, wanted.pop(index), image))
-                while len(queue) > (workers * _QUEUE_PER_THREAD if index < last else 0):
+                    image = change(index, picture) if change is not None else picture
+                    queue.append(executor.submit(_write_image, wanted[index], image))
+                    num_taken += 1
+                while len(queue) > (num_threads * _QUEUE_PER_THREAD if index < last else 0):
                     queue.pop(0).result()
-                    done += 1
-                    if progress is not None:
-                        progress(done)
+                    report(num_taken - len(queue))
                 if index >= last:
                     break
             for future in queue:  # left where the decoder ends early
                 future.result()
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
-            decoded.close()
-    if wanted:
+    if num_taken < len(wanted):
         raise ImageError(
-            f"the decoder gives no frame {min(wanted)} of the {last + 1} that the stream shows: "
-            "leave out the images, or re-encode the video"
+            f"the decoder gives no frame {sorted(wanted)[num_taken]} of the {last + 1} that the "
+            "stream shows: leave out the images, or re-encode the video"
         )
-    return len(names) - num_kept
 
 
 def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) -> int:

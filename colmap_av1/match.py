@@ -27,6 +27,7 @@ from colmap_av1.images import write_images
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import keep_frames
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video_images import prepare_images
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -134,7 +135,7 @@ def match(
         progress: called with a stage's name, what is done, and of how much where known.
 
     Raises:
-        VideoError: the video cannot be read, or has no motion to match.
+        VideoError: the video cannot be read, changes meanwhile, or has no motion to match.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images or names do not fit the video.
         DatabaseError: the database is locked, no COLMAP database, has features of its
@@ -149,44 +150,46 @@ def match(
 
     listed = _read_listed_images(database, options)
     existing = {image.name: (image.width, image.height) for image in listed}
-    prepared = prepare_images(
-        video, folder, options, listed=existing, clock=clock, progress=progress
-    )
-    source, display, chosen = prepared.source, prepared.display, prepared.chosen
-    size, pixel_aspect = prepared.size, prepared.pixel_aspect
-    notes, num_coded_frames = list(prepared.tracked.warnings), prepared.tracked.num_coded_frames
+    with unchanged(video) as check_video:
+        prepared = prepare_images(
+            video, folder, options, listed=existing, clock=clock, progress=progress
+        )
+        source, display, chosen = prepared.source, prepared.display, prepared.chosen
+        size, pixel_aspect = prepared.size, prepared.pixel_aspect
+        notes, num_coded_frames = list(prepared.tracked.warnings), prepared.tracked.num_coded_frames
 
-    with clock.measure("pairs"):
-        tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
-    # All tracks of a video are its largest arrays: they make room for the matches.
-    del prepared
-    paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
-    num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
-    del tracks
-    focal_length = None
-    if not listed:
-        focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
-    cameras, new_cameras = _cameras(
-        *(database, listed, chosen.names, size, options.camera),
-        pixel_aspect=pixel_aspect,
-        focal_length=focal_length,
-    )
-    notes += _camera_notes(cameras, listed, pixel_aspect)
-    matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
+        with clock.measure("pairs"):
+            tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
+        # All tracks of a video are its largest arrays: they make room for the matches.
+        del prepared
+        paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
+        num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
+        del tracks
+        focal_length = None
+        if not listed:
+            focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
+        cameras, new_cameras = _cameras(
+            *(database, listed, chosen.names, size, options.camera),
+            pixel_aspect=pixel_aspect,
+            focal_length=focal_length,
+        )
+        notes += _camera_notes(cameras, listed, pixel_aspect)
+        matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
 
-    num_written = 0
-    if folder is not None:
-        with clock.measure("images"):
-            num_written = write_images(
-                source.pictures,
-                folder,
-                chosen.names,
-                chosen.frames.tolist(),
-                num_threads=options.verify.num_threads,
-                operating_point=options.read.operating_point,
-                display=display,
-                progress=lambda done: progress("images", done, len(chosen.names)),
-            )
+        num_written = 0
+        if folder is not None:
+            check_video()
+            with clock.measure("images"):
+                num_written = write_images(
+                    source.pictures,
+                    folder,
+                    chosen.names,
+                    chosen.frames.tolist(),
+                    num_threads=options.verify.num_threads,
+                    operating_point=options.read.operating_point,
+                    display=display,
+                    progress=lambda done: progress("images", done, len(chosen.names)),
+                )
 
     with clock.measure("database"):
         write_matches(

@@ -74,6 +74,20 @@ def no_points() -> ModelPoints:
     )
 
 
+def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
+    """The images of a pycolmap.Reconstruction that have a pose, by name."""
+    return {
+        image.name: ModelImage(
+            int(image.image_id),
+            image.name,
+            int(image.camera_id),
+            np.asarray(image.cam_from_world().matrix()),
+        )
+        for image in reconstruction.images.values()
+        if image.has_pose
+    }
+
+
 def write_model(
     folder: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
 ) -> None:

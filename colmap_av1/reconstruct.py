@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from colmap_av1.dense_points import LEAST_AGREEING
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.files import whole_file
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import MapperOptions, ReconstructOptions
@@ -18,7 +18,6 @@ from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.reconstruct_stages import (
     Run,
     adjustment_stage,
-    files_of,
     match_stage,
     model_stage,
     pose_stage,
@@ -28,6 +27,7 @@ from colmap_av1.reconstruct_stages import (
 )
 from colmap_av1.stages import open_stages
 from colmap_av1.triangulate import check_triangulate_options
+from colmap_av1.unchanged import check_unchanged, file_states
 from colmap_av1.video import picture_size
 from colmap_av1.video_tracks import open_source
 
@@ -116,9 +116,12 @@ def reconstruct(
     _check_reconstruct_options(options)
     with open_stages(output, "reconstruct") as stages:
         source = open_source(video, options.match, clock=clock, progress=progress)
-        report = _run_stages(
-            Run(source, files_of(source), output, stages, options, clock, progress)
-        )
+        files = file_states(source.stream, source.pictures)
+        try:
+            report = _run_stages(Run(source, files, output, stages, options, clock, progress))
+        except ColmapAv1Error:  # which may come of a change
+            check_unchanged(files)
+            raise
         _write_report(report)
     return report
 

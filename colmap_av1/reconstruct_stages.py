@@ -22,16 +22,17 @@ from colmap_av1.dense_points import (
     triangulate_tracks,
 )
 from colmap_av1.density import select_tracks
-from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
+from colmap_av1.errors import ImageError, ModelError, OptionError
 from colmap_av1.image_matches import MatchedImages, pair_images, shared_focal_length, verify_images
 from colmap_av1.images import write_images
 from colmap_av1.mapper import adjust_model, map_poses
-from colmap_av1.model import ModelImage, read_model, write_model
+from colmap_av1.model import ModelImage, posed_images, read_model, write_model
 from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.stages import Kept, run_stage
 from colmap_av1.tracks import MIN_LENGTH, Tracks, keep_frames, keep_long_tracks
 from colmap_av1.triangulate import Points
+from colmap_av1.unchanged import FileState, check_unchanged, file_states
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
 from colmap_av1.video import read_display
 from colmap_av1.video_tracks import VideoSource, decoded_pictures, times_of_frames, track_video
@@ -56,7 +57,7 @@ class Run:
 
     Attributes:
         source: the video.
-        files: what tells its files from such as take their place.
+        files: its files as they were at the start.
         output: the folder that is made.
         stages: the folder in it that holds what later runs go on from.
         options: options of every stage.
@@ -65,7 +66,7 @@ class Run:
     """
 
     source: VideoSource
-    files: list[tuple[str, int, int]]
+    files: dict[Path, FileState]
     output: Path
     stages: Path
     options: ReconstructOptions
@@ -101,7 +102,7 @@ def track_stage(run: Run) -> Kept:
         with (partial / "tracks.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
             np.savez(file, **vars(tracks), names=np.array(chosen.names), frames=chosen.frames)
-        _check_unchanged(run)
+        check_unchanged(run.files)
         return {
             "num_frames": tracks.num_frames,
             "num_images": len(chosen.names),
@@ -111,38 +112,15 @@ def track_stage(run: Run) -> Kept:
 
     given = (options.images, options.read, options.tracks, options.refine, options.encode)
     frame_list = options.images.frame_list
-    listed = _identity(Path(frame_list)) if frame_list is not None else None
+    listed = list(file_states(Path(frame_list)).values()) if frame_list is not None else None
     return run_stage(
         run.stages,
         "tracks",
-        [*run.files, given, listed],
+        [*run.files.values(), given, listed],
         into=run.stages,
         products=["tracks.npz"],
         make=make,
     )
-
-
-def files_of(source: VideoSource) -> list[tuple[str, int, int]]:
-    """What tells a video's files from such as take their place."""
-    return [_identity(path) for path in (source.stream, source.pictures)]
-
-
-def _check_unchanged(run: Run) -> None:
-    try:
-        same = files_of(run.source) == run.files
-    except OSError:
-        same = False
-    if not same:
-        raise VideoError(
-            f"{run.source.pictures}: changed or went while it was read: let it be, and run the "
-            "same command again"
-        )
-
-
-def _identity(path: Path) -> tuple[str, int, int]:
-    """What tells a file apart from one that takes its place."""
-    status = path.stat()
-    return str(path.resolve()), status.st_size, status.st_mtime_ns
 
 
 def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages]:
@@ -364,19 +342,11 @@ class _Placed:
 
 def _read_placed(run: Run, posed: Kept, chosen: ChosenImages) -> _Placed:
     poses = read_model(run.stages / posed.facts["poses"])
-    by_name = {i.name: i for i in poses.images.values() if i.has_pose}
-    index = [i for i, name in enumerate(chosen.names) if name in by_name]
-    names = [chosen.names[i] for i in index]
-    camera = poses.cameras[by_name[names[0]].camera_id]
-    images = [
-        ModelImage(
-            i + 1,
-            name,
-            int(camera.camera_id),
-            np.asarray(by_name[name].cam_from_world().matrix()),
-        )
-        for i, name in enumerate(names)
-    ]
+    posed_by_name = posed_images(poses)
+    index = [i for i, name in enumerate(chosen.names) if name in posed_by_name]
+    found = [posed_by_name[chosen.names[i]] for i in index]
+    camera = poses.cameras[found[0].camera_id]
+    images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
     return _Placed(images, chosen.frames[index], camera)
 
 
@@ -444,7 +414,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 change=change,
                 progress=lambda done: progress("images", done, len(names)),
             )
-        _check_unchanged(run)
+        check_unchanged(run.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)

@@ -25,6 +25,7 @@ from colmap_av1.option_checks import check_options
 from colmap_av1.options import MatchOptions
 from colmap_av1.progress import Clock, Progress
 from colmap_av1.tracks import Tracks, scale_tracks, show_tracks
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import decode_frames, picture_size, read_display
 from colmap_av1.video_tracks import (
     TrackedVideo,
@@ -104,34 +105,35 @@ def prepare_images(
             check_images_there(folder, list(existing))
 
     source = open_source(video, options, clock=clock, progress=progress)
-    tracked = track_video(
-        source, options, one_size=folder is not None, clock=clock, progress=progress
-    )
-    tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
-    if (tracks.width, tracks.height) != video_size:
-        if source.stream != source.pictures:
-            raise VideoError(
-                f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
-                f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
-            )
-        video_size = (tracks.width, tracks.height)
-        size = size_of_images(existing, video_size, display.pixel_aspect)
-
-    def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
-        for index, picture in pictures:
-            progress("looking", index + 1, tracks.num_frames)
-            yield index, picture
-
-    with clock.measure("choice"):
-        chosen = choose_images(
-            tracks,
-            options.images,
-            existing=list(existing),
-            folder=folder,
-            times=lambda: times_of_frames(source, tracks.num_frames),
-            decode=decode,
+    with unchanged(source.stream):
+        tracked = track_video(
+            source, options, one_size=folder is not None, clock=clock, progress=progress
         )
+        tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
+        if (tracks.width, tracks.height) != video_size:
+            if source.stream != source.pictures:
+                raise VideoError(
+                    f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+                    f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
+                )
+            video_size = (tracks.width, tracks.height)
+            size = size_of_images(existing, video_size, display.pixel_aspect)
+
+        def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+            pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
+            for index, picture in pictures:
+                progress("looking", index + 1, tracks.num_frames)
+                yield index, picture
+
+        with clock.measure("choice"):
+            chosen = choose_images(
+                tracks,
+                options.images,
+                existing=list(existing),
+                folder=folder,
+                times=lambda: times_of_frames(source, tracks.num_frames),
+                decode=decode,
+            )
     if folder is not None:
         check_image_folder(folder, chosen.names, size)
         kept = zip(chosen.names, chosen.frames.tolist(), strict=True)

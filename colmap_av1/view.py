@@ -32,6 +32,7 @@ from colmap_av1.motion import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.progress import Progress, no_progress
 from colmap_av1.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import decode_frames, open_stream, presented_frames, read_display
 
 _Image = NDArray[np.uint8]
@@ -90,34 +91,37 @@ def view_video(
 
     Raises:
         OptionError: an option has a value that cannot work, or the output cannot be written.
-        VideoError: the file cannot be read as a video, or is not AV1.
+        VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
         BitstreamError: the stream is damaged before its second frame, or with strict.
     """
     options = options if options is not None else ViewOptions()
     _check_view_options(options)
     report = progress if progress is not None else no_progress
-    path = Path(output)
-    with open_stream(video) as stream:
-        num_packets = stream.num_frames
-        frame_rate = stream.frame_rate or _DEFAULT_FRAME_RATE
-    if path.suffix and path.suffix.lower() != ".mp4" and not path.is_dir():
-        raise OptionError(f"{path}: give an output that ends in .mp4, or a folder for PNG files")
-    chained = build_tracks(
-        read_motion(video, read), tracks, lambda done: report("tracks", done, num_packets)
-    )
-    chained = show_tracks(chained, read_display(video), presented_frames(video))
-    drawing = _prepare(chained, options)
-    draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
-    operating_point = read.operating_point if read is not None else 0
+    path, operating_point = Path(output), read.operating_point if read is not None else 0
     count = 0
-    with _open_pictures(path, frame_rate) as write:
-        for index, picture in decode_frames(video, operating_point=operating_point):
-            if index >= chained.num_frames:
-                break
-            panels = [panel(picture, drawing, index) for panel in draw]
-            write(_side_by_side(panels))
-            count += 1
-            report("pictures", count, chained.num_frames)
+    with unchanged(Path(video)) as check_video:
+        with open_stream(video) as stream:
+            num_packets = stream.num_frames
+            frame_rate = stream.frame_rate or _DEFAULT_FRAME_RATE
+        if path.suffix and path.suffix.lower() != ".mp4" and not path.is_dir():
+            raise OptionError(
+                f"{path}: give an output that ends in .mp4, or a folder for PNG files"
+            )
+        chained = build_tracks(
+            read_motion(video, read), tracks, lambda done: report("tracks", done, num_packets)
+        )
+        chained = show_tracks(chained, read_display(video), presented_frames(video))
+        drawing = _prepare(chained, options)
+        draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
+        check_video()
+        with _open_pictures(path, frame_rate) as write:
+            for index, picture in decode_frames(video, operating_point=operating_point):
+                if index >= chained.num_frames:
+                    break
+                write(_side_by_side([panel(picture, drawing, index) for panel in draw]))
+                count += 1
+                report("pictures", count, chained.num_frames)
+            check_video()
     return count
 
 

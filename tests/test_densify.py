@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import render_scene
 from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
-from colmap_av1.errors import ImageError, ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.model import ModelImage, no_points, write_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions
 from colmap_av1.video import decode_frames
@@ -86,6 +87,36 @@ def test_points_lie_on_the_surfaces(truth: Truth, tmp_path: Path) -> None:
         assert np.median(error) < 0.003
         assert np.quantile(error, 0.9) < 0.02
         assert np.mean(error > 0.05) < 0.035
+
+
+def model_of_clip(folder: Path) -> Path:
+    """The clip's layers move by 2 and 4 px a frame, as at distances of 100 and 50 steps."""
+    folder.mkdir()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=192, height=128, params=[200, 200, 96, 64]
+    )
+    images = [
+        ModelImage(i + 1, f"{i}.png", 1, np.column_stack([np.eye(3), [-i, 0, 0]]))
+        for i in range(16)
+    ]
+    write_model(folder, {1: camera}, images, no_points())
+    return folder
+
+
+@pytest.mark.parametrize("when", ["motion", "colours"])
+def test_video_that_changes(clip: Path, tmp_path: Path, when: str) -> None:
+    model = model_of_clip(tmp_path / "model")
+    video = tmp_path / "v.mp4"
+    shutil.copyfile(clip, video)
+
+    def change(stage: str, done: int, total: int | None) -> None:
+        if stage == when and done == 9:
+            video.touch()
+
+    with pytest.raises(VideoError, match=r"v\.mp4: changed or went while it was read: let it be"):
+        densify(model, video, tmp_path / "dense", progress=change)
+    assert {p.name for p in tmp_path.iterdir()} == {"model", "v.mp4"}
+    assert densify(model, video, tmp_path / "dense").num_points > 500
 
 
 def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: Path) -> None:

@@ -234,6 +234,21 @@ def test_frames_are_counted_where_the_container_does_not(
     assert done[-1] == ("encoding", 12, 12)
 
 
+def test_video_that_changes(phone: Path, tmp_path: Path) -> None:
+    """As one does that is still copied from the phone."""
+    video = tmp_path / "v.mov"
+    shutil.copyfile(phone, video)
+
+    def write_on(stage: str, done: int, total: int | None) -> None:
+        if done == 0:
+            with video.open("ab") as file:
+                file.write(b"more")
+
+    with pytest.raises(VideoError, match="changed or went while it was read"):
+        encode_video(video, tmp_path / "s.mp4", progress=write_on)
+    assert list(tmp_path.iterdir()) == [video]
+
+
 def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
     video = tmp_path / "video.h264"
     video.write_bytes(

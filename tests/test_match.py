@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import shutil
 import sqlite3
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -316,6 +318,31 @@ def test_images_that_do_not_fit_the_video(clip: Path, tmp_path: Path) -> None:
     assert database.read_bytes() == before
     options = MatchOptions(images=ImageOptions(first_number=0))
     assert match(database, clip, options=options).num_images == 10
+
+
+def cut_short(video: Path) -> None:
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("when", "change"),
+    [("motion", cut_short), ("verification", Path.unlink), ("images", Path.touch)],
+)
+def test_video_that_changes(
+    clip: Path, tmp_path: Path, when: str, change: Callable[[Path], None]
+) -> None:
+    """No database, and no image of a video that is another now."""
+    video = tmp_path / "v.mp4"
+    shutil.copyfile(clip, video)
+
+    def progress(stage: str, done: int, total: int | None) -> None:
+        if stage == when and done == 3:
+            change(video)
+
+    with pytest.raises(VideoError, match=r"v\.mp4: changed or went while it was read: let it be"):
+        match(tmp_path / "a.db", video, image_path=tmp_path / "frames", progress=progress)
+    video.unlink(missing_ok=True)
+    assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
 
 
 def test_interrupt_leaves_the_database(clip: Path, tmp_path: Path) -> None:

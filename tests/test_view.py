@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import urllib.request
 from pathlib import Path
@@ -13,7 +14,7 @@ from conftest import Encode
 
 from colmap_av1 import view
 from colmap_av1.cli import main
-from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, VideoError
 from colmap_av1.match import match
 from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
 
@@ -74,6 +75,20 @@ def test_mp4_shows_both_and_is_the_same_each_time(panning: Path, tmp_path: Path)
         pictures = list(container.decode(video=0))
         assert float(container.streams.video[0].average_rate or 0) == 25
     assert [(p.width, p.height) for p in pictures] == [(512, 320)] * 10
+
+
+@pytest.mark.parametrize("when", ["tracks", "pictures"])
+def test_video_that_changes(panning: Path, tmp_path: Path, when: str) -> None:
+    video = tmp_path / "v.mp4"
+    shutil.copyfile(panning, video)
+
+    def change(stage: str, done: int, total: int | None) -> None:
+        if stage == when and done == 4:
+            video.touch()
+
+    with pytest.raises(VideoError, match="changed or went while it was read"):
+        view.view_video(video, tmp_path / "drawn.mp4", progress=change)
+    assert list(tmp_path.iterdir()) == [video]
 
 
 def test_odd_sizes_are_padded(encode: Encode, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import keep_frames
+from colmap_av1.unchanged import unchanged
 from colmap_av1.video import picture_size, read_display
 from colmap_av1.video_images import PreparedImages, prepare_images
 
@@ -119,18 +120,22 @@ def choose_footage(
     def work() -> dict[str, Any]:
         clock = Clock()
         existed = bool(existing_images(images, options.images.image_name))
-        prepared = prepare_images(video, images, options, listed={}, clock=clock, progress=progress)
-        chosen = prepared.chosen
-        write_images(
-            prepared.source.pictures,
-            images,
-            chosen.names,
-            chosen.frames.tolist(),
-            num_threads=options.verify.num_threads,
-            operating_point=options.read.operating_point,
-            display=prepared.display,
-            progress=lambda done: progress("images", done, len(chosen.names)),
-        )
+        with unchanged(video) as check_video:
+            prepared = prepare_images(
+                video, images, options, listed={}, clock=clock, progress=progress
+            )
+            chosen = prepared.chosen
+            check_video()
+            write_images(
+                prepared.source.pictures,
+                images,
+                chosen.names,
+                chosen.frames.tolist(),
+                num_threads=options.verify.num_threads,
+                operating_point=options.read.operating_point,
+                display=prepared.display,
+                progress=lambda done: progress("images", done, len(chosen.names)),
+            )
         return {
             "names": chosen.names,
             "frames": chosen.frames.tolist(),

@@ -22,7 +22,7 @@ from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.evaluate.splatting import Milestone, split_images, train_gaussians
-from colmap_av1.model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.model import ModelPoints, posed_images, read_model, write_model
 
 GSPLAT = "gsplat"
 _PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
@@ -105,7 +105,7 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
         EvaluationError: the images cannot be undistorted; there are fewer than two.
     """
     split = Split(folder / "data", folder / "train", folder / "test")
-    registered = sorted(image.name for image in read_model(model).images.values() if image.has_pose)
+    registered = sorted(posed_images(read_model(model)))
     if len(registered) < 2:
         raise EvaluationError(f"{model}: a single image cannot be parted for training and test")
 
@@ -265,14 +265,10 @@ def _link(source: Path, target: Path) -> None:
 def _write_part(model: Path, output: Path, names: Collection[str]) -> None:
     """Write a model with some of its images and all its points."""
     whole = read_model(model)
-    images = sorted(
-        (i for i in whole.images.values() if i.has_pose and i.name in names), key=lambda i: i.name
-    )
-    index = {int(image.image_id): k for k, image in enumerate(images)}
-    xy = {
-        int(image.image_id): np.array([p.xy for p in image.points2D], dtype=np.float64)
-        for image in images
-    }
+    posed = posed_images(whole)
+    images = [posed[name] for name in sorted(posed) if name in names]
+    index = {image.image_id: k for k, image in enumerate(images)}
+    xy = {i: np.array([p.xy for p in whole.images[i].points2D], dtype=np.float64) for i in index}
     points = [whole.points3D[i] for i in sorted(whole.points3D)]
     seen: list[tuple[int, NDArray[np.float64]]] = []
     counts = np.zeros(len(points) + 1, dtype=np.int64)
@@ -282,13 +278,8 @@ def _write_part(model: Path, output: Path, names: Collection[str]) -> None:
         counts[k + 1] = len(own)
     write_model(
         output,
-        {int(i.camera_id): whole.cameras[i.camera_id] for i in images},
-        [
-            ModelImage(
-                int(i.image_id), i.name, int(i.camera_id), np.asarray(i.cam_from_world().matrix())
-            )
-            for i in images
-        ],
+        {image.camera_id: whole.cameras[image.camera_id] for image in images},
+        images,
         ModelPoints(
             xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
             rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
