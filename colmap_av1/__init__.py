@@ -1,5 +1,6 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
+from colmap_av1 import ending  # noqa: F401 - first, so that the program ends quietly from here on
 from colmap_av1.check import CheckReport, check
 from colmap_av1.densify import DensifyReport, densify
 from colmap_av1.encode import EncodeReport, encode

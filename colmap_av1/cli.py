@@ -5,18 +5,16 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import os
-import signal
 import sys
 import threading
-import types
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from colmap_av1.check import check
 from colmap_av1.command_options import add_options, given, underscored
 from colmap_av1.densify import densify
 from colmap_av1.encode import encode
+from colmap_av1.ending import ending_in_order
 from colmap_av1.errors import ColmapAv1Error, EvaluationError, OptionError
 from colmap_av1.export import export_hloc
 from colmap_av1.info import inspect as inspect_stream
@@ -91,53 +89,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: the process is told to end.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    parser = _make_parser()
-    with warnings_as_lines(), _ending_in_order():
-        try:
+    try:
+        with warnings_as_lines(), ending_in_order():
+            words = sys.argv[1:] if arguments is None else arguments
             # argparse exits by itself, with status 2 and one line, on words it does not know.
-            namespace = parser.parse_args([underscored(word) for word in words])
+            namespace = _make_parser().parse_args([underscored(word) for word in words])
             status: int | None = namespace.run(namespace)
             sys.stdout.flush()
-        except ColmapAv1Error as error:
-            print(f"{PROGRAM}: error: {error}", file=sys.stderr)
-            return _BAD_INPUT
-        except BrokenPipeError:  # as before `head`, which has read enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _BROKEN_PIPE
-        except OSError as error:
-            if error.filename is None:
-                raise
-            what = f"{os.fsdecode(error.filename)}: {error.strerror}"
-            print(f"{PROGRAM}: error: {what}: mend that, or give another path", file=sys.stderr)
-            return _BAD_INPUT
-        except KeyboardInterrupt:
-            print(f"{PROGRAM}: interrupted", file=sys.stderr)
-            return _INTERRUPTED
+    except ColmapAv1Error as error:
+        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        return _BAD_INPUT
+    except BrokenPipeError:  # as before `head`, which has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
+    except OSError as error:
+        if error.filename is None:
+            raise
+        what = f"{os.fsdecode(error.filename)}: {error.strerror}"
+        print(f"{PROGRAM}: error: {what}: mend that, or give another path", file=sys.stderr)
+        return _BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
+        return _INTERRUPTED
     return status or 0
-
-
-@contextmanager
-def _ending_in_order() -> Iterator[None]:
-    """Let the signals that end a process unwind it, so that nothing half-written is left."""
-
-    def end(number: int, _: types.FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)
-
-    names = ("SIGTERM", "SIGHUP")  # some systems have no SIGHUP
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    if threading.current_thread() is not threading.main_thread():
-        numbers = []
-    # What is ignored, as nohup asks for, stays ignored.
-    before = {number: signal.getsignal(number) for number in numbers}
-    before = {number: old for number, old in before.items() if old == signal.SIG_DFL}
-    for number in before:
-        signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
 
 
 class _Parser(argparse.ArgumentParser):
