@@ -18,6 +18,23 @@ ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 if os.getppid() == int(starter):
     os.execvp(command[0], command)
 """
+# A program that runs a shell command and ends with the process that started it, as does all that
+# the command started: the system would only end the shell.
+_SHELL = """
+import ctypes, os, signal, subprocess, sys
+starter, command = sys.argv[1:]
+def end(*_):
+    os.killpg(0, signal.SIGKILL)
+os.setpgid(0, 0)
+signal.signal(signal.SIGTERM, end)
+ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+if os.getppid() != int(starter):
+    end()
+status = subprocess.call(command, shell=True)
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+os.killpg(0, signal.SIGTERM)  # what the command left in the background
+sys.exit(status if status >= 0 else 128 - status)
+"""
 
 
 def bound(command: Sequence[str]) -> list[str]:
@@ -26,9 +43,19 @@ def bound(command: Sequence[str]) -> list[str]:
     The thread that starts it must not end before it. Only Linux can do that; elsewhere these are
     the words given.
     """
-    if sys.platform != "linux" or not sys.executable:
+    if not _can_bind():
         return list(command)
     return [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
+
+
+def bound_shell(command: str) -> list[str] | str:
+    """The same for a shell command and all that it starts, which ends with the command, too.
+
+    Elsewhere it is the command given, for a shell.
+    """
+    if not _can_bind():
+        return command
+    return [sys.executable, "-I", "-S", "-c", _SHELL, str(os.getpid()), command]
 
 
 def bind(starter: int) -> None:
@@ -42,3 +69,7 @@ def bind(starter: int) -> None:
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     if os.getppid() != starter:
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _can_bind() -> bool:
+    return sys.platform == "linux" and bool(sys.executable)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_av1.processes import bound
+from colmap_av1.processes import bound, bound_shell
 
 BOUND = """
 import subprocess, sys, time
@@ -25,6 +25,15 @@ child = (
 subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
 time.sleep(60)
 """
+SHELL = """
+import shlex, subprocess, sys, time
+from colmap_av1.processes import bound_shell
+child = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+command = f"{shlex.join([sys.executable, '-c', child])} && echo not reached"
+subprocess.Popen(bound_shell(command))
+time.sleep(60)
+"""
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children so")
 
 
 def is_running(process: int) -> bool:
@@ -49,8 +58,35 @@ def test_a_program_without_a_folder_is_looked_for() -> None:
     assert run.stdout == "here\n"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
-@pytest.mark.parametrize("program", [BOUND, BINDING], ids=["bound", "binding"])
+@linux
+def test_a_bound_shell_runs_what_is_asked_for() -> None:
+    words = bound_shell("echo 'a b' && sh -c 'exit 3'")
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert run.stdout == "a b\n"
+    assert run.returncode == 3
+    killed = subprocess.run(bound_shell("kill -KILL $$"), check=False)
+    assert killed.returncode == 137
+
+
+@linux
+def test_nothing_that_a_bound_shell_started_outlives_it() -> None:
+    words = bound_shell("sleep 60 & echo $!")
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as shell:
+        assert shell.stdout is not None
+        left = int(shell.stdout.readline())
+        assert shell.wait(timeout=30) == 0
+    wait_for_end(left)
+
+
+def wait_for_end(process: int) -> None:
+    deadline = time.monotonic() + 10
+    while is_running(process):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@linux
+@pytest.mark.parametrize("program", [BOUND, BINDING, SHELL], ids=["bound", "binding", "shell"])
 def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=tmp_path
@@ -59,7 +95,4 @@ def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) ->
         child = int(starter.stdout.readline())
         assert is_running(child)
         starter.kill()
-    deadline = time.monotonic() + 10
-    while is_running(child):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for_end(child)

@@ -55,9 +55,9 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_call, args=(os.getpid(), sender, log, function, args))
-    process.start()
-    sender.close()
     try:
+        process.start()
+        sender.close()
         outcome = receiver.recv()
     except EOFError:
         outcome = None
@@ -65,7 +65,8 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
         _end(process)
         raise
     finally:
-        process.join()
+        if process.pid is not None:
+            process.join()
         receiver.close()
     if isinstance(outcome, ColmapAv1Error):
         raise outcome
@@ -77,7 +78,9 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
 
 def _end(process: BaseProcess) -> None:
     """End a process, and those it started."""
-    if hasattr(os, "killpg") and process.pid is not None:
+    if process.pid is None:
+        return
+    if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
     process.kill()  # pycolmap would answer SIGTERM with a stack trace

@@ -23,6 +23,7 @@ from colmap_av1.evaluate.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.evaluate.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model import ModelPoints, posed_images, read_model, write_model
+from colmap_av1.processes import bound_shell
 
 GSPLAT = "gsplat"
 _PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
@@ -240,7 +241,10 @@ def _milestone(plain: dict[str, Any]) -> Milestone:
 
 
 def _run(command: str) -> None:
-    status = subprocess.run(command, shell=True, check=False, stdin=subprocess.DEVNULL).returncode
+    words = bound_shell(command)
+    status = subprocess.run(
+        words, shell=isinstance(words, str), check=False, stdin=subprocess.DEVNULL
+    ).returncode
     if status != 0:
         raise EvaluationError(f"the trainer ended with status {status}: its log.txt says more")
 
