@@ -16,7 +16,7 @@ from colmap_av1.focal import estimate_focal_length
 from colmap_av1.options import MatchOptions
 from colmap_av1.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.progress import Clock, Progress
-from colmap_av1.tracks import MIN_LENGTH, Tracks
+from colmap_av1.tracks import Tracks, least_length
 from colmap_av1.verify import TwoViewGeometry, verify_pairs
 
 # The mapper's default limit for the translation along the axis of a first pair.
@@ -78,7 +78,7 @@ def pair_images(
     with clock.measure("pairs"):
         keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options.pairs)
-        length = options.tracks.min_length or MIN_LENGTH
+        length = least_length(options.tracks)
         if tracks.num_frames < length:
             raise VideoError(
                 f"{video}: tracks are of {length} frames or more, the video has "

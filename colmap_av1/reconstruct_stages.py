@@ -30,7 +30,7 @@ from colmap_av1.model import ModelImage, posed_images, read_model, write_model
 from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.stages import Kept, run_stage
-from colmap_av1.tracks import MIN_LENGTH, Tracks, keep_frames, keep_long_tracks
+from colmap_av1.tracks import Tracks, keep_frames, keep_long_tracks, least_length
 from colmap_av1.triangulate import Points
 from colmap_av1.unchanged import FileState, check_unchanged, file_states
 from colmap_av1.undistort import on_pinhole, pinhole_camera, undistortion
@@ -135,7 +135,7 @@ def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages]:
 
 def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
     """The tracks that may tell of the poses; short ones are for points only."""
-    return keep_long_tracks(tracks, run.options.match.tracks.min_length or MIN_LENGTH)
+    return keep_long_tracks(tracks, least_length(run.options.match.tracks))
 
 
 def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -> Kept:

@@ -18,8 +18,7 @@ from colmap_av1.options import TrackOptions
 
 # Width in pixels of the squares that motion is coded for.
 _UNIT = 4
-# Shown frames that a track is seen in at least where the options leave it open.
-MIN_LENGTH = 4
+_MIN_LENGTH = 4
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def build_tracks(
     _check_options(options)
     cell = options.cell or _UNIT
     builder = _core.TrackBuilder(
-        min_length=MIN_LENGTH if options.min_length is None else options.min_length,
+        min_length=least_length(options),
         cosine=-2.0 if options.cosine is None else options.cosine,
         cosine_relative_to_dominant=options.cosine_relative_to == "dominant",
         cosine_scale=options.cosine_scale,
@@ -225,6 +224,11 @@ def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
         xy=(tracks.xy * factor).astype(np.float32),
         sigma=(tracks.sigma * math.sqrt(float(factor.prod()))).astype(np.float32),
     )
+
+
+def least_length(options: TrackOptions) -> int:
+    """Shown frames that a track is seen in at least."""
+    return _MIN_LENGTH if options.min_length is None else options.min_length
 
 
 _Limit = TypeVar("_Limit", int, float)
