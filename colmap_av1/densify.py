@@ -183,7 +183,7 @@ def _check_input(
     options: DensifyOptions,
 ) -> tuple[int, int]:
     """Refuse what does not fit before the long work; (width, height) of the model's images."""
-    video_size = picture_size(video)
+    video_size = picture_size(video, options.match.read.operating_point)
     check_options(options.match, video_size)
     check_triangulate_options(options.triangulate)
     if len(sizes) < 2:

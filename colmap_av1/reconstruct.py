@@ -112,7 +112,7 @@ def reconstruct(
     progress = progress if progress is not None else no_progress
     video, output = Path(video), Path(output)
     clock = Clock()
-    check_options(options.match, picture_size(video))
+    check_options(options.match, picture_size(video, options.match.read.operating_point))
     _check_reconstruct_options(options)
     with open_stages(output, "reconstruct") as stages:
         source = open_source(video, options.match, clock=clock, progress=progress)

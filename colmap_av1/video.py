@@ -251,14 +251,18 @@ def read_display(video: str | os.PathLike[str]) -> Display:
     return _look(video)[1]
 
 
-def picture_size(video: str | os.PathLike[str]) -> tuple[int, int]:
+def picture_size(video: str | os.PathLike[str], operating_point: int = 0) -> tuple[int, int]:
     """Width and height in pixels of the pictures that `decode_frames` gives.
+
+    Args:
+        video: a file of any codec that FFmpeg decodes.
+        operating_point: operating point of a scalable stream.
 
     Raises:
         BitstreamError: no frame can be decoded.
         VideoError: as `read_display`.
     """
-    return shown_size(*_look(video))
+    return shown_size(*_look(video, operating_point))
 
 
 def presented_frames(video: str | os.PathLike[str]) -> NDArray[np.int32] | None:
@@ -378,10 +382,12 @@ def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
     return count, None
 
 
-def _look(video: str | os.PathLike[str]) -> tuple[tuple[int, int], Display]:
+def _look(
+    video: str | os.PathLike[str], operating_point: int = 0
+) -> tuple[tuple[int, int], Display]:
     """(width, height) of the first stored picture, and how it is shown."""
     path = Path(video)
-    frames = _decode(path, 0, 1)
+    frames = _decode(path, operating_point, 1)
     frame = next(frames, None)
     frames.close()
     if frame is None:

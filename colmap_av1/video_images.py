@@ -86,7 +86,7 @@ def prepare_images(
         OptionError: an option has a value that cannot work.
     """
     # What can be refused is refused before the long work.
-    video_size = picture_size(video)
+    video_size = picture_size(video, options.read.operating_point)
     display = read_display(video)
     existing = dict(listed)
     if folder is not None and not existing:
@@ -111,13 +111,10 @@ def prepare_images(
         )
         tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
         if (tracks.width, tracks.height) != video_size:
-            if source.stream != source.pictures:
-                raise VideoError(
-                    f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
-                    f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
-                )
-            video_size = (tracks.width, tracks.height)
-            size = size_of_images(existing, video_size, display.pixel_aspect)
+            raise VideoError(
+                f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+                f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
+            )
 
         def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
             pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)

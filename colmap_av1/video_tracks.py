@@ -200,10 +200,11 @@ def decodable_frames(
     count = 0
     try:
         for index, image in decoded:
-            if index >= num_frames:
+            if index < num_frames:
+                yield index, image
+                count += 1
+            if index + 1 >= num_frames:  # what is damaged beyond does no harm
                 return
-            yield index, image
-            count += 1
     except BitstreamError as error:
         if options.read.strict:
             raise

@@ -177,17 +177,11 @@ def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (MatchOptions(images=ImageOptions(every=0)), OptionError),
-        (MatchOptions(images=ImageOptions(image_name="x.png")), OptionError),
-        (MatchOptions(camera=CameraOptions(camera_model="NONE")), OptionError),
-        (MatchOptions(refine=RefineOptions(refine_window=4)), OptionError),
-        (MatchOptions(density=DensityOptions(spacing=-1)), OptionError),
-        (MatchOptions(pairs=PairOptions(offsets=())), OptionError),
         (MatchOptions(verify=VerifyOptions(max_error=0)), OptionError),
         (MatchOptions(pairs=PairOptions(min_matches=10**6)), VideoError),
     ],
 )
-def test_options_that_cannot_work(
+def test_options_that_cannot_work_leave_nothing(
     clip: Path, tmp_path: Path, options: MatchOptions, error: type[ColmapAv1Error]
 ) -> None:
     with pytest.raises(error):
