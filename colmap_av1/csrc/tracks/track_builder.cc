@@ -5,7 +5,6 @@
 #include <cstdlib>
 #include <limits>
 #include <stdexcept>
-#include <type_traits>
 #include <utility>
 
 #include "av1/constants.h"
@@ -73,7 +72,10 @@ TrackArrays TrackBuilder::finish() {
   std::sort(kept_.begin(), kept_.end(),
             [](const Kept& a, const Kept& b) { return a.serial < b.serial; });
 
-  TrackArrays out = std::move(done_);
+  tracks_.clear();
+  stretches_.clear();
+  idle_frames_.clear();
+  TrackArrays out;
   out.num_frames = num_frames_;
   out.width = width_;
   out.height = height_;
@@ -81,18 +83,18 @@ TrackArrays TrackBuilder::finish() {
   out.offsets.push_back(0);
   for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
   // One array after the other, the largest first: that takes the least memory.
-  const auto sort = [this](auto& values, std::ptrdiff_t width) {
-    std::remove_reference_t<decltype(values)> sorted;
-    sorted.reserve(values.size());
+  const auto sort = [this](auto& values, std::ptrdiff_t width, auto* sorted) {
+    sorted->resize(values.size());
+    auto end = sorted->begin();
     for (const Kept& kept : kept_) {
       const auto first = values.begin() + width * kept.first;
-      sorted.insert(sorted.end(), first, first + width * kept.length);
+      end = std::copy(first, first + width * kept.length, end);
     }
-    values = std::move(sorted);
+    values = {};
   };
-  sort(out.xy, 2);
-  sort(out.frame, 1);
-  sort(out.sigma, 1);
+  sort(done_.xy, 2, &out.xy);
+  sort(done_.frame, 1, &out.frame);
+  sort(done_.sigma, 1, &out.sigma);
   *this = TrackBuilder(options_);
   return out;
 }
@@ -174,19 +176,18 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
   judge_blocks(frame, coded);
   if (options_.interpolation > 0) interpolate(frame);
   if (options_.bridge > 0) bridge(frame);
+  frame.num_linked = {};
+  for (const auto& list : frame.motion) {
+    for (const UnitMotion& motion : list) ++frame.num_linked[motion.ref];
+  }
   return frame;
 }
 
 // Says how far to trust the lists of every block, and takes out those that most of the units
 // around it contradict. A block of w x h units lies at a multiple of (w, h), so its origin follows
 // from its size.
-void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
-  struct Verdict {
-    float variance;
-    bool rough;
-  };
-  std::array<std::vector<Verdict>, 2> verdicts;
-  for (auto& list : verdicts) list.assign(frame.mi_size.size(), Verdict{0.F, false});
+void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) {
+  for (auto& list : verdicts_) list.assign(frame.mi_size.size(), Verdict{});
   for (int row = 0; row < frame.visible_rows; ++row) {
     for (int col = 0; col < frame.visible_cols; ++col) {
       const int unit = row * frame.cols + col;
@@ -195,7 +196,7 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
       const int origin = (row & ~(block_rows - 1)) * frame.cols + (col & ~(block_cols - 1));
       for (int list = 0; list < 2; ++list) {
         if (origin != unit) {
-          verdicts[list][unit] = verdicts[list][origin];
+          verdicts_[list][unit] = verdicts_[list][origin];
           continue;
         }
         // Of a block at the picture's border, other units may be trusted than the origin.
@@ -212,15 +213,15 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) const {
           traits.disagreement = static_cast<float>(around.distance / around.judged);
         }
         const float sigma = step_sigma(traits);
-        verdicts[list][unit] = {sigma * sigma, options_.smoothness >= 0 &&
-                                                   2 * around.agreeing < around.judged};
+        verdicts_[list][unit] = {sigma * sigma, options_.smoothness >= 0 &&
+                                                    2 * around.agreeing < around.judged};
       }
     }
   }
   for (std::size_t unit = 0; unit < frame.mi_size.size(); ++unit) {
     for (int list = 0; list < 2; ++list) {
-      frame.motion[list][unit].variance = verdicts[list][unit].variance;
-      if (verdicts[list][unit].rough) frame.motion[list][unit].ref = 0;
+      frame.motion[list][unit].variance = verdicts_[list][unit].variance;
+      if (verdicts_[list][unit].rough) frame.motion[list][unit].ref = 0;
     }
   }
 }
@@ -387,8 +388,11 @@ void TrackBuilder::chain_frame(Frame& frame) {
   current_ = &frame;
   frame.chained = true;
   frame.cells.assign(static_cast<std::size_t>(frame.cell_rows) * frame.cell_cols, Cell{});
+  frame.first_serial = next_serial_;
+  next_serial_ += static_cast<int64_t>(frame.cells.size());
   if (uses_cosine()) frame.velocity.assign(frame.cells.size(), Point{kNan, kNan});
   find_links();
+  note_open_units();
   for (Link& link : links_) {
     if (uses_cosine() && options_.cosine_relative_to_dominant) fit_dominant(link);
     for (int list = 0; list < 2; ++list) {
@@ -411,7 +415,7 @@ void TrackBuilder::chain_frame(Frame& frame) {
 // last.
 void TrackBuilder::find_links() {
   links_.clear();
-  const auto add_link = [this](const Frame& from, const Frame& to, const Frame& other) {
+  const auto add_link = [this](const Frame& from, const Frame& to, Frame& other) {
     Link link;
     link.other = &other;
     link.forward = &from == &other;
@@ -423,6 +427,11 @@ void TrackBuilder::find_links() {
     }
     link.distance =
         link.interval != 0 ? std::abs(link.interval) : std::numeric_limits<int>::max();
+    link.from_picture_x = current_->coded_width / other.width;
+    link.from_picture_y = current_->height / other.height;
+    const float cell = 2.F * half_cell_;
+    link.to_cells_x = 1.F / (cell * other.upscale * link.from_picture_x);
+    link.to_cells_y = 1.F / (cell * link.from_picture_y);
     links_.push_back(link);
   };
   for (const auto& other : frames_) {
@@ -450,9 +459,7 @@ bool TrackBuilder::links(const Frame& from, const Frame& to) const {
 void TrackBuilder::fit_dominant(Link& link) {
   const Frame& frame = link.forward ? *link.other : *current_;
   std::size_t count = 0;
-  for (const auto& motion : frame.motion) {
-    for (const UnitMotion& unit : motion) count += link.refs[unit.ref] ? 1 : 0;
-  }
+  for (int ref = 1; ref < kNumRefs; ++ref) count += link.refs[ref] ? frame.num_linked[ref] : 0;
   const std::size_t stride = count / kMaxDominantSamples + 1;
   samples_.clear();
   std::size_t index = 0;
@@ -466,6 +473,36 @@ void TrackBuilder::fit_dominant(Link& link) {
   link.dominant = fit_dominant_motion(samples_, frame.coded_width, frame.height, scratch_);
 }
 
+// The units that may move a track into the current frame.
+void TrackBuilder::note_open_units() {
+  open_units_.clear();
+  if (std::all_of(links_.begin(), links_.end(), [](const Link& link) { return link.forward; })) {
+    return;
+  }
+  for (int row = 0; row < current_->visible_rows; ++row) {
+    for (int col = 0; col < current_->visible_cols; ++col) {
+      const int unit = row * current_->cols + col;
+      if (current_->motion[0][unit].ref != 0 || current_->motion[1][unit].ref != 0) {
+        open_units_.push_back({row, col});
+      }
+    }
+  }
+}
+
+// Whether a cell of the current frame's unit holds no track yet.
+bool TrackBuilder::is_open(OpenUnit unit) const {
+  const int size = options_.cells;
+  const Cell* first = current_->cells.data() +
+                      static_cast<std::ptrdiff_t>(size) * unit.row * current_->cell_cols +
+                      static_cast<std::ptrdiff_t>(size) * unit.col;
+  for (int row = 0; row < size; ++row, first += current_->cell_cols) {
+    for (int col = 0; col < size; ++col) {
+      if (first[col].track < 0) return true;
+    }
+  }
+  return false;
+}
+
 // By the current frame's displacements: every free cell asks for the longest track that it
 // finds, every track goes to the cell that puts it nearest to its centre (a stable
 // matching, so the order of cells does not matter).
@@ -475,51 +512,61 @@ void TrackBuilder::chain_backward(const Link& link, int list, Reach reach) {
   // A cell as large as its unit is searched in no more time than the unit is judged.
   const bool judges_units = options_.cells > 1;
   bool noted = false;
-  for (int unit_row = 0; unit_row < current_->visible_rows; ++unit_row) {
-    for (int unit_col = 0; unit_col < current_->visible_cols; ++unit_col) {
-      const int unit = unit_row * current_->cols + unit_col;
-      if (!link.refs[motion[unit].ref]) continue;
-      if (judges_units) {
-        if (!noted) note_open_units(*link.other);
-        noted = true;
-        if (!may_find_track(link, unit, motion[unit], reach)) continue;
-      }
-      for (int part = 0; part < options_.cells * options_.cells; ++part) {
-        const int row = options_.cells * unit_row + (part >> log_cells_);
-        const int col = options_.cells * unit_col + (part & (options_.cells - 1));
-        if (current_->cells[row * current_->cell_cols + col].track >= 0) continue;
-        for (int cell = row * current_->cell_cols + col; cell >= 0;) {
-          int best = -1;
-          Claim claim;
-          if (reach == Reach::kOwn) {
-            find_track(link, cell, motion[unit_of(*current_, cell)], &best, &claim);
-          } else {
-            find_track_beside(link, list, cell, &best, &claim);
-          }
-          if (best < 0) break;
-          if (claims_[best].cell < 0) claimed_.push_back(best);
-          cell = std::exchange(claims_[best], claim).cell;
+  std::size_t num_open = 0;
+  for (std::size_t i = 0; i < open_units_.size(); ++i) {
+    const OpenUnit open = open_units_[i];
+    if (!is_open(open)) continue;
+    open_units_[num_open++] = open;
+    const int unit = open.row * current_->cols + open.col;
+    if (!link.refs[motion[unit].ref]) continue;
+    if (judges_units) {
+      if (!noted) note_unplaced_units(*link.other);
+      noted = true;
+      if (!may_find_track(link, unit, motion[unit], reach)) continue;
+    }
+    for (int part = 0; part < options_.cells * options_.cells; ++part) {
+      const int row = options_.cells * open.row + (part >> log_cells_);
+      const int col = options_.cells * open.col + (part & (options_.cells - 1));
+      int cell = row * current_->cell_cols + col;
+      if (current_->cells[cell].track >= 0) continue;
+      int unit_of_cell = unit;
+      Point centre = cell_centre(row, col);
+      while (true) {
+        int best = -1;
+        Claim claim;
+        if (reach == Reach::kOwn) {
+          find_track(link, cell, centre, motion[unit_of_cell], &best, &claim);
+        } else {
+          find_track_beside(link, list, cell, centre, &best, &claim);
         }
+        if (best < 0) break;
+        if (claims_[best].cell < 0) claimed_.push_back(best);
+        // The cell that held the claim until now looks for another track.
+        cell = std::exchange(claims_[best], claim).cell;
+        if (cell < 0) break;
+        unit_of_cell = unit_of(*current_, cell);
+        centre = cell_centre(cell / current_->cell_cols, cell % current_->cell_cols);
       }
     }
   }
+  open_units_.resize(num_open);
   for (const int32_t cell : claimed_) {
     const Claim claim = std::exchange(claims_[cell], Claim{});
-    place(claim.cell, link.other->cells[cell].track, claim.position, claim.velocity,
-          claim.variance);
+    carry_on(*link.other, cell, claim.cell, claim);
   }
   claimed_.clear();
 }
 
 // The units of a frame with tracks that have no place in the current frame yet.
-void TrackBuilder::note_open_units(const Frame& other) {
-  open_units_.assign(other.mi_size.size(), 0);
+void TrackBuilder::note_unplaced_units(const Frame& other) {
+  unplaced_units_.assign(other.mi_size.size(), 0);
   const Cell* cell = other.cells.data();
   for (int row = 0; row < other.cell_rows; ++row) {
-    uint8_t* unit = open_units_.data() + static_cast<std::ptrdiff_t>(row >> log_cells_) * other.cols;
+    uint8_t* unit =
+        unplaced_units_.data() + static_cast<std::ptrdiff_t>(row >> log_cells_) * other.cols;
     for (int col = 0; col < other.cols; ++col, ++unit) {
       for (const Cell* end = cell + options_.cells; cell < end; ++cell) {
-        if (cell->track >= 0 && tracks_[cell->track].last_seen != frames_chained_) *unit = 1;
+        if (is_unplaced(*cell)) *unit = 1;
       }
     }
   }
@@ -535,16 +582,12 @@ bool TrackBuilder::may_find_track(const Link& link, int unit, const UnitMotion& 
     pixels += static_cast<float>(options_.bridge);
   }
   const Frame& other = *link.other;
-  const float scale_x = current_->coded_width / other.width;
-  const float scale_y = current_->height / other.height;
   const Point centre = unit_centre(*current_, unit);
-  const Window window =
-      around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
-             pixels / scale_x, pixels / scale_y);
+  const Window window = around(link, {centre.x + motion.dx, centre.y + motion.dy}, pixels);
   if (window.bottom < window.top || window.right < window.left) return false;
   for (int row = window.top >> log_cells_; row <= window.bottom >> log_cells_; ++row) {
     for (int col = window.left >> log_cells_; col <= window.right >> log_cells_; ++col) {
-      if (open_units_[row * other.cols + col] != 0) return true;
+      if (unplaced_units_[row * other.cols + col] != 0) return true;
     }
   }
   return false;
@@ -552,20 +595,20 @@ bool TrackBuilder::may_find_track(const Link& link, int unit, const UnitMotion& 
 
 // The same by the displacements of the units beside the cell's: where these point apart, tracks lie
 // in the gap that their blocks leave.
-void TrackBuilder::find_track_beside(const Link& link, int list, int cell, int* best,
-                                     Claim* best_claim) const {
+void TrackBuilder::find_track_beside(const Link& link, int list, int cell, Point centre,
+                                     int* best, Claim* best_claim) const {
   const int unit = unit_of(*current_, cell);
   const int row = unit / current_->cols;
   const int col = unit % current_->cols;
   const auto& motion = current_->motion[list];
+  const UnitMotion& own = motion[unit];
   for (int r = std::max(0, row - 1); r <= std::min(current_->visible_rows - 1, row + 1); ++r) {
     for (int c = std::max(0, col - 1); c <= std::min(current_->visible_cols - 1, col + 1); ++c) {
-      const int other = r * current_->cols + c;
-      if (other == unit || !link.refs[motion[other].ref] ||
-          !moves_alike(motion[other], motion[unit])) {
-        continue;
-      }
-      find_track(link, cell, motion[other], best, best_claim);
+      const UnitMotion& other = motion[r * current_->cols + c];
+      if (!link.refs[other.ref] || !moves_alike(other, own)) continue;
+      // The cell has looked there already.
+      if (other.dx == own.dx && other.dy == own.dy && other.warp == own.warp) continue;
+      find_track(link, cell, centre, other, best, best_claim);
     }
   }
 }
@@ -573,7 +616,7 @@ void TrackBuilder::find_track_beside(const Link& link, int list, int cell, int* 
 // By the other frame's displacements: every track moves with the unit it lies in, and a
 // free cell takes the longest one that lands in it.
 void TrackBuilder::chain_forward(const Link& link, int list) {
-  const Frame& other = *link.other;
+  Frame& other = *link.other;
   const auto& motion = other.motion[list];
   const float scale_x = current_->coded_width / other.coded_width;
   const float scale_y = current_->height / other.height;
@@ -583,10 +626,7 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
       const int index = row * other.cell_cols + col;
       const int unit = (row >> log_cells_) * other.cols + (col >> log_cells_);
       const Cell& cell = other.cells[index];
-      if (!link.refs[motion[unit].ref] || cell.track < 0 ||
-          tracks_[cell.track].last_seen == frames_chained_) {
-        continue;
-      }
+      if (!link.refs[motion[unit].ref] || !is_unplaced(cell)) continue;
       const Point from{cell.position.x / other.upscale, cell.position.y};
       const Point moved = move(other, motion[unit], from);
       Claim claim;
@@ -595,12 +635,13 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
       claim.variance = cell.variance + motion[unit].variance;
       if (!is_in_picture(claim.position)) continue;
       const float size = 2.F * half_cell_;
-      const int target = static_cast<int>(claim.position.y / size) * current_->cell_cols +
-                         static_cast<int>(claim.position.x / size);
+      const int target_row = static_cast<int>(claim.position.y / size);
+      const int target_col = static_cast<int>(claim.position.x / size);
+      const int target = target_row * current_->cell_cols + target_col;
       if (current_->cells[target].track >= 0) continue;
-      claim.cost = distance(claim.position, cell_centre(*current_, target));
+      claim.cost = distance(claim.position, cell_centre(target_row, target_col));
       const Claim& holder = claims_[target];
-      if ((holder.cell < 0 || is_preferred(cell, claim, other.cells[holder.cell], holder)) &&
+      if ((holder.cell < 0 || is_preferred(other, index, claim, holder.cell, holder)) &&
           passes_cosine(link, index, from, moved, &claim)) {
         if (holder.cell < 0) claimed_.push_back(target);
         claims_[target] = claim;
@@ -609,30 +650,26 @@ void TrackBuilder::chain_forward(const Link& link, int list) {
   }
   for (const int32_t cell : claimed_) {
     const Claim claim = std::exchange(claims_[cell], Claim{});
-    place(cell, other.cells[claim.cell].track, claim.position, claim.velocity, claim.variance);
+    carry_on(other, claim.cell, cell, claim);
   }
   claimed_.clear();
 }
 
 // The longest track that `cell` has a better claim on than the cell that holds it, by the motion
 // of a unit; what `best` holds already is kept where it is longer.
-void TrackBuilder::find_track(const Link& link, int cell, const UnitMotion& motion, int* best,
-                              Claim* best_claim) const {
+void TrackBuilder::find_track(const Link& link, int cell, Point centre, const UnitMotion& motion,
+                              int* best, Claim* best_claim) const {
   const Frame& other = *link.other;
-  const float scale_x = current_->coded_width / other.width;
-  const float scale_y = current_->height / other.height;
-  const Point centre = cell_centre(*current_, cell);
   // A valid warp stretches a unit by less than half its size, about the unit's centre.
   const float reach = motion.warp < 0 ? half_cell_ : half_cell_ + kUnit / 4.F;
-  const Window window =
-      around(other, {(centre.x + motion.dx) / scale_x, (centre.y + motion.dy) / scale_y},
-             reach / scale_x, reach / scale_y);
+  const Window window = around(link, {centre.x + motion.dx, centre.y + motion.dy}, reach);
   for (int row = window.top; row <= window.bottom; ++row) {
     for (int col = window.left; col <= window.right; ++col) {
       const int index = row * other.cell_cols + col;
       const Cell& found = other.cells[index];
-      if (found.track < 0) continue;
-      const Point target{found.position.x * scale_x, found.position.y * scale_y};
+      if (found.track == kNone) continue;
+      const Point target{found.position.x * link.from_picture_x,
+                         found.position.y * link.from_picture_y};
       Claim claim;
       if (!move_back(*current_, motion, target, &claim.position) ||
           !is_in_cell(claim.position, centre)) {
@@ -641,9 +678,9 @@ void TrackBuilder::find_track(const Link& link, int cell, const UnitMotion& moti
       claim.cell = cell;
       claim.cost = distance(claim.position, centre);
       claim.variance = found.variance + motion.variance;
-      if ((*best >= 0 && !is_preferred(found, claim, other.cells[*best], *best_claim)) ||
+      if ((*best >= 0 && !is_preferred(other, index, claim, *best, *best_claim)) ||
           !is_in_picture(claim.position) || !is_better(claim, claims_[index]) ||
-          tracks_[found.track].last_seen == frames_chained_ ||
+          !is_unplaced(found) ||
           !passes_cosine(link, index, claim.position, target, &claim)) {
         continue;
       }
@@ -654,11 +691,23 @@ void TrackBuilder::find_track(const Link& link, int cell, const UnitMotion& moti
 }
 
 // Of two tracks that want one cell the longer goes on: another one can start at any time.
-bool TrackBuilder::is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
+bool TrackBuilder::is_preferred(const Frame& frame, int cell, const Claim& claim, int other_cell,
                                 const Claim& other_claim) const {
-  const int32_t length = tracks_[cell.track].length;
-  const int32_t other_length = tracks_[other.track].length;
-  return length != other_length ? length > other_length : claim.cost < other_claim.cost;
+  const int32_t own_length = length(frame, frame.cells[cell]);
+  const int32_t other_length = length(frame, frame.cells[other_cell]);
+  return own_length != other_length ? own_length > other_length : claim.cost < other_claim.cost;
+}
+
+// Whether a cell holds a track that has no place in the current frame yet.
+bool TrackBuilder::is_unplaced(const Cell& cell) const {
+  return cell.track == kSeed ||
+         (cell.track != kNone && tracks_[cell.track].last_seen != frames_chained_);
+}
+
+// Shown frames that have seen a cell's track.
+int32_t TrackBuilder::length(const Frame& frame, const Cell& cell) const {
+  if (cell.track == kSeed) return frame.display_index >= 0 ? 1 : 0;
+  return tracks_[cell.track].length;
 }
 
 // The vectors of small blocks are the better ones.
@@ -708,12 +757,34 @@ bool TrackBuilder::passes_cosine(const Link& link, int other_cell, Point from, P
   return vx * px + vy * py + s2 >= options_.cosine * norm;
 }
 
-void TrackBuilder::place(int cell, int32_t track, Point position, Point velocity,
-                         float variance) {
-  current_->cells[cell] = {track, {position.x * current_->upscale, position.y}, variance};
-  if (uses_cosine()) current_->velocity[cell] = velocity;
+// Gives the track of another frame's cell its place in a cell of the current frame.
+void TrackBuilder::carry_on(Frame& other, int other_cell, int cell, const Claim& claim) {
+  int32_t track = other.cells[other_cell].track;
+  if (track == kSeed) track = start_track(other, other_cell);
+  current_->cells[cell] = {track,
+                           {claim.position.x * current_->upscale, claim.position.y},
+                           claim.variance};
+  if (uses_cosine()) current_->velocity[cell] = claim.velocity;
   tracks_[track].last_seen = frames_chained_;
   ++tracks_[track].frames;
+}
+
+// Makes a track of a seed.
+int32_t TrackBuilder::start_track(Frame& frame, int cell) {
+  auto index = static_cast<int32_t>(tracks_.size());
+  if (free_tracks_.empty()) {
+    tracks_.emplace_back();
+  } else {
+    index = free_tracks_.back();
+    free_tracks_.pop_back();
+    tracks_[index] = Track{};
+  }
+  Track& track = tracks_[index];
+  track.serial = frame.first_serial + cell;
+  track.frames = 1;
+  frame.cells[cell].track = index;
+  if (frame.display_index >= 0) observe(track, frame, frame.cells[cell]);
+  return index;
 }
 
 // In the centre of every square of `seeding` x `seeding` cells that holds no track.
@@ -723,7 +794,7 @@ void TrackBuilder::seed() {
   const auto is_empty = [&](int row, int col) {
     for (int r = row; r < row + size; ++r) {
       for (int c = col; c < col + size; ++c) {
-        if (current_->cells[r * current_->cell_cols + c].track >= 0) return false;
+        if (current_->cells[r * current_->cell_cols + c].track != kNone) return false;
       }
     }
     return true;
@@ -733,48 +804,42 @@ void TrackBuilder::seed() {
       const Point centre{2.F * half_cell_ * static_cast<float>(col) + half,
                          2.F * half_cell_ * static_cast<float>(row) + half};
       if (!is_in_picture(centre) || !is_empty(row, col)) continue;
-      int32_t track = static_cast<int32_t>(tracks_.size());
-      if (free_tracks_.empty()) {
-        tracks_.emplace_back();
-      } else {
-        track = free_tracks_.back();
-        free_tracks_.pop_back();
-        tracks_[track] = Track{};
-      }
-      tracks_[track].serial = next_serial_++;
       const int cell = (row + size / 2) * current_->cell_cols + col + size / 2;
-      place(cell, track, centre, {kNan, kNan}, 0.F);
+      current_->cells[cell] = {kSeed, {centre.x * current_->upscale, centre.y}, 0.F};
     }
   }
 }
 
 void TrackBuilder::observe() {
-  const float scale_x = static_cast<float>(width_) / current_->width;
-  const float scale_y = static_cast<float>(height_) / current_->height;
   for (const Cell& cell : current_->cells) {
-    if (cell.track < 0) continue;
-    Track& track = tracks_[cell.track];
-    const int place = track.length % kStretch;
-    if (place == 0) start_stretch(track);
-    stretches_[track.last_stretch].observations[place] = {
-        current_->display_index,
-        {cell.position.x * scale_x, cell.position.y * scale_y},
-        std::sqrt(cell.variance) * scale_y};
-    ++track.length;
+    if (cell.track >= 0) observe(tracks_[cell.track], *current_, cell);
   }
 }
 
+void TrackBuilder::observe(Track& track, const Frame& frame, const Cell& cell) {
+  const float scale_x = static_cast<float>(width_) / frame.width;
+  const float scale_y = static_cast<float>(height_) / frame.height;
+  const int place = track.length % kStretch;
+  if (place == 0) start_stretch(track);
+  stretches_[track.last_stretch].observations[place] = {
+      frame.display_index,
+      {cell.position.x * scale_x, cell.position.y * scale_y},
+      std::sqrt(cell.variance) * scale_y};
+  ++track.length;
+}
+
 void TrackBuilder::start_stretch(Track& track) {
-  auto index = static_cast<int32_t>(stretches_.size());
+  auto index = static_cast<int32_t>(previous_stretch_.size());
   if (!free_stretches_.empty()) {
     index = free_stretches_.back();
     free_stretches_.pop_back();
   } else if (stretches_.size() < std::numeric_limits<int32_t>::max()) {
     stretches_.emplace_back();
+    previous_stretch_.push_back(-1);
   } else {
     throw std::length_error("too many observations at a time: cut the video");
   }
-  stretches_[index].previous = track.last_stretch;
+  previous_stretch_[index] = track.last_stretch;
   track.last_stretch = index;
 }
 
@@ -800,56 +865,60 @@ void TrackBuilder::release_frames(const int32_t* slots) {
 
 // A track that no frame holds any more is over: kept, or its memory used again.
 void TrackBuilder::release(Frame& frame) {
-  for (const Cell& cell : frame.cells) {
+  for (std::size_t i = 0; i < frame.cells.size(); ++i) {
+    const Cell& cell = frame.cells[i];
+    if (cell.track == kSeed && length(frame, cell) >= options_.min_length) {
+      start_track(frame, static_cast<int>(i));
+    }
     if (cell.track < 0) continue;
     Track& track = tracks_[cell.track];
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
     if (track.length >= options_.min_length) keep(track);
-    for (int32_t s = track.last_stretch; s >= 0; s = stretches_[s].previous) {
+    for (int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
       free_stretches_.push_back(s);
     }
   }
 }
 
 void TrackBuilder::keep(const Track& track) {
-  const std::size_t first = done_.frame.size();
-  kept_.push_back({track.serial, static_cast<std::ptrdiff_t>(first), track.length});
-  const std::size_t end = first + static_cast<std::size_t>(track.length);
-  done_.frame.resize(end);
-  done_.xy.resize(2 * end);
-  done_.sigma.resize(end);
+  const auto first = static_cast<std::ptrdiff_t>(done_.frame.size());
+  kept_.push_back({track.serial, first, track.length});
+  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.length);
+  done_.frame.resize(size);
+  done_.xy.resize(2 * size);
+  done_.sigma.resize(size);
+  auto frame = done_.frame.end();
+  auto xy = done_.xy.end();
+  auto sigma = done_.sigma.end();
   int32_t stretch = track.last_stretch;
   for (int i = track.length - 1; i >= 0; --i) {
     const Observation& observation = stretches_[stretch].observations[i % kStretch];
-    done_.frame[first + i] = observation.frame;
-    done_.xy[2 * (first + i)] = observation.position.x;
-    done_.xy[2 * (first + i) + 1] = observation.position.y;
-    done_.sigma[first + i] = observation.sigma;
-    if (i % kStretch == 0) stretch = stretches_[stretch].previous;
+    *--frame = observation.frame;
+    *--xy = observation.position.y;
+    *--xy = observation.position.x;
+    *--sigma = observation.sigma;
+    if (i % kStretch == 0) stretch = previous_stretch_[stretch];
   }
 }
 
-// The cells within reach of a position of the picture, the reach itself left out on the
-// right and below.
-TrackBuilder::Window TrackBuilder::around(const Frame& frame, Point position, float reach_x,
-                                          float reach_y) const {
+// The other frame's cells within reach of a position in coded pixels of the current one, the reach
+// itself left out on the right and below.
+TrackBuilder::Window TrackBuilder::around(const Link& link, Point position, float reach) {
   // Far outside there are no cells; the clamp keeps the cast defined.
   const auto first = [](float cell, int count) {
-    const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
-    return static_cast<int>(clamped);
+    return static_cast<int>(std::clamp(cell, 0.F, static_cast<float>(count)));
   };
   const auto last = [](float cell, int count) {
     const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
     const int floor = static_cast<int>(clamped);
     return (static_cast<float>(floor) == clamped ? floor : floor + 1) - 1;
   };
-  const float height = 2.F * half_cell_;
-  const float width = height * frame.upscale;
-  return {first((position.y - reach_y) / height, frame.cell_rows),
-          last((position.y + reach_y) / height, frame.cell_rows),
-          first((position.x - reach_x) / width, frame.cell_cols),
-          last((position.x + reach_x) / width, frame.cell_cols)};
+  const Frame& other = *link.other;
+  return {first((position.y - reach) * link.to_cells_y, other.cell_rows),
+          last((position.y + reach) * link.to_cells_y, other.cell_rows),
+          first((position.x - reach) * link.to_cells_x, other.cell_cols),
+          last((position.x + reach) * link.to_cells_x, other.cell_cols)};
 }
 
 int TrackBuilder::unit_of(const Frame& frame, int cell) const {
@@ -864,9 +933,9 @@ TrackBuilder::Point TrackBuilder::unit_centre(const Frame& frame, int unit) {
           kUnit * (static_cast<float>(unit / frame.cols) + 0.5F)};
 }
 
-TrackBuilder::Point TrackBuilder::cell_centre(const Frame& frame, int cell) const {
-  return {half_cell_ * static_cast<float>(2 * (cell % frame.cell_cols) + 1),
-          half_cell_ * static_cast<float>(2 * (cell / frame.cell_cols) + 1)};
+TrackBuilder::Point TrackBuilder::cell_centre(int row, int col) const {
+  return {half_cell_ * static_cast<float>(2 * col + 1),
+          half_cell_ * static_cast<float>(2 * row + 1)};
 }
 
 // Half-open, so that touching cells share no position.

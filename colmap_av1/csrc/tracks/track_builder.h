@@ -6,6 +6,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <memory>
 #include <vector>
 
@@ -82,9 +83,12 @@ class TrackBuilder {
     float y = 0.F;
   };
   // What a unit, or one of the equal parts that a unit is cut into, holds: at most one track, at
-  // its sub-pixel place in pixels of the picture.
+  // its sub-pixel place in pixels of the picture. Most seeds are never carried on: a seed becomes
+  // a track when it is.
+  static constexpr int32_t kNone = -1;
+  static constexpr int32_t kSeed = -2;
   struct Cell {
-    int32_t track = -1;
+    int32_t track = kNone;
     Point position;
     float variance = 0.F;  // of the position against the track's seed, in coded px^2
   };
@@ -113,8 +117,10 @@ class TrackBuilder {
     std::array<int, kNumRefs> ref_decode_index{};
     std::array<int, kNumRefs> ref_interval{};  // in shown frames, 0 where unknown
     std::array<std::vector<UnitMotion>, 2> motion;
+    std::array<int, kNumRefs> num_linked{};  // entries of `motion`, by their ref
     std::vector<int32_t> warps;
     std::vector<uint8_t> mi_size;
+    int64_t first_serial = 0;  // of the seed in the first cell
     std::vector<Cell> cells;
     // Velocity per shown frame by which the track came here, less the frame's dominant
     // motion; NaN at a seed. Empty without the cosine test.
@@ -132,11 +138,16 @@ class TrackBuilder {
     Point position;
     float sigma = 0.F;
   };
-  // Observations of a track that lives, some at a time: they lie far apart in memory.
+  // Observations of a track that lives, a line of the cache at a time.
   static constexpr int kStretch = 4;
-  struct Stretch {
+  struct alignas(64) Stretch {
     std::array<Observation, kStretch> observations;
-    int32_t previous = -1;
+  };
+  // Those of the tracks that are kept. A deque grows without being copied.
+  struct Done {
+    std::deque<int32_t> frame;
+    std::deque<float> xy;
+    std::deque<float> sigma;
   };
   struct Kept {
     int64_t serial = 0;
@@ -146,11 +157,16 @@ class TrackBuilder {
   // A frame with tracks that displacements link to the frame being chained: from the
   // current frame's units (backward) or from the other's (forward).
   struct Link {
-    const Frame* other = nullptr;
+    Frame* other = nullptr;
     bool forward = false;
     std::array<bool, kNumRefs> refs{};  // the RefFrame values that name the link
     int distance = 0;                   // in shown frames
     int interval = 0;                   // other less current display index, 0 if unknown
+    // To coded pixels of the current frame, from pixels of the other's picture and to its cells.
+    float from_picture_x = 1.F;
+    float from_picture_y = 1.F;
+    float to_cells_x = 1.F;
+    float to_cells_y = 1.F;
     DominantMotion dominant;            // of the field that the displacements come from
   };
   // What a cell would do with a track, and how well it fits.
@@ -161,11 +177,20 @@ class TrackBuilder {
     Point velocity;
     float variance = 0.F;
   };
+  // How far to trust a block's motion.
+  struct Verdict {
+    float variance = 0.F;
+    bool rough = false;
+  };
   // How the units around a block move, against the block.
   struct Agreement {
     int judged = 0;
     int agreeing = 0;
     double distance = 0;  // summed over the judged ones
+  };
+  struct OpenUnit {
+    int32_t row = 0;
+    int32_t col = 0;
   };
   struct Window {
     int top = 0;
@@ -181,7 +206,7 @@ class TrackBuilder {
   Frame* find_frame(int decode_index) const;
   bool is_waiting(int display_index) const;
   Frame& read_frame(const CodedFrame& coded);
-  void judge_blocks(Frame& frame, const CodedFrame& coded) const;
+  void judge_blocks(Frame& frame, const CodedFrame& coded);
   void interpolate(Frame& frame);
   void bridge(Frame& frame);
   bool moves_alike(const UnitMotion& a, const UnitMotion& b) const;
@@ -192,31 +217,37 @@ class TrackBuilder {
   bool is_within_reach(int interval) const;
   bool links(const Frame& from, const Frame& to) const;
   void fit_dominant(Link& link);
+  void note_open_units();
+  bool is_open(OpenUnit unit) const;
   void chain_backward(const Link& link, int list, Reach reach);
   void chain_forward(const Link& link, int list);
-  void note_open_units(const Frame& other);
+  void note_unplaced_units(const Frame& other);
   bool may_find_track(const Link& link, int unit, const UnitMotion& motion, Reach reach) const;
-  void find_track(const Link& link, int cell, const UnitMotion& motion, int* best,
+  void find_track(const Link& link, int cell, Point centre, const UnitMotion& motion, int* best,
                   Claim* best_claim) const;
-  void find_track_beside(const Link& link, int list, int cell, int* best,
+  void find_track_beside(const Link& link, int list, int cell, Point centre, int* best,
                          Claim* best_claim) const;
-  bool is_preferred(const Cell& cell, const Claim& claim, const Cell& other,
+  bool is_preferred(const Frame& frame, int cell, const Claim& claim, int other_cell,
                     const Claim& other_claim) const;
   bool is_better(const Claim& claim, const Claim& holder) const;
   static float distance(Point a, Point b);
   bool passes_cosine(const Link& link, int other_cell, Point from, Point moved,
                      Claim* claim) const;
-  void place(int cell, int32_t track, Point position, Point velocity, float variance);
+  bool is_unplaced(const Cell& cell) const;
+  int32_t length(const Frame& frame, const Cell& cell) const;
+  void carry_on(Frame& other, int other_cell, int cell, const Claim& claim);
+  int32_t start_track(Frame& frame, int cell);
   void seed();
   void observe();
+  void observe(Track& track, const Frame& frame, const Cell& cell);
   void release_frames(const int32_t* slots);
   void release(Frame& frame);
   void start_stretch(Track& track);
   void keep(const Track& track);
-  Window around(const Frame& frame, Point position, float reach_x, float reach_y) const;
+  static Window around(const Link& link, Point position, float reach);
   int unit_of(const Frame& frame, int cell) const;
   static Point unit_centre(const Frame& frame, int unit);
-  Point cell_centre(const Frame& frame, int cell) const;
+  Point cell_centre(int row, int col) const;
   bool is_in_cell(Point position, Point centre) const;
   bool is_in_picture(Point position) const;
   static Point move(const Frame& frame, const UnitMotion& motion, Point position);
@@ -234,10 +265,11 @@ class TrackBuilder {
   int64_t next_serial_ = 0;
   std::vector<Track> tracks_;
   std::vector<int32_t> free_tracks_;
-  std::vector<Stretch> stretches_;
+  std::deque<Stretch> stretches_;
+  std::vector<int32_t> previous_stretch_;  // of the same track, by stretch
   std::vector<int32_t> free_stretches_;
-  TrackArrays done_;  // observations of the kept tracks, in the order in which these ended
-  std::vector<Kept> kept_;
+  std::vector<Kept> kept_;  // in the order in which they ended, as their observations are
+  Done done_;
   std::vector<std::unique_ptr<Frame>> frames_;       // in bitstream order
   std::vector<std::unique_ptr<Frame>> idle_frames_;  // their memory is used again
 
@@ -246,7 +278,9 @@ class TrackBuilder {
   std::vector<Link> links_;
   std::vector<Claim> claims_;      // by cell, free between links
   std::vector<int32_t> claimed_;   // those that are not
-  std::vector<uint8_t> open_units_;
+  std::vector<OpenUnit> open_units_;      // of the current frame, in raster order
+  std::vector<uint8_t> unplaced_units_;    // of a frame with tracks
+  std::array<std::vector<Verdict>, 2> verdicts_;
   std::vector<UnitMotion> block_motion_;
   std::vector<MotionSample> samples_;
   std::vector<float> scratch_;
