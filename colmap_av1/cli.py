@@ -70,6 +70,20 @@ _ABOUT_NAMES = (
     "'-' and '_' are alike in option names. COLMAP's spellings are accepted, such as "
     "--ImageReader.camera_model."
 )
+_ANY_VIDEO = "a video; one that is not AV1 is converted first"
+# The stages of `match`, as their options are titled.
+_STAGES: dict[type, str] = {
+    ImageOptions: "images",
+    MatchOptions: "stream",
+    CameraOptions: "camera",
+    TrackOptions: "tracks",
+    RefineOptions: "refinement",
+    DensityOptions: "density",
+    PairOptions: "pairs",
+    VerifyOptions: "two-view geometry",
+    ReadOptions: "bitstream",
+    EncodeOptions: "encoding of a video that is not AV1",
+}
 _INTERRUPTED = 130
 _BROKEN_PIPE = 141
 _FAILED_CHECK = 1
@@ -134,240 +148,11 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-
-    command = _add_command(
-        commands,
-        "match",
-        _run_match,
-        "fill a COLMAP database from a video",
-        "--database PATH --video PATH [--image_path PATH]",
-    )
-    command.add_argument(
-        "--database",
-        "--database_path",
-        required=True,
-        metavar="PATH",
-        help="COLMAP database; made where it is missing, else its images are used",
-    )
-    _add_video(command, "a video; one that is not AV1 is converted first")
-    command.add_argument(
-        "--image_path",
-        metavar="PATH",
-        help="folder to write the images to; existing ones of the right size are kept",
-    )
-    add_options(
-        command,
-        {
-            ImageOptions: "images",
-            MatchOptions: "database and stream",
-            CameraOptions: "camera",
-            TrackOptions: "tracks",
-            RefineOptions: "refinement",
-            DensityOptions: "density",
-            PairOptions: "pairs",
-            VerifyOptions: "two-view geometry",
-            ReadOptions: "bitstream",
-            EncodeOptions: "encoding of a video that is not AV1",
-        },
-    )
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "reconstruct",
-        _run_reconstruct,
-        "make a dense model for 3D Gaussian splatting",
-        "--video PATH --output PATH",
-    )
-    _add_video(command, "a video; one that is not AV1 is converted first")
-    _add_output(command, "folder for images/ and sparse/0/; that of an earlier run is gone on with")
-    stages = {
-        MapperOptions: "poses",
-        TriangulateOptions: "points",
-        ImageOptions: "images",
-        MatchOptions: "stream",
-        CameraOptions: "camera",
-        TrackOptions: "tracks",
-        RefineOptions: "refinement",
-        PairOptions: "pairs",
-        VerifyOptions: "two-view geometry",
-        ReadOptions: "bitstream",
-        EncodeOptions: "encoding of a video that is not AV1",
-    }
-    add_options(command, stages, without=("on_existing", "first_number", "single_camera"))
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "densify",
-        _run_densify,
-        "put dense points on the poses of a model that is there",
-        "--model PATH --video PATH --output PATH",
-    )
-    command.add_argument(
-        "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
-    )
-    _add_video(command, "the video its images come from")
-    _add_output(command, "new folder for the model")
-    command.add_argument(
-        "--image_path", metavar="PATH", help="folder of its images, where names leave doubt"
-    )
-    for kind in (MapperOptions, CameraOptions, PairOptions, VerifyOptions):
-        del stages[kind]
-    new_images = ("image_name", "num_images", "fps", "select", "skip_blurred")
-    add_options(command, stages, without=("on_existing", *new_images))
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "compare",
-        _run_compare,
-        "compare with SIFT and others on a video, with a report",
-        "--video PATH --output PATH [--reference PATH]",
-    )
-    _add_video(command, "a video; one that is not AV1 is converted first")
-    _add_output(command, "folder for the report; that of an earlier run is gone on with")
-    command.add_argument(
-        "--image_path",
-        metavar="PATH",
-        help="folder of images that exist or are to be written [within the output]",
-    )
-    command.add_argument(
-        "--reference",
-        metavar="PATH",
-        help="given truth: a COLMAP model, or a file with lines of 'name tx ty tz qx qy qz qw', "
-        "camera to world [the model of sift-exhaustive]",
-    )
-    add_options(
-        command,
-        {
-            CompareOptions: "comparison",
-            LearnedOptions: "learned features",
-            TriangulateOptions: "points of all tracks",
-            ImageOptions: "images",
-            MatchOptions: "stream",
-            CameraOptions: "camera",
-            TrackOptions: "tracks",
-            RefineOptions: "refinement",
-            PairOptions: "pairs",
-            VerifyOptions: "two-view geometry",
-            ReadOptions: "bitstream",
-            EncodeOptions: "encoding of a video that is not AV1",
-        },
-        without=("on_existing", "refine", "single_camera"),
-    )
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "encode",
-        _run_encode,
-        "convert a video to a good AV1 stream",
-        "--video PATH --output PATH",
-    )
-    _add_video(command, "a video that ffmpeg decodes")
-    _add_output(command, "the stream: .mp4, .mkv, .webm or .ivf")
-    command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
-    command.add_argument(
-        "--strict",
-        action="store_true",
-        help="fail on a damaged video instead of using the frames before the damage",
-    )
-    add_options(command, {EncodeOptions: "encoding"})
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "info",
-        _run_info,
-        "tell what a stream is made of and whether it is any good",
-        "--video PATH",
-    )
-    _add_video(command)
-    add_options(command, {ReadOptions: "bitstream"})
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "check",
-        _run_check,
-        "tell what COLMAP's mappers will make of a database",
-        "--database PATH",
-    )
-    _add_database(command)
-    command.add_argument(
-        "--strict",
-        action="store_true",
-        help="exit with status 1 where something stops the mappers",
-    )
-
-    command = _add_command(
-        commands,
-        "motion",
-        _run_motion,
-        "write the motion of every frame",
-        "--video PATH --output PATH",
-    )
-    _add_video(command)
-    _add_output(command, "a .npz or .h5 file")
-    add_options(command, {ReadOptions: "bitstream"})
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "export",
-        _run_export,
-        "write a database's features and matches for hloc",
-        "--database PATH --output PATH",
-    )
-    _add_database(command)
-    _add_output(command, "folder for the files")
-    add_options(command, {ExportOptions: "files"})
-    _add_quiet(command)
-
-    command = _add_command(
-        commands,
-        "view",
-        _run_view,
-        "draw motion, tracks, matches or a model",
-        "(--video PATH | --database PATH | --model PATH) --output PATH",
-    )
-    subject = command.add_mutually_exclusive_group(required=True)
-    subject.add_argument(
-        "--video", "--video_path", metavar="PATH", help="draw motion and tracks of an AV1 video"
-    )
-    subject.add_argument(
-        "--database", "--database_path", metavar="PATH", help="draw the matches of two images"
-    )
-    subject.add_argument(
-        "--model", "--model_path", metavar="PATH", help="draw points and camera path of a model"
-    )
-    command.add_argument(
-        "--output",
-        "--output_path",
-        metavar="PATH",
-        help="an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
-    )
-    command.add_argument("--image_path", metavar="PATH", help="folder of the database's images")
-    command.add_argument(
-        "--pair",
-        nargs=2,
-        metavar="NAME",
-        help="the images to draw [the pair with the most inliers]",
-    )
-    command.add_argument(
-        "--interactive",
-        action="store_true",
-        help="show the model in the browser (needs the viewer extra)",
-    )
-    command.add_argument(
-        "--port", type=int, default=8080, metavar="N", help="port of the interactive viewer [8080]"
-    )
-    add_options(
-        command,
-        {ViewOptions: "drawing", TrackOptions: "tracks", ReadOptions: "bitstream"},
-    )
-    _add_quiet(command)
+    for add in (
+        *(_add_match, _add_reconstruct, _add_densify, _add_compare, _add_encode),
+        *(_add_info, _add_check, _add_motion, _add_export, _add_view),
+    ):
+        add(commands)
     return parser
 
 
@@ -389,6 +174,10 @@ def _add_command(
     )
     command.set_defaults(run=run)
     return command
+
+
+def _stages_but(*left_out: type) -> dict[type, str]:
+    return {kind: title for kind, title in _STAGES.items() if kind not in left_out}
 
 
 def _add_database(command: argparse.ArgumentParser) -> None:
@@ -433,6 +222,34 @@ def _print_result(namespace: argparse.Namespace, rows: Rows, warnings: Sequence[
         print_summary(rows)
 
 
+def _add_match(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "match",
+        _run_match,
+        "fill a COLMAP database from a video",
+        "--database PATH --video PATH [--image_path PATH]",
+    )
+    command.add_argument(
+        "--database",
+        "--database_path",
+        required=True,
+        metavar="PATH",
+        help="COLMAP database; made where it is missing, else its images are used",
+    )
+    _add_video(command, _ANY_VIDEO)
+    command.add_argument(
+        "--image_path",
+        metavar="PATH",
+        help="folder to write the images to; existing ones of the right size are kept",
+    )
+    add_options(
+        command,
+        {**_STAGES, MatchOptions: "database and stream"},
+    )
+    _add_quiet(command)
+
+
 def _run_match(namespace: argparse.Namespace) -> None:
     options = _match_options(namespace)
     with progress_bars(namespace.quiet) as report:
@@ -448,6 +265,24 @@ def _run_match(namespace: argparse.Namespace) -> None:
         print_next(result)
 
 
+def _add_reconstruct(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "reconstruct",
+        _run_reconstruct,
+        "make a dense model for 3D Gaussian splatting",
+        "--video PATH --output PATH",
+    )
+    _add_video(command, _ANY_VIDEO)
+    _add_output(command, "folder for images/ and sparse/0/; that of an earlier run is gone on with")
+    add_options(
+        command,
+        {MapperOptions: "poses", TriangulateOptions: "points", **_stages_but(DensityOptions)},
+        without=("on_existing", "first_number", "single_camera"),
+    )
+    _add_quiet(command)
+
+
 def _run_reconstruct(namespace: argparse.Namespace) -> None:
     options = ReconstructOptions(
         match=_match_options(namespace),
@@ -457,6 +292,32 @@ def _run_reconstruct(namespace: argparse.Namespace) -> None:
     with progress_bars(namespace.quiet) as report:
         result = reconstruct(namespace.video, namespace.output, options=options, progress=report)
     _print_result(namespace, reconstruct_rows(result), result.warnings)
+
+
+def _add_densify(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "densify",
+        _run_densify,
+        "put dense points on the poses of a model that is there",
+        "--model PATH --video PATH --output PATH",
+    )
+    command.add_argument(
+        "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
+    )
+    _add_video(command, "the video its images come from")
+    _add_output(command, "new folder for the model")
+    command.add_argument(
+        "--image_path", metavar="PATH", help="folder of its images, where names leave doubt"
+    )
+    of_matches = (CameraOptions, DensityOptions, PairOptions, VerifyOptions)
+    of_new_images = ("image_name", "num_images", "fps", "select", "skip_blurred")
+    add_options(
+        command,
+        {TriangulateOptions: "points", **_stages_but(*of_matches)},
+        without=("on_existing", *of_new_images),
+    )
+    _add_quiet(command)
 
 
 def _run_densify(namespace: argparse.Namespace) -> None:
@@ -473,6 +334,40 @@ def _run_densify(namespace: argparse.Namespace) -> None:
             progress=report,
         )
     _print_result(namespace, densify_rows(result), result.warnings)
+
+
+def _add_compare(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "compare",
+        _run_compare,
+        "compare with SIFT and others on a video, with a report",
+        "--video PATH --output PATH [--reference PATH]",
+    )
+    _add_video(command, _ANY_VIDEO)
+    _add_output(command, "folder for the report; that of an earlier run is gone on with")
+    command.add_argument(
+        "--image_path",
+        metavar="PATH",
+        help="folder of images that exist or are to be written [within the output]",
+    )
+    command.add_argument(
+        "--reference",
+        metavar="PATH",
+        help="given truth: a COLMAP model, or a file with lines of 'name tx ty tz qx qy qz qw', "
+        "camera to world [the model of sift-exhaustive]",
+    )
+    add_options(
+        command,
+        {
+            CompareOptions: "comparison",
+            LearnedOptions: "learned features",
+            TriangulateOptions: "points of all tracks",
+            **_stages_but(DensityOptions),
+        },
+        without=("on_existing", "refine", "single_camera"),
+    )
+    _add_quiet(command)
 
 
 def _run_compare(namespace: argparse.Namespace) -> None:
@@ -506,6 +401,26 @@ def _run_compare(namespace: argparse.Namespace) -> None:
         )
 
 
+def _add_encode(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "encode",
+        _run_encode,
+        "convert a video to a good AV1 stream",
+        "--video PATH --output PATH",
+    )
+    _add_video(command, "a video that ffmpeg decodes")
+    _add_output(command, "the stream: .mp4, .mkv, .webm or .ivf")
+    command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="fail on a damaged video instead of using the frames before the damage",
+    )
+    add_options(command, {EncodeOptions: "encoding"})
+    _add_quiet(command)
+
+
 def _run_encode(namespace: argparse.Namespace) -> None:
     with progress_bars(namespace.quiet) as report:
         result = encode(
@@ -520,6 +435,19 @@ def _run_encode(namespace: argparse.Namespace) -> None:
     _print_result(namespace, [*rows, ("output", str(result.output))])
 
 
+def _add_info(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "info",
+        _run_info,
+        "tell what a stream is made of and whether it is any good",
+        "--video PATH",
+    )
+    _add_video(command)
+    add_options(command, {ReadOptions: "bitstream"})
+    _add_quiet(command)
+
+
 def _run_info(namespace: argparse.Namespace) -> None:
     with progress_bars(namespace.quiet) as report:
         result = inspect_stream(
@@ -530,10 +458,40 @@ def _run_info(namespace: argparse.Namespace) -> None:
     print_summary(info_rows(result))
 
 
+def _add_check(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "check",
+        _run_check,
+        "tell what COLMAP's mappers will make of a database",
+        "--database PATH",
+    )
+    _add_database(command)
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with status 1 where something stops the mappers",
+    )
+
+
 def _run_check(namespace: argparse.Namespace) -> int:
     result = check(namespace.database)
     print_summary(check_rows(result))
     return _FAILED_CHECK if namespace.strict and not result.mappable else 0
+
+
+def _add_motion(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "motion",
+        _run_motion,
+        "write the motion of every frame",
+        "--video PATH --output PATH",
+    )
+    _add_video(command)
+    _add_output(command, "a .npz or .h5 file")
+    add_options(command, {ReadOptions: "bitstream"})
+    _add_quiet(command)
 
 
 def _run_motion(namespace: argparse.Namespace) -> None:
@@ -547,6 +505,20 @@ def _run_motion(namespace: argparse.Namespace) -> None:
     _print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
 
 
+def _add_export(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "export",
+        _run_export,
+        "write a database's features and matches for hloc",
+        "--database PATH --output PATH",
+    )
+    _add_database(command)
+    _add_output(command, "folder for the files")
+    add_options(command, {ExportOptions: "files"})
+    _add_quiet(command)
+
+
 def _run_export(namespace: argparse.Namespace) -> None:
     with progress_bars(namespace.quiet) as report:
         num_images, num_pairs = export_hloc(
@@ -554,6 +526,52 @@ def _run_export(namespace: argparse.Namespace) -> None:
         )
     rows = [("images", str(num_images)), ("pairs", str(num_pairs))]
     _print_result(namespace, [*rows, ("output", namespace.output)])
+
+
+def _add_view(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "view",
+        _run_view,
+        "draw motion, tracks, matches or a model",
+        "(--video PATH | --database PATH | --model PATH) --output PATH",
+    )
+    subject = command.add_mutually_exclusive_group(required=True)
+    subject.add_argument(
+        "--video", "--video_path", metavar="PATH", help="draw motion and tracks of an AV1 video"
+    )
+    subject.add_argument(
+        "--database", "--database_path", metavar="PATH", help="draw the matches of two images"
+    )
+    subject.add_argument(
+        "--model", "--model_path", metavar="PATH", help="draw points and camera path of a model"
+    )
+    command.add_argument(
+        "--output",
+        "--output_path",
+        metavar="PATH",
+        help="an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
+    )
+    command.add_argument("--image_path", metavar="PATH", help="folder of the database's images")
+    command.add_argument(
+        "--pair",
+        nargs=2,
+        metavar="NAME",
+        help="the images to draw [the pair with the most inliers]",
+    )
+    command.add_argument(
+        "--interactive",
+        action="store_true",
+        help="show the model in the browser (needs the viewer extra)",
+    )
+    command.add_argument(
+        "--port", type=int, default=8080, metavar="N", help="port of the interactive viewer [8080]"
+    )
+    add_options(
+        command,
+        {ViewOptions: "drawing", TrackOptions: "tracks", ReadOptions: "bitstream"},
+    )
+    _add_quiet(command)
 
 
 def _run_view(namespace: argparse.Namespace) -> None:
