@@ -23,7 +23,7 @@ from colmap_av1.images import (
     natural_order,
 )
 from colmap_av1.options import ImageOptions
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import Tracks, order_by_frame
 
 _Image = NDArray[np.uint8]
 
@@ -183,7 +183,7 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
     focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
     number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
     step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
-    order = step[np.argsort(tracks.frame[step], kind="stable")]
+    order = step[order_by_frame(tracks.frame[step], tracks.num_frames)]
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames))
     centre = np.array([tracks.width, tracks.height]) / 2
     found = np.full(max(tracks.num_frames - 1, 0), np.nan)
@@ -258,7 +258,11 @@ def read_frame_list(
     try:
         lines = Path(path).read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ImageError(f"{path}: is no list of frames that can be read: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise ImageError(
+            f"{path}: is no list of frames that can be read: {reason}: give a text file with a "
+            "frame's index on each line"
+        ) from error
     entries: list[tuple[int, str]] = []
     for number, line in enumerate(lines, start=1):
         words = line.split(maxsplit=1)
@@ -424,7 +428,7 @@ def _rotation_field(
 def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
     """A function that lists the tracks a frame sees, ascending."""
     number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
-    order = np.argsort(tracks.frame, kind="stable")
+    order = order_by_frame(tracks.frame, tracks.num_frames)
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
     return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]
 

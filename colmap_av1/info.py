@@ -146,7 +146,6 @@ class Structure:
     Attributes:
         num_coded: frames with block data.
         num_shown: frames that the bitstream shows.
-        num_cut: those of them that an edit list hides.
         num_key_frames: key frames and intra-only frames among the coded ones.
         later_units: units of all frames but the first.
         inter_units: those of them that are inter coded.

@@ -23,12 +23,11 @@ from colmap_av1.database import (
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import DatabaseError
 from colmap_av1.image_matches import pair_images, shared_focal_length, verify_images
-from colmap_av1.images import write_images
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import keep_frames
 from colmap_av1.unchanged import unchanged
-from colmap_av1.video_images import prepare_images
+from colmap_av1.video_images import prepare_images, write_chosen
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
@@ -96,12 +95,10 @@ class MatchReport:
             *("--image_path", images, "--output_path", output),
         ]
         if self.forward_motion:
-            mapper += ["--Mapper.init_max_forward_motion", "1"]
             mapper += [
-                "--Mapper.ba_refine_focal_length",
-                "0",
-                "--Mapper.ba_refine_extra_params",
-                "0",
+                *("--Mapper.init_max_forward_motion", "1"),
+                *("--Mapper.ba_refine_focal_length", "0"),
+                *("--Mapper.ba_refine_extra_params", "0"),
             ]
         script = [
             *("python", "examples/map_with_pycolmap.py", "--database", database),
@@ -180,15 +177,8 @@ def match(
         if folder is not None:
             check_video()
             with clock.measure("images"):
-                num_written = write_images(
-                    source.pictures,
-                    folder,
-                    chosen.names,
-                    chosen.frames.tolist(),
-                    num_threads=options.verify.num_threads,
-                    operating_point=options.read.operating_point,
-                    display=display,
-                    progress=lambda done: progress("images", done, len(chosen.names)),
+                num_written = write_chosen(
+                    source.pictures, folder, chosen, options, display=display, progress=progress
                 )
 
     with clock.measure("database"):
@@ -202,7 +192,6 @@ def match(
             geometries=matched.geometries,
             on_existing=options.on_existing,
         )
-    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
     return MatchReport(
@@ -215,7 +204,7 @@ def match(
         num_images=len(matched.keypoints),
         num_written_images=num_written,
         num_tracks=len(lengths),
-        track_lengths={q: int(v) for q, v in zip(_LENGTH_QUANTILES, quantiles, strict=True)},
+        track_lengths={q: int(np.quantile(lengths, q, method="lower")) for q in _LENGTH_QUANTILES},
         num_observations=sum(len(k.xy) for k in matched.keypoints),
         focal_length=focal_length,
         num_pairs=len(matched.geometries),

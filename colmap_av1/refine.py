@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.options import RefineOptions
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import Tracks, order_by_frame
 
 # Pixels around a template's window: one for its gradients, two for the way back.
 _MARGIN = 3
@@ -93,7 +93,7 @@ def match_tracks(
     Args and errors are those of `refine_tracks`.
     """
     state = RefinedTracks.start(tracks, options)
-    by_frame = np.argsort(tracks.frame, kind="stable")
+    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
     bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
     next_frame = 0
     for count, (index, image) in enumerate(frames, start=1):

@@ -20,6 +20,7 @@ from colmap_av1.images import (
     has_shape,
     image_size,
     size_of_images,
+    write_images,
 )
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import MatchOptions
@@ -35,6 +36,8 @@ from colmap_av1.video_tracks import (
     times_of_frames,
     track_video,
 )
+
+_Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ def prepare_images(
                 f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
             )
 
-        def decode() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        def decode() -> Iterator[tuple[int, _Image]]:
             pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
             for index, picture in pictures:
                 progress("looking", index + 1, tracks.num_frames)
@@ -146,6 +149,40 @@ def prepare_images(
         size=size,
         # Images may be scaled by different factors along x and y.
         pixel_aspect=display.pixel_aspect * video_size[0] * size[1] / (video_size[1] * size[0]),
+    )
+
+
+def write_chosen(
+    pictures: Path,
+    folder: Path,
+    chosen: ChosenImages,
+    options: MatchOptions,
+    *,
+    display: Display,
+    progress: Progress,
+) -> int:
+    """Write the chosen frames of a video as images, see `write_images`.
+
+    Args:
+        pictures: the video.
+        folder: where the images go.
+        chosen: the images.
+        options: those of reading and the threads are used.
+        display: how pictures are cut and turned.
+        progress: told about the stage "images".
+
+    Returns:
+        The number of images written; the others were there.
+    """
+    return write_images(
+        pictures,
+        folder,
+        chosen.names,
+        chosen.frames.tolist(),
+        num_threads=options.verify.num_threads,
+        operating_point=options.read.operating_point,
+        display=display,
+        progress=lambda done: progress("images", done, len(chosen.names)),
     )
 
 

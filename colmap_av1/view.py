@@ -31,7 +31,7 @@ from colmap_av1.model import read_model
 from colmap_av1.motion import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.progress import Progress, no_progress
-from colmap_av1.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.tracks import Tracks, build_tracks, order_by_frame, show_tracks
 from colmap_av1.unchanged import unchanged
 from colmap_av1.video import decode_frames, open_stream, presented_frames, read_display
 
@@ -357,7 +357,7 @@ class _Drawing:
 
 def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
     length = np.diff(tracks.offsets)
-    by_frame = np.argsort(tracks.frame, kind="stable")
+    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
     step = np.diff(tracks.xy, axis=0, prepend=tracks.xy[:1])
     interval = np.diff(tracks.frame, prepend=tracks.frame[:1])
     starts = tracks.offsets[:-1][length > 1]

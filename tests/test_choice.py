@@ -168,10 +168,13 @@ def test_frame_list(tmp_path: Path) -> None:
         ("first.png\n", "names no frame"),
         ("5\n", "1 of 10 frames become images"),
         ("", "0 of 10 frames become images"),
+        (b"\xff\xd8\xff\xe0", r"list\.txt: .*: it is no text: give a text file"),
+        (None, r"list\.txt: .*: No such file or directory: give a text file"),
     ],
 )
-def test_bad_frame_lists(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "list.txt").write_text(text)
+def test_bad_frame_lists(tmp_path: Path, text: str | bytes | None, message: str) -> None:
+    if text is not None:
+        (tmp_path / "list.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
     options = ImageOptions(frame_list=str(tmp_path / "list.txt"))
     with pytest.raises(ImageError, match=message):
         choose_images(

@@ -24,7 +24,7 @@ from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import keep_frames
 from colmap_av1.unchanged import unchanged
 from colmap_av1.video import picture_size, read_display
-from colmap_av1.video_images import PreparedImages, prepare_images
+from colmap_av1.video_images import PreparedImages, prepare_images, write_chosen
 
 
 @dataclass(frozen=True)
@@ -126,16 +126,8 @@ def choose_footage(
             )
             chosen = prepared.chosen
             check_video()
-            write_images(
-                prepared.source.pictures,
-                images,
-                chosen.names,
-                chosen.frames.tolist(),
-                num_threads=options.verify.num_threads,
-                operating_point=options.read.operating_point,
-                display=prepared.display,
-                progress=lambda done: progress("images", done, len(chosen.names)),
-            )
+            pictures, display = prepared.source.pictures, prepared.display
+            write_chosen(pictures, images, chosen, options, display=display, progress=progress)
         return {
             "names": chosen.names,
             "frames": chosen.frames.tolist(),
