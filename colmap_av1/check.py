@@ -228,10 +228,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     layout, readers = _layout(connection)
     group = _largest_group(len(images.ids), pairs.index[used])
     parallax = _parallax(connection, path, images, pairs, cameras)
-    configs = [
-        _CONFIGS[c] if 0 <= c < len(_CONFIGS) else str(c)
-        for c in pairs.config[pairs.num_inliers > 0]
-    ]
+    configs = [_name_of_config(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
@@ -424,8 +421,9 @@ def _read_geometry(
         for name, blob in zip(names, blobs, strict=True)
         if blob is not None and len(blob) == 72
     }
-    needed = {"CALIBRATED": "E", "UNCALIBRATED": "F"}.get(_CONFIGS[config], "H")
-    if _CONFIGS[config] == "MULTIPLE" or needed not in models:
+    kind = _name_of_config(config)
+    needed = {"CALIBRATED": "E", "UNCALIBRATED": "F"}.get(kind, "H")
+    if kind == "MULTIPLE" or kind not in _CONFIGS or needed not in models:
         return None
     geometry = pycolmap.TwoViewGeometry()
     geometry.config = pycolmap.TwoViewGeometryConfiguration(config)
@@ -433,6 +431,11 @@ def _read_geometry(
     for name, model in models.items():
         setattr(geometry, name, model)
     return geometry
+
+
+def _name_of_config(config: int) -> str:
+    """COLMAP's name of a kind of geometry; the number of one that it has none for."""
+    return _CONFIGS[config] if 0 <= config < len(_CONFIGS) else str(config)
 
 
 def _image_findings(images: _Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:

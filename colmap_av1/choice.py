@@ -280,7 +280,7 @@ def read_frame_list(
         if not 0 <= frame < num_frames:
             raise ImageError(
                 f"{path}, line {number}: there is no frame {frame}: the video has frames 0 to "
-                f"{num_frames - 1}"
+                f"{num_frames - 1}, give one of them"
             )
         entries.append((frame, name))
     entries.sort()

@@ -14,7 +14,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from colmap_av1.errors import DatabaseError
+from colmap_av1.errors import DatabaseError, cannot_write
 
 # COLMAP's kMaxNumImages: image ids stay below it, and it spreads pair ids.
 MAX_NUM_IMAGES = 2147483647
@@ -123,14 +123,14 @@ def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
         "not a database": "it is not a COLMAP database: give another path",
         "malformed": "it is damaged: restore it from a copy, or give another path",
         "full": "the disk is full: free some space",
-        "disk I/O error": "it cannot be read or written (disk full, quota, or a failing disk)",
+        "disk I/O error": "it cannot be read or written: free some space, or use another disk",
         "readonly": "it may not be written: change its permissions, or give another path",
         "unable to open": "it cannot be opened: check the path and its permissions",
     }
     for sign, cause in causes.items():
         if sign in text:
             return f"{path}: {cause}"
-    return f"{path}: SQLite refuses: {text}"
+    return f"{path}: SQLite refuses: {text}: restore it from a copy, or give another path"
 
 
 def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
@@ -155,7 +155,7 @@ def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
             raise DatabaseError(f"{path} was made by another process meanwhile: run again")
         partial.replace(target)
     except OSError as error:
-        raise DatabaseError(f"{path} cannot be written: {error.strerror}") from error
+        raise DatabaseError(cannot_write(path, error)) from error
     finally:
         partial.unlink(missing_ok=True)
 

@@ -18,7 +18,7 @@ from colmap_av1.dense_points import (
     seen_in,
     triangulate_tracks,
 )
-from colmap_av1.errors import ImageError, ModelError, OptionError
+from colmap_av1.errors import ImageError, ModelError, OptionError, cannot_write
 from colmap_av1.files import remove_leftovers, whole_folder
 from colmap_av1.images import size_of_images
 from colmap_av1.model import posed_images, read_model, write_model
@@ -150,7 +150,7 @@ def densify(
             with whole_folder(output) as partial:
                 write_model(partial, cameras, images, dense)
         except OSError as error:
-            raise ModelError(f"{output}: cannot be written: {error.strerror}") from error
+            raise ModelError(cannot_write(output, error)) from error
     return DensifyReport(
         output=output,
         model=model,
@@ -187,7 +187,7 @@ def _check_input(
     check_options(options.match, video_size)
     check_triangulate_options(options.triangulate)
     if len(sizes) < 2:
-        raise ModelError(f"{model}: only one image has a pose: points need two or more")
+        raise ModelError(f"{model}: only one image has a pose: give a model with two or more")
     try:
         size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
     except ImageError as error:

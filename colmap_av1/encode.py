@@ -18,7 +18,14 @@ import av
 import av.error
 import imageio_ffmpeg
 
-from colmap_av1.errors import BitstreamError, EncodeError, NotAv1Error, OptionError, VideoError
+from colmap_av1.errors import (
+    BitstreamError,
+    EncodeError,
+    NotAv1Error,
+    OptionError,
+    VideoError,
+    cannot_write,
+)
 from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.options import EncodeOptions
 from colmap_av1.processes import bound
@@ -215,7 +222,9 @@ def encode(
         command += ["-metadata", f"comment={words}", f"file:{partial}"]
         count = _run(command, video, facts.size, lambda done: progress("encoding", done, total))
         if count == 0:
-            raise VideoError(f"{video}: no frame can be decoded: the file is damaged")
+            raise VideoError(
+                f"{video}: no frame can be decoded, it is damaged: give another copy of it"
+            )
         _check_stream(partial, count)
         return count
 
@@ -226,7 +235,7 @@ def encode(
             if readable < count:
                 count = convert(partial, readable)
     except OSError as error:
-        raise EncodeError(f"{output}: cannot be written: {error.strerror or error}") from error
+        raise EncodeError(cannot_write(output, error)) from error
     return EncodeReport(output, encoder.ffmpeg_name, count)
 
 
@@ -391,7 +400,7 @@ def _run(
                 f"{video}: the disk is full: free some space, or say where the stream goes"
             )
         if count == 0 and ("Invalid data" in said or "does not contain any stream" in said):
-            raise VideoError(f"{video}: cannot be decoded: {reason}")
+            raise VideoError(f"{video}: cannot be decoded: {reason}: give another copy of it")
         raise EncodeError(
             f"{video}: the encoder failed after {count} frames ({reason}): try another --encoder"
         )
@@ -454,7 +463,7 @@ def _readable_frames(video: Path, facts: VideoFacts, count: int, strict: bool) -
             "would not be those of the video: convert it with another program first"
         )
     if readable == 0:
-        raise VideoError(f"{video}: no frame can be decoded: {damage}")
+        raise VideoError(f"{video}: no frame can be decoded: {damage}: give another copy of it")
     if strict:
         raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
     _warn_of_damage(video, readable, facts, damage)

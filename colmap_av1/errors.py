@@ -7,6 +7,8 @@ package.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class ColmapAv1Error(Exception):
     """Base class of every error this package raises for bad input."""
@@ -54,3 +56,9 @@ class OptionError(ColmapAv1Error):
 
 class EvaluationError(ColmapAv1Error):
     """A front-end or a mapper that is compared failed; the message says where its log is."""
+
+
+def cannot_write(path: Path, error: Exception) -> str:
+    """The message where the system refuses to write a file or folder."""
+    reason = getattr(error, "strerror", None) or error
+    return f"{path}: cannot be written: {reason}: mend that, or give another path"

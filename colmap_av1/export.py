@@ -25,7 +25,8 @@ from colmap_av1.database import (
     matches_from_row,
 )
 from colmap_av1.database_file import check_layout, is_new, open_unaltered
-from colmap_av1.errors import DatabaseError, HlocError, OptionError
+from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
+from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.hdf5 import new_hdf5
 from colmap_av1.options import ExportOptions
 from colmap_av1.progress import Progress, no_progress
@@ -140,29 +141,28 @@ def _pair_part(name: str) -> str:
 
 @contextlib.contextmanager
 def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
-    """Open the three files under other names, which they lose at the end."""
+    """Open the three files, each a `whole_file`."""
     made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
-    targets = [folder / name for name in (FEATURES, MATCHES, PAIRS)]
-    partial = [t.with_name(f".{t.name}.{os.getpid()}.tmp") for t in targets]
+    names = (FEATURES, MATCHES, PAIRS)
     complete = False
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with (
-            new_hdf5(partial[0]) as features,
-            new_hdf5(partial[1]) as matches,
-            open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
-        ):
-            yield features, matches, pairs
-        for source, target in zip(partial, targets, strict=True):
-            source.replace(target)
+        for name in names:
+            remove_leftovers(folder, name)
+        with contextlib.ExitStack() as files:
+            partial = [files.enter_context(whole_file(folder / name)) for name in names]
+            with (
+                new_hdf5(partial[0]) as features,
+                new_hdf5(partial[1]) as matches,
+                open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
+            ):
+                yield features, matches, pairs
         complete = True
     except OSError as error:
-        raise OptionError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise OptionError(cannot_write(folder, error)) from error
     finally:
-        with contextlib.suppress(OSError):
-            for source in partial:
-                source.unlink(missing_ok=True)
-            if not complete:
+        if not complete:
+            with contextlib.suppress(OSError):
                 for parent in made:
                     parent.rmdir()
 
@@ -226,7 +226,7 @@ def _write_pairs(
         if len(np.unique(found[:, 0])) != len(found):
             raise DatabaseError(
                 f"{path}: a keypoint of {names[i]!r} matches several of {names[j]!r}, for which "
-                "hloc's layout has no place"
+                "hloc's layout has no place: match these images again"
             )
         narrow = counts[j] <= np.iinfo(np.int16).max
         matches0 = np.full(counts[i], _NO_MATCH, dtype=np.int16 if narrow else np.int32)

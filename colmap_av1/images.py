@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.display import Display
-from colmap_av1.errors import ImageError, OptionError, VideoError
+from colmap_av1.errors import ImageError, OptionError, VideoError, cannot_write
 from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.unchanged import unchanged
 from colmap_av1.video import decode_frames
@@ -95,7 +95,9 @@ def frames_of_images(
         )
     if len(set(found)) < len(found):
         twice = next(number for number in found if found.count(number) > 1)
-        raise ImageError(f"two images have the frame number {twice}")
+        raise ImageError(
+            f"two images have the frame number {twice}: list their frames in a --frame_list"
+        )
     return np.array([number - first_number for number in found], dtype=np.int32)
 
 
@@ -202,7 +204,9 @@ def check_image_folder(
         raise ImageError(f"{existing_parent}: is a file: give a folder for the images")
     is_complete = not isinstance(names, str) and all(image_file(root, n).exists() for n in names)
     if not is_complete and not os.access(existing_parent, os.W_OK | os.X_OK):
-        raise ImageError(f"{existing_parent}: no permission to write images there")
+        raise ImageError(
+            f"{existing_parent}: no permission to write images there: give another folder"
+        )
     if isinstance(names, str):
         regex = _pattern_regex(names)
         present = [p.name for p in root.iterdir()] if root.is_dir() else []
@@ -276,7 +280,9 @@ def write_images(
         try:
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ImageError(f"{parent}: cannot be made: {error.strerror}") from error
+            raise ImageError(
+                f"{parent}: cannot be made: {error.strerror}: mend that, or give another path"
+            ) from error
         remove_leftovers(parent)
     try:
         with unchanged(Path(video)):
@@ -375,7 +381,9 @@ def _pattern_regex(pattern: str) -> re.Pattern[str]:
             f"image name '{pattern}' needs exactly one number field, such as frame_%06d.png"
         )
     if Path(pattern).name != pattern or pattern.startswith("."):
-        raise OptionError(f"image name '{pattern}' must be a plain file name without a folder")
+        raise OptionError(
+            f"image name '{pattern}' has a folder or a dot before it: give a plain file name"
+        )
     _check_extension(pattern)
     before, after = pattern.split(fields[0])
     return re.compile(re.escape(before) + r"\d+" + re.escape(after))
@@ -383,7 +391,7 @@ def _pattern_regex(pattern: str) -> re.Pattern[str]:
 
 def _check_extension(name: str) -> None:
     if PurePosixPath(name).suffix.lower() not in _WRITE_PARAMETERS:
-        raise OptionError(f"image name '{name}' must end in .png, .jpg or .jpeg")
+        raise OptionError(f"image name '{name}': give one that ends in .png, .jpg or .jpeg")
 
 
 def check_new_name(name: str) -> None:
@@ -437,4 +445,4 @@ def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
         with whole_file(path) as partial:
             partial.write_bytes(encoded.tobytes())
     except OSError as error:
-        raise ImageError(f"{path}: cannot be written: {error.strerror}") from error
+        raise ImageError(cannot_write(path, error)) from error

@@ -236,7 +236,9 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
         # Nothing is written, but the write lock is taken.
         write_matches(database, (), (), (), pairs=_NO_PAIRS, matches=(), geometries=())
     elif not os.access(database.resolve().parent, os.W_OK | os.X_OK):
-        raise DatabaseError(f"{database}: no permission to write a database there")
+        raise DatabaseError(
+            f"{database}: no permission to write a database there: give another path"
+        )
     return listed
 
 
@@ -256,7 +258,9 @@ def _cameras(
         camera_id = {image.name: image.camera_id for image in listed}
         missing = next((n for n in names if camera_id[n] not in cameras), None)
         if missing is not None:
-            raise DatabaseError(f"{database}: image '{missing}' has no camera")
+            raise DatabaseError(
+                f"{database}: image '{missing}' has no camera: import the images again"
+            )
         return [cameras[camera_id[name]] for name in names], None
     camera = make_camera(options, *size, pixel_aspect, focal_length)
     if options.single_camera:

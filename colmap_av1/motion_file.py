@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.errors import OptionError, VideoError, cannot_write
 from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.hdf5 import new_hdf5
 from colmap_av1.motion import FrameMotion, read_motion
@@ -68,7 +68,7 @@ def export_motion(
             if count == 0:
                 raise VideoError(f"{video}: holds no frame: give a video with pictures")
     except OSError as error:
-        raise OptionError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise OptionError(cannot_write(path, error)) from error
     return count
 
 

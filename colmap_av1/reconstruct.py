@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from colmap_av1.dense_points import LEAST_AGREEING
-from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, cannot_write
 from colmap_av1.files import whole_file
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import MapperOptions, ReconstructOptions
@@ -165,10 +165,12 @@ def _check_reconstruct_options(options: ReconstructOptions) -> None:
     if options.mapping.mapper_threads < 1:
         raise OptionError(f"mapper_threads is {options.mapping.mapper_threads}: give 1 or more")
     if not options.match.camera.single_camera:
-        raise OptionError("single_camera is 0: a trainer's folder has one camera, leave it at 1")
+        raise OptionError(
+            "single_camera is 0, but a trainer's folder has one camera: leave it at 1"
+        )
     name = options.match.images.image_name
     if name.count(".") != 1:
-        raise OptionError(f"image_name '{name}': trainers want no dot but that of the extension")
+        raise OptionError(f"image_name '{name}': give one without a dot but that of the extension")
 
 
 def _notes(facts: dict[str, Any]) -> list[str]:
@@ -202,4 +204,4 @@ def _write_report(report: ReconstructReport) -> None:
         with whole_file(path) as partial:
             partial.write_text(text + "\n")
     except OSError as error:
-        raise ModelError(f"{path}: cannot be written: {error.strerror}") from error
+        raise ModelError(cannot_write(path, error)) from error

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import ModelError, OptionError, cannot_write
 from colmap_av1.files import only_run, remove_leftovers
 
 _FOLDER = ".stages"
@@ -64,7 +64,7 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
                 raise OptionError(f"{output}: is the output of {other}: give another folder")
             alone = running.enter_context(only_run(lock))
         except OSError as error:
-            raise OptionError(f"{output}: cannot be written: {error.strerror}") from error
+            raise OptionError(cannot_write(output, error)) from error
         if not alone:
             raise OptionError(
                 f"{output}: another run is at work in it: wait for its end, or give another folder"

@@ -391,7 +391,9 @@ def _look(
     frame = next(frames, None)
     frames.close()
     if frame is None:
-        raise BitstreamError(f"{path}: no frame can be decoded: the file is damaged")
+        raise BitstreamError(
+            f"{path}: no frame can be decoded, it is damaged: give another copy of it"
+        )
     matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
     turn = Display().turn if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
     if turn is None:
@@ -405,7 +407,9 @@ def _look(
         aspect = float(stream.sample_aspect_ratio or 1)
     left, top, right, bottom = crop
     if left + right >= frame.width or top + bottom >= frame.height:
-        raise VideoError(f"{path}: its container cuts off the whole picture: it is damaged")
+        raise VideoError(
+            f"{path}: its container cuts off the whole picture: give another copy of it"
+        )
     aspect = aspect if turn[0][0] else 1 / aspect
     return (frame.width, frame.height), Display(crop, turn, aspect)
 
@@ -500,11 +504,11 @@ def _open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
     file: _IvfWithRate | None = None
     try:
         if not path.exists():
-            raise VideoError(f"{path}: no such file")
+            raise VideoError(f"{path}: no such file: give the path of a video")
         if path.is_dir():
             raise VideoError(f"{path}: is a folder: give a video file")
         if path.is_file() and path.stat().st_size == 0:
-            raise VideoError(f"{path}: is an empty file")
+            raise VideoError(f"{path}: is an empty file: give the path of a video")
         if _is_ivf_without_rate(path):
             file = _IvfWithRate(path)
         # An absolute path: FFmpeg would take 'name:...' for a protocol.
@@ -516,9 +520,12 @@ def _open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
         if file is not None:
             file.close()
         if isinstance(error, PermissionError):
-            raise VideoError(f"{path}: no permission to read it") from error
+            raise VideoError(
+                f"{path}: no permission to read it: change that, or give another"
+            ) from error
         raise VideoError(
-            f"{path}: not a video, or damaged before its first frame: {_reason(error)}"
+            f"{path}: not a video, or damaged before its first frame ({_reason(error)}): give "
+            "another"
         ) from error
     try:
         yield container

@@ -24,7 +24,7 @@ from colmap_av1.database import (
     pair_id_from_image_ids,
 )
 from colmap_av1.database_file import check_layout, open_unaltered
-from colmap_av1.errors import DatabaseError, ImageError, OptionError
+from colmap_av1.errors import DatabaseError, ImageError, OptionError, cannot_write
 from colmap_av1.files import remove_leftovers, whole_file
 from colmap_av1.images import image_file
 from colmap_av1.model import read_model
@@ -153,7 +153,10 @@ def view_database(
         if picture is None:
             raise ImageError(f"{Path(image_path) / name}: is missing or no image: give its folder")
         if len(xy) and np.any(xy.max(axis=0) > [picture.shape[1], picture.shape[0]]):
-            raise ImageError(f"{Path(image_path) / name}: is smaller than its keypoints say")
+            raise ImageError(
+                f"{Path(image_path) / name}: is smaller than its keypoints say: give the "
+                "images that were matched"
+            )
         pictures.append(np.asarray(picture, dtype=np.uint8))
     return _draw_matches(pictures[0], pictures[1], keypoints[0], keypoints[1], matches)
 
@@ -189,7 +192,9 @@ def _read_pair(
         name_of = {image_id: name for name, image_id in images.items()}
         names = (name_of[ids[0]], name_of[ids[1]])
         if len(matches) == 0:
-            raise DatabaseError(f"{path}: has no matches of {names[0]!r} and {names[1]!r}")
+            raise DatabaseError(
+                f"{path}: has no matches of {names[0]!r} and {names[1]!r}: give another pair"
+            )
         keypoints = []
         for image_id in ids:
             row = connection.execute(
@@ -488,7 +493,9 @@ def _open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[_Image],
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OptionError(f"{path}: cannot be made: {error.strerror}") from error
+            raise OptionError(
+                f"{path}: cannot be made: {error.strerror}: mend that, or give another path"
+            ) from error
         yield write_file
         return
     with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
@@ -524,7 +531,7 @@ def _output(path: Path) -> Iterator[Path]:
         with whole_file(path) as partial:
             yield partial
     except (OSError, av.error.FFmpegError) as error:
-        raise OptionError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise OptionError(cannot_write(path, error)) from error
 
 
 @dataclass(frozen=True)

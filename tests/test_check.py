@@ -226,6 +226,11 @@ CHANGES = {
         "warning: 100% of the pairs see a plane",
         None,
     ),
+    "unknown kind": (
+        ["UPDATE two_view_geometries SET config = 12"],
+        "note: parallax is unknown",
+        True,
+    ),
     "several models": (
         ["UPDATE two_view_geometries SET config = 8"],
         "note: 28 pairs have several geometries",

@@ -50,7 +50,7 @@ def test_ignored_signal_during_the_imports(tmp_path: Path) -> None:
     words = [IGNORING, "-m", "colmap_av1", "info", "--video", "none.mp4"]
     status, said = end_while_importing(words, signal.SIGINT, tmp_path)
     assert status == 2
-    assert said.endswith("none.mp4: no such file")
+    assert "none.mp4: no such file" in said
 
 
 def test_programs_that_import_the_package_keep_their_handlers(tmp_path: Path) -> None:
