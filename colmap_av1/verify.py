@@ -246,7 +246,7 @@ def _verify_pair(
     if len(matches) < max(options.min_num_inliers, _MIN_MATCHES):
         return _degenerate()
     # A beginning of the order that was made for the whole image stays spread in its part.
-    places = a.place[matches[:, 0]]
+    places = a.place.take(matches[:, 0])
     num_refined = min(len(matches), max(_MAX_REFINED, options.max_samples))
     nearest = np.argpartition(places, num_refined - 1)[:num_refined]
     order = nearest[np.argsort(places[nearest])]
@@ -320,6 +320,8 @@ _MIN_INLIER_RATIO = 0.25
 # Matches a model is refined on, and steps of refinement.
 _MAX_REFINED = 500
 _REFINEMENT = {"max_iterations": 5, "step_tol": 1e-4, "gradient_tol": 1e-6}
+_TINY = float(np.finfo(np.float64).tiny)
+_IDENTITY = np.eye(3)
 # A model with this share of the matches is not searched any longer.
 _TRUSTED_SHARE = 0.95
 # A search finds no more inliers than a quick fit by this share of the matches, and hardly ever
@@ -485,7 +487,7 @@ def _epipolar_loss(model: _Model, points: _Points) -> float:
     if model.matrix is None:
         return math.inf
     algebraic, gradient = _epipolar_terms(model.matrix, points.spread_a, points.spread_b)
-    squared = algebraic**2 / np.maximum(gradient, np.finfo(float).tiny)
+    squared = algebraic**2 / np.maximum(gradient, _TINY)
     return float(np.log1p(squared).sum())
 
 
@@ -529,23 +531,28 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
     rows = (b[:, None] * a).reshape(9, -1)
     F = np.linalg.eigh(rows @ rows.T)[1][:, 0].reshape(3, 3)
     algebraic, gradient = _epipolar_terms(F, a[:2], b[:2])
-    weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + np.finfo(float).tiny)
+    weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _TINY)
     F = np.linalg.eigh((rows * weight) @ rows.T)[1][:, 0].reshape(3, 3)
-    U, s, Vt = np.linalg.svd(F)
-    return np.asarray(to_b.T @ (U[:, :2] * s[:2]) @ Vt[:2] @ to_a)
+    # Refinement takes the nearest matrix of rank two.
+    return np.asarray(to_b.T @ F @ to_a)
 
 
 def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
     """Points [2, n] as homogeneous ones about 0 of size 1, and what makes them so, [3, 3]."""
-    centre = x.mean(axis=1)
+    centre = x.sum(axis=1) / x.shape[1]
     moved = x - centre[:, None]
-    scale = 1 / max(math.sqrt(np.vdot(moved, moved) / x.size), np.finfo(float).tiny)
-    homogeneous = np.ones((3, x.shape[1]))
-    np.multiply(moved, scale, out=homogeneous[:2])
+    scale = 1 / max(math.sqrt(np.vdot(moved, moved) / x.size), _TINY)
     transform = np.array(
         [[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]]
     )
-    return homogeneous, transform
+    return _homogeneous(moved * scale), transform
+
+
+def _homogeneous(x: _Floats) -> _Floats:
+    """Points [2, n] with a third coordinate 1, [3, n]."""
+    extended = np.ones((3, x.shape[1]))
+    extended[:2] = x
+    return extended
 
 
 def _find_homography(points: _Points, search: _Search, num_rival: int) -> _Model:
@@ -564,8 +571,14 @@ def _find_homography(points: _Points, search: _Search, num_rival: int) -> _Model
     num_matches = points.a.shape[1]
     xa, xb = points.first(search.options.max_samples)
     H = _affine_fit(xa, xb)
-    for loss in ("CAUCHY", "TRUNCATED"):
-        robust = {**_REFINEMENT, "loss_type": loss, "loss_scale": search.options.max_error}
+    # The first loss brings matches near that are to agree, the second drops all others.
+    for loss, steps in (("CAUCHY", 2), ("TRUNCATED", 3)):
+        robust = {
+            **_REFINEMENT,
+            "max_iterations": steps,
+            "loss_type": loss,
+            "loss_scale": search.options.max_error,
+        }
         H, _ = poselib.refine_homography(xa.T, xb.T, H, robust)
     found = _test(_transfer_inliers, H, points, search)
     decisive = _planar_share(search.options) * num_rival / num_matches
@@ -592,15 +605,11 @@ def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
 
 def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
     """The affine map, as a 3x3 matrix, that takes `xa` to `xb` with the least squares."""
-    centre_a, centre_b = xa.mean(axis=1), xb.mean(axis=1)
-    moved_a, moved_b = xa - centre_a[:, None], xb - centre_b[:, None]
-    square = moved_a @ moved_a.T
+    a = _homogeneous(xa)
+    square = a @ a.T
     # A little more than that, so points on a line have a solution.
-    square += np.eye(2) * (1e-9 * np.trace(square) + np.finfo(float).tiny)
-    linear = np.linalg.solve(square, moved_a @ moved_b.T).T
-    H = np.eye(3)
-    H[:2, :2], H[:2, 2] = linear, centre_b - linear @ centre_a
-    return H
+    square += 1e-12 * np.trace(square) * _IDENTITY
+    return np.vstack([np.linalg.solve(square, a @ xb.T).T, _IDENTITY[2]])
 
 
 def _no_model(points: _Points) -> _Model:
