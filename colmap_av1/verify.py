@@ -319,7 +319,7 @@ _MIN_ITERATIONS = 15
 _MIN_INLIER_RATIO = 0.25
 # Matches a model is refined on, and steps of refinement.
 _MAX_REFINED = 500
-_REFINEMENT = {"max_iterations": 5, "step_tol": 1e-4, "gradient_tol": 1e-6}
+_REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
 _TINY = float(np.finfo(np.float64).tiny)
 _IDENTITY = np.eye(3)
 # A model with this share of the matches is not searched any longer.
