@@ -180,12 +180,12 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
         "height": height,
         "params": [focal, 0.0, 0.0],
     }
-    place = _spread_order(pixels, (width, height), seed).astype(np.int32)
+    place = _spread_order(pixels, (width, height), seed)
     to_flat = np.diag([focal, focal, 1.0]) @ np.linalg.inv(camera.calibration_matrix())
     return _View(camera, keypoints.xy, flat, focal, to_flat, pinhole, place)
 
 
-def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int64]:
+def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
     """Order points so that any beginning of the order is spread over the image.
 
     The image is divided into cells; every cell gives one random point before any gives its
@@ -197,18 +197,22 @@ def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.in
         seed: seed of the random order within a cell.
 
     Returns:
-        int64 [n] place of each point in the order.
+        int32 [n] place of each point in the order.
     """
     edge = math.sqrt(size[0] * size[1] / _NUM_CELLS)
+    num_columns, num_rows = (math.ceil(length / edge) for length in size)
+    column = np.clip(x[:, 0] / edge, 0, num_columns - 1).astype(np.uint16)
+    row = np.clip(x[:, 1] / edge, 0, num_rows - 1).astype(np.uint16)
     order = np.random.default_rng(seed).permutation(len(x))
-    cell = np.floor(x[order] / edge).astype(np.int64)
-    key = cell[:, 1] * (size[0] + 1) + cell[:, 0]
-    by_cell = np.argsort(key, kind="stable")
-    count = np.arange(len(x))
-    starts = np.diff(key[by_cell], prepend=-1) != 0
-    turn = np.empty(len(x), dtype=np.int64)
-    turn[by_cell] = count - np.maximum.accumulate(np.where(starts, count, 0))
-    place = np.empty(len(x), dtype=np.int64)
+    # NumPy sorts numbers of 16 bits many times as fast as longer ones.
+    cell = (row * np.uint16(num_columns) + column)[order]
+    by_cell = np.argsort(cell, kind="stable")
+    sorted_cell = cell[by_cell]
+    count = np.arange(len(x), dtype=np.int32)
+    first = np.searchsorted(sorted_cell, sorted_cell)
+    turn = np.empty(len(x), dtype=np.uint16)
+    turn[by_cell] = np.minimum(count - first, np.iinfo(np.uint16).max)
+    place = np.empty(len(x), dtype=np.int32)
     place[order[np.argsort(turn, kind="stable")]] = count
     return place
 
