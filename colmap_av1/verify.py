@@ -390,7 +390,8 @@ def _verify_calibrated(
     qvec = tvec = None
     if config == TwoViewConfig.CALIBRATED:
         qvec = np.asarray(E.pose.q, dtype=np.float64).reshape(4)
-        tvec = np.asarray(E.pose.t, dtype=np.float64).reshape(3)
+        # PoseLib's steps along the sphere of directions leave it a little.
+        tvec = _unit(np.asarray(E.pose.t, dtype=np.float64).reshape(3))
     return TwoViewGeometry(
         config=config,
         inlier_matches=_inliers(matches, chosen),

@@ -126,6 +126,7 @@ def test_pose_against_truth() -> None:
         direction = np.degrees(np.arccos(np.clip(g.tvec @ t / np.linalg.norm(t), -1, 1)))
         assert angle < 0.5
         assert direction < 5
+        assert np.linalg.norm(g.tvec) == pytest.approx(1)
         x, y, z = g.tvec
         E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
         assert np.allclose(E / np.linalg.norm(E), g.E, atol=1e-6)
