@@ -83,12 +83,12 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         # In place, here and below: these arrays are the largest of a whole run.
         way *= share[tracks.frame]
         way *= way
-        sure = variance <= np.maximum(max_variance, way, out=way)
+        sure = variance <= np.maximum(np.float32(max_variance), way, out=way)
         del way
         tracks, variance = keep_observations(tracks, sure), variance[sure]
-    weight = 1.0 / (_SIGMA_FLOOR**2 + variance)
-    total = np.concatenate([[0.0], np.cumsum(weight)])
-    score = total[tracks.offsets[1:]] - total[tracks.offsets[:-1]]
+    variance += _SIGMA_FLOOR**2
+    weight = np.reciprocal(variance, out=variance)
+    score = np.add.reduceat(weight, tracks.offsets[:-1])
     kept = _core.select_spread(
         num_frames=tracks.num_frames,
         offsets=tracks.offsets,
@@ -102,31 +102,32 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
     return keep_observations(tracks, kept.view(np.bool_))
 
 
-def _variance_since_first(tracks: Tracks) -> NDArray[np.float64]:
+def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
     """Variance of each observation against the first of its track that is left, in px^2."""
-    variance = tracks.sigma.astype(np.float64)
-    variance *= variance
+    variance = tracks.sigma * tracks.sigma
     variance -= np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
-    return np.maximum(variance, 0.0, out=variance)
+    np.maximum(variance, 0, out=variance)
+    return variance
 
 
-def _way_since_first(tracks: Tracks) -> NDArray[np.float64]:
+def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
     """Distance of each observation to the first of its track that is left, in px."""
-    squared = np.zeros(len(tracks.xy))
+    squared = np.zeros(len(tracks.xy), dtype=np.float32)
     for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
-        first = np.repeat(along[tracks.offsets[:-1]], np.diff(tracks.offsets))
-        step = (along - first).astype(np.float64)
+        step = np.repeat(along[tracks.offsets[:-1]], np.diff(tracks.offsets))
+        np.subtract(along, step, out=step)
         squared += np.multiply(step, step, out=step)
-    return np.sqrt(squared, out=squared)
+    np.sqrt(squared, out=squared)
+    return squared
 
 
 def _error_shares(
-    tracks: Tracks, error: NDArray[np.float64], way: NDArray[np.float64], wide_tracks: int
-) -> NDArray[np.float64]:
+    tracks: Tracks, error: NDArray[np.float32], way: NDArray[np.float32], wide_tracks: int
+) -> NDArray[np.float32]:
     """Error allowed in each frame as a share of the way, [num_frames]: what its wide views need."""
     if wide_tracks == 0:
-        return np.zeros(tracks.num_frames)
-    shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE)
+        return np.zeros(tracks.num_frames, dtype=np.float32)
+    shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)
     usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * way)
     usable = usable[order_by_frame(tracks.frame[usable], tracks.num_frames)]
     bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))

@@ -46,10 +46,10 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     """Median step in pixels that leads to each frame: float64 [num_frames], 0 where none does."""
     starts = np.zeros(len(tracks.frame), dtype=np.bool_)
     starts[tracks.offsets[:-1]] = True
-    num_steps = len(tracks.frame) - (len(tracks.offsets) - 1)
     # Every n-th: steps of a track follow each other, so all tracks have their part.
-    stride = max(1, num_steps // (_NUM_STEPS * tracks.num_frames))
-    to = np.flatnonzero(~starts)[::stride]
+    stride = max(1, len(tracks.frame) // (_NUM_STEPS * tracks.num_frames))
+    to = np.arange(0, len(tracks.frame), stride)
+    to = to[~starts[to]]
     step = _length(tracks.xy[to] - tracks.xy[to - 1])
     frame = tracks.frame[to]
     step /= frame - tracks.frame[to - 1]

@@ -187,10 +187,16 @@ def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
         tracks,
         offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),
         frame=tracks.frame[kept],
-        xy=np.compress(kept, tracks.xy, axis=0),
+        xy=_rows(tracks.xy, kept),
         sigma=tracks.sigma[kept],
         confirmed=tracks.confirmed[kept],
     )
+
+
+def _rows(xy: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Some rows of a [n, 2] array: as numbers of eight bytes, which takes no indices."""
+    rows = np.ascontiguousarray(xy).view(np.uint64)[:, 0]
+    return rows[kept].view(np.float32).reshape(-1, 2)
 
 
 def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:

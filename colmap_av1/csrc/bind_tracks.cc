@@ -4,6 +4,10 @@
 
 #include <nanobind/ndarray.h>
 
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
+
 #include <cstddef>
 #include <cstdint>
 #include <initializer_list>
@@ -150,6 +154,10 @@ nb::tuple finish(TrackBuilder& builder) {
   {
     const nb::gil_scoped_release release;
     tracks = builder.finish();
+#ifdef __GLIBC__
+    // What was needed to build the tracks, as much as they are, would stay with the process.
+    malloc_trim(0);
+#endif
   }
   const std::size_t observations = tracks.frame.size();
   const std::size_t offsets = tracks.offsets.size();
