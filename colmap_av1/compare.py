@@ -31,6 +31,7 @@ from colmap_av1.model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions
 from colmap_av1.progress import Progress, no_progress
 from colmap_av1.stages import open_stages
+from colmap_av1.video import picture_size
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"
@@ -105,6 +106,7 @@ def compare(
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
     _check_training(options)
+    picture_size(video, options.match.read.operating_point)  # refuses what is no video
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
             video,
@@ -157,6 +159,8 @@ def _writing(output: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.filename is not None and output not in Path(error.filename).parents:
+            raise  # of what is read
         raise OptionError(
             f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
             "run the same command again once that is mended"

@@ -124,19 +124,6 @@ class FrameMotion:
 
 
 @dataclass(frozen=True)
-class _ShownFrame:
-    """One frame of the output, in output order.
-
-    Attributes:
-        decode_index: the event that decoded the frame.
-        first_showing: False where the frame was shown before.
-    """
-
-    decode_index: int
-    first_showing: bool
-
-
-@dataclass(frozen=True)
 class _Group:
     """Packets from a shown key frame on, which refer to none before: threads read them alone.
 
@@ -151,9 +138,15 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Index:
-    """What the headers say: the shown frames, the groups, units of the largest frame."""
+    """What the headers say.
 
-    shown: list[_ShownFrame]
+    Attributes:
+        shown: for each shown frame, in output order, the event that decoded it.
+        groups: the groups.
+        num_units: units of the largest frame.
+    """
+
+    shown: list[int]
     groups: list[_Group]
     num_units: int
 
@@ -184,8 +177,8 @@ def read_motion(
     options = options if options is not None else ReadOptions()
     index = _read_index(video, options)
     display_index: dict[int, int] = {}
-    for number, frame in enumerate(index.shown):
-        display_index.setdefault(frame.decode_index, number)
+    for number, decode_index in enumerate(index.shown):
+        display_index.setdefault(decode_index, number)
     count = 0
     try:
         for event in _read_events(video, options, index):
@@ -204,10 +197,9 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
 
     Of a temporal unit with several spatial layers the highest is output (7.18.1).
     """
-    shown: list[_ShownFrame] = []
+    shown: list[int] = []
     groups = [_Group(0, None)]
     num_units = 0
-    seen: set[int] = set()
     last_unit = -1
     parser = _core.Parser(
         operating_point=options.operating_point,
@@ -229,10 +221,9 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
                         continue
                     decoded = event.shown_decode_index if event.is_repeated else event.decode_index
                     if event.temporal_unit == last_unit and shown:
-                        seen.discard(shown.pop().decode_index)
+                        shown.pop()
                     last_unit = event.temporal_unit
-                    shown.append(_ShownFrame(decoded, decoded not in seen))
-                    seen.add(decoded)
+                    shown.append(decoded)
     except BitstreamError:
         pass
     return _Index(shown, groups, num_units)

@@ -116,10 +116,10 @@ def triangulate(
     The first guess of a point is the best of several midpoints of two rays (Hartley and Sturm,
     "Triangulation", 1997), judged by all observations; Gauss-Newton steps on the reprojection
     error follow, weighted by the expected error of each observation and by how well it agrees.
-    Observations beyond `max_error`, or behind the camera, are dropped. What is dropped may be a
-    point of its own, where a track slid from one surface to another: it is tried once more. Rays
-    that meet at an angle a and are off by e tell a distance to e / a of it; where that is too much
-    there is no point.
+    Observations beyond `max_reprojection_error`, or behind the camera, are dropped. What is dropped
+    may be a point of its own, where a track slid from one surface to another: it is tried once
+    more. Rays that meet at an angle a and are off by e tell a distance to e / a of it; where that
+    is too much there is no point.
 
     Args:
         sightings: the tracks.

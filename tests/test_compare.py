@@ -305,6 +305,9 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         assert f"trainer '{trainer}': " in error
     assert main([*given, "--learned_offsets", "1,0"]) == 2
     assert main([*given, "--iterations", "0"]) == 2
+    capsys.readouterr()
+    assert main(["compare", "--video", "none.mp4", "--output", str(output)]) == 2
+    assert "none.mp4: no such file" in capsys.readouterr().err
     assert not output.exists()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").touch()
