@@ -52,6 +52,8 @@ from colmap_av1.summaries import (
 )
 from colmap_av1.terminal import (
     PROGRAM,
+    allow_any_file_name,
+    print_error,
     print_next,
     print_summary,
     print_warning,
@@ -103,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: the process is told to end.
     """
+    allow_any_file_name()
     try:
         with warnings_as_lines(), ending_in_order():
             words = sys.argv[1:] if arguments is None else arguments
@@ -111,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status: int | None = namespace.run(namespace)
             sys.stdout.flush()
     except ColmapAv1Error as error:
-        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        print_error(error)
         return _BAD_INPUT
     except BrokenPipeError:  # as before `head`, which has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -120,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.filename is None:
             raise
         what = f"{os.fsdecode(error.filename)}: {error.strerror}"
-        print(f"{PROGRAM}: error: {what}: mend that, or give another path", file=sys.stderr)
+        print_error(f"{what}: mend that, or give another path")
         return _BAD_INPUT
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)

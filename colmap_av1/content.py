@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.display import Display, shown_picture, turned_back
 from colmap_av1.errors import ImageError
+from colmap_av1.images import read_image
 
 _Image = NDArray[np.uint8]
 
@@ -48,7 +49,7 @@ def frames_by_content(
         ImageError: there are more images than frames, an image cannot be read, shows no frame of
             the video, or shows several as well.
     """
-    images = np.array([_thumbnail(_read(path)) for path in files])
+    images = np.array([_thumbnail(read_image(path)) for path in files])
     frames = np.array([_thumbnail(picture) for _, picture in pictures])
     if len(images) > len(frames):
         raise ImageError(
@@ -87,7 +88,7 @@ def check_content(
     Raises:
         ImageError: one shows something else.
     """
-    images = np.array([_thumbnail(_read(path)) for path in files])
+    images = np.array([_thumbnail(read_image(path)) for path in files])
     likeness = np.zeros((len(files), 2 * _REACH + 1))
     for index, picture in pictures:
         near = [k for k, frame in enumerate(frames) if abs(index - frame) <= _REACH]
@@ -119,7 +120,7 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
     Raises:
         ImageError: the image cannot be read.
     """
-    image = _thumbnail(_read(path))
+    image = _thumbnail(read_image(path))
     back = turned_back(display)
     best = np.zeros(2)
     for _, picture in pictures:
@@ -179,12 +180,3 @@ def _thumbnail(image: _Image) -> NDArray[np.float32]:
     small = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).reshape(-1)
     small -= small.mean()
     return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), dtype=np.float32)
-
-
-def _read(path: Path) -> _Image:
-    # COLMAP, too, takes pixels as they are stored and leaves an orientation in EXIF alone.
-    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imread(str(path), how) if path.is_file() else None
-    if image is None:
-        raise ImageError(f"{path}: is missing or no image: give the folder of the images")
-    return np.asarray(image, dtype=np.uint8)

@@ -58,12 +58,17 @@ _REQUIRED_COLUMNS = {
 
 
 def is_new(path: Path) -> bool:
-    """Whether the file is absent or empty, so that making it loses nothing."""
+    """Whether the file is absent or empty, so that making it loses nothing.
+
+    Raises:
+        DatabaseError: it can be no database: its folder is missing, or it is no plain file.
+    """
     if path.is_dir():
         raise DatabaseError(f"{path} is a folder: give the path of a database file")
+    target = _target(path)
     if path.exists() and path.stat().st_size > 0:
         return False
-    if not path.resolve().parent.is_dir():
+    if not target.parent.is_dir():
         raise DatabaseError(f"{path}: the folder does not exist: make it first")
     for suffix in ("-journal", "-wal"):
         # SQLite would replay such a file into whatever database appears beside it.
@@ -71,6 +76,19 @@ def is_new(path: Path) -> bool:
         if leftover.exists():
             raise DatabaseError(f"{leftover} is left from another database: remove it first")
     return True
+
+
+def _target(path: Path) -> Path:
+    """The file that a path, which may be a link, stands for.
+
+    A new one would take the place of a device, such as /dev/null, and a pipe has no end.
+    """
+    if path.exists() and not path.is_file():
+        raise DatabaseError(f"{path} is no plain file: give the path of a database file")
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError) as error:
+        raise DatabaseError(f"{path} is a link that leads nowhere: give another path") from error
 
 
 def open_database(
@@ -88,7 +106,8 @@ def open_database(
 def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
     """Open a file that exists to read it, without leaving a trace in it or beside it."""
     # Without a log beside it the file is all there is, and SQLite needs no lock of its own.
-    logs = [path.resolve().with_name(path.resolve().name + end) for end in ("-journal", "-wal")]
+    target = _target(path)
+    logs = [target.with_name(target.name + end) for end in ("-journal", "-wal")]
     busy = any(log.exists() and log.stat().st_size > 0 for log in logs)
     return _connect(path, "mode=ro" if busy else "mode=ro&immutable=1", path)
 
@@ -99,7 +118,7 @@ def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
     try:
         with contextlib.closing(
             sqlite3.connect(
-                f"{path.resolve().as_uri()}?{how}",
+                f"{_target(path).as_uri()}?{how}",
                 uri=True,
                 timeout=_BUSY_TIMEOUT,
                 isolation_level=None,
@@ -135,7 +154,7 @@ def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
 
 def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
     """Make a database under another name in the same folder, then give it its own."""
-    target = path.resolve()
+    target = _target(path)
     _remove_leftovers(target)
     partial = target.with_name(f".{target.name}.{secrets.token_hex(8)}.partial")
     try:

@@ -419,6 +419,20 @@ def image_file(root: Path, name: str) -> Path:
     return root / name
 
 
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read an image file: uint8 [height, width, 3] BGR.
+
+    Raises:
+        ImageError: it is missing, or none that can be read.
+    """
+    # COLMAP, too, takes pixels as they are stored and leaves an orientation in EXIF alone.
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imread(str(path), how) if path.is_file() else None
+    if image is None:
+        raise ImageError(f"{path}: is missing or no image: give the folder of the images")
+    return np.asarray(image, dtype=np.uint8)
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, without decoding it in full.
 

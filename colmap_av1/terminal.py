@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import warnings
 from collections.abc import Iterator
@@ -73,7 +74,23 @@ def print_next(report: MatchReport) -> None:
 
 def print_warning(message: object) -> None:
     """Print a warning on a line of standard error."""
-    print(f"{PROGRAM}: warning: {message}", file=sys.stderr)
+    _print_line(f"{PROGRAM}: warning: {message}")
+
+
+def print_error(message: object) -> None:
+    """Print what is wrong on a line of standard error."""
+    _print_line(f"{PROGRAM}: error: {message}")
+
+
+def _print_line(text: str) -> None:
+    # Names of files may hold ends of lines.
+    print(text.replace("\n", "\\n"), file=sys.stderr)
+
+
+def allow_any_file_name() -> None:
+    """Let standard output take names of files that are no text, as the bytes they are."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="surrogateescape")
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from colmap_av1.database import (
 from colmap_av1.database_file import check_layout, open_unaltered
 from colmap_av1.errors import DatabaseError, ImageError, OptionError, cannot_write
 from colmap_av1.files import remove_leftovers, whole_file
-from colmap_av1.images import image_file
+from colmap_av1.images import image_file, read_image
 from colmap_av1.model import read_model
 from colmap_av1.motion import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
@@ -149,15 +149,13 @@ def view_database(
     names, keypoints, matches = _read_pair(path, pair)
     pictures = []
     for name, xy in zip(names, keypoints, strict=True):
-        picture = cv2.imread(str(image_file(Path(image_path), name)), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ImageError(f"{Path(image_path) / name}: is missing or no image: give its folder")
+        picture = read_image(image_file(Path(image_path), name))
         if len(xy) and np.any(xy.max(axis=0) > [picture.shape[1], picture.shape[0]]):
             raise ImageError(
                 f"{Path(image_path) / name}: is smaller than its keypoints say: give the "
                 "images that were matched"
             )
-        pictures.append(np.asarray(picture, dtype=np.uint8))
+        pictures.append(picture)
     return _draw_matches(pictures[0], pictures[1], keypoints[0], keypoints[1], matches)
 
 

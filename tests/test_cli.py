@@ -208,6 +208,21 @@ def test_path_that_the_system_refuses(
     assert "File name too long: " in line
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_of_files_that_are_no_text_or_several_lines(clip: Path, tmp_path: Path) -> None:
+    name = os.fsdecode(b"\xff.mp4")
+    (tmp_path / name).symlink_to(clip)
+    strict = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    words = [*COMMAND, "info", "--video", name]
+    run = subprocess.run(words, cwd=tmp_path, env=strict, capture_output=True, check=True)
+    assert run.stdout.startswith(b"video\t\xff.mp4\n")
+    run = subprocess.run(
+        [*COMMAND, "info", "--video", "a\nb"], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert run.stderr.startswith(b"colmap-av1: error: a\\nb: no such file")
+    assert run.stderr.count(b"\n") == 1
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
 def test_output_that_nobody_reads(clip: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "colmap_av1", "info", "--video", str(clip)]

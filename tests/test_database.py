@@ -30,6 +30,7 @@ from colmap_av1.database import (
     read_images,
     write_matches,
 )
+from colmap_av1.database_file import open_unaltered
 from colmap_av1.errors import DatabaseError, OptionError
 from colmap_av1.options import CameraOptions
 from colmap_av1.pairs import ImageKeypoints
@@ -379,6 +380,23 @@ def test_refusals_change_nothing(
     assert "\n" not in str(caught.value)
     assert (path.read_bytes() if path.is_file() else None) == before
     assert [p.name for p in tmp_path.iterdir()] == ["given.db"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes and links of a Unix")
+def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
+    """A device as /dev/null is one for all: a file must not take its place."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "round").symlink_to("round")
+    for name, what in (("pipe", "is no plain file"), ("round", "is a link that leads nowhere")):
+        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+            write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+            open_unaltered(tmp_path / name)
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link").symlink_to("new.db")
+    write_matches(tmp_path / "link", NAMES, CAMERA, **ROWS)
+    assert (tmp_path / "link").is_symlink()
+    assert len(read_images(tmp_path / "new.db")) == len(NAMES)
 
 
 def test_folder_that_is_not_there(tmp_path: Path) -> None:
