@@ -324,7 +324,8 @@ _MIN_INLIER_RATIO = 0.25
 # Matches a model is refined on, and steps of refinement.
 _MAX_REFINED = 500
 _REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
-_TINY = float(np.finfo(np.float64).tiny)
+# What keeps sums of points that coincide or lie on a line apart from 0.
+_ROUNDING = 1e-12
 _IDENTITY = np.eye(3)
 # A model with this share of the matches is not searched any longer.
 _TRUSTED_SHARE = 0.95
@@ -492,7 +493,7 @@ def _epipolar_loss(model: _Model, points: _Points) -> float:
     if model.matrix is None:
         return math.inf
     algebraic, gradient = _epipolar_terms(model.matrix, points.spread_a, points.spread_b)
-    squared = algebraic**2 / np.maximum(gradient, _TINY)
+    squared = algebraic**2 / np.maximum(gradient, np.finfo(np.float64).tiny)
     return float(np.log1p(squared).sum())
 
 
@@ -536,7 +537,7 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
     rows = (b[:, None] * a).reshape(9, -1)
     F = np.linalg.eigh(rows @ rows.T)[1][:, 0].reshape(3, 3)
     algebraic, gradient = _epipolar_terms(F, a[:2], b[:2])
-    weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _TINY)
+    weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _ROUNDING)
     F = np.linalg.eigh((rows * weight) @ rows.T)[1][:, 0].reshape(3, 3)
     # Refinement takes the nearest matrix of rank two.
     return np.asarray(to_b.T @ F @ to_a)
@@ -546,7 +547,7 @@ def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
     """Points [2, n] as homogeneous ones about 0 of size 1, and what makes them so, [3, 3]."""
     centre = x.sum(axis=1) / x.shape[1]
     moved = x - centre[:, None]
-    scale = 1 / max(math.sqrt(np.vdot(moved, moved) / x.size), _TINY)
+    scale = 1 / (math.sqrt(np.vdot(moved, moved) / x.size) + _ROUNDING)
     transform = np.array(
         [[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]]
     )
@@ -613,7 +614,7 @@ def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
     a = _homogeneous(xa)
     square = a @ a.T
     # A little more than that, so points on a line have a solution.
-    square += 1e-12 * np.trace(square) * _IDENTITY
+    square += _ROUNDING * np.trace(square) * _IDENTITY
     return np.vstack([np.linalg.solve(square, a @ xb.T).T, _IDENTITY[2]])
 
 

@@ -86,5 +86,12 @@ def test_circle_around_what_the_camera_looks_at() -> None:
     assert found is None
 
 
+def test_standing_still() -> None:
+    assert estimate(seen_by(np.zeros((NUM_FRAMES, 3)), np.zeros((NUM_FRAMES, 3)))) is None
+    tracks = walk()
+    xy = np.repeat(tracks.xy[::NUM_FRAMES], NUM_FRAMES, axis=0)
+    assert estimate(replace(tracks, xy=xy)) is None
+
+
 def test_too_few_matches() -> None:
     assert estimate(walk(num_points=40)) is None

@@ -235,6 +235,16 @@ def test_standing_still_is_panoramic() -> None:
     assert len(geometry.inlier_matches) == 200
 
 
+@pytest.mark.parametrize("camera", [KNOWN, UNKNOWN], ids=["calibrated", "uncalibrated"])
+def test_points_on_a_line_are_planar(camera: pycolmap.Camera) -> None:
+    line = np.linspace([10, 20], [300, 200], 200).astype(np.float32)
+    images = [ImageKeypoints(i, line + 3 * i, np.arange(200)) for i in range(2)]
+    matches = np.repeat(np.arange(200, dtype=np.uint32)[:, None], 2, axis=1)
+    (geometry,) = verify_pairs(images, np.array([[0, 1]]), [matches], camera)
+    assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
+    assert len(geometry.inlier_matches) == 200
+
+
 @pytest.mark.shared
 @pytest.mark.skipif(not SHELFBOX.is_dir(), reason="no ../shared/sequences beside the checkout")
 def test_same_decisions_as_colmap_on_real_images() -> None:
