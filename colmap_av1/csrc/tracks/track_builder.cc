@@ -21,6 +21,13 @@ constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
 int block_area(int mi_size) { return av1::kBlockWidth[mi_size] * av1::kBlockHeight[mi_size]; }
 
+bool has_compounds(const MotionField& field) {
+  for (int unit = 0; unit < field.num_units(); ++unit) {
+    if (field.ref_frame[2 * unit + 1] > 0) return true;
+  }
+  return false;
+}
+
 }  // namespace
 
 TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
@@ -151,7 +158,8 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
     return x < border || y < border || x > frame.coded_width - border || y > frame.height - border;
   };
   frame.mi_size.assign(field.mi_size, field.mi_size + num_units);
-  for (auto& list : frame.motion) list.assign(frame.mi_size.size(), UnitMotion{});
+  frame.num_lists = has_compounds(field) ? 2 : 1;
+  for (auto& list : frame.lists()) list.assign(frame.mi_size.size(), UnitMotion{});
   for (int row = 0; row < frame.visible_rows; ++row) {
     for (int col = 0; col < frame.visible_cols; ++col) {
       const int unit = row * field.mi_cols + col;
@@ -161,7 +169,7 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
           area > options_.max_uncoded_block_area) {
         continue;
       }
-      for (int list = 0; list < 2; ++list) {
+      for (int list = 0; list < frame.num_lists; ++list) {
         const Displacement d = model.at(unit, list);
         if (d.ref == 0 || !is_within_reach(frame.ref_interval[d.ref])) continue;
         const float x = kUnit * static_cast<float>(col) + kUnit / 2.F;
@@ -177,7 +185,7 @@ TrackBuilder::Frame& TrackBuilder::read_frame(const CodedFrame& coded) {
   if (options_.interpolation > 0) interpolate(frame);
   if (options_.bridge > 0) bridge(frame);
   frame.num_linked = {};
-  for (const auto& list : frame.motion) {
+  for (const auto& list : frame.lists()) {
     for (const UnitMotion& motion : list) ++frame.num_linked[motion.ref];
   }
   return frame;
@@ -194,7 +202,7 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) {
       const int block_cols = av1::kBlockWidth[frame.mi_size[unit]] / 4;
       const int block_rows = av1::kBlockHeight[frame.mi_size[unit]] / 4;
       const int origin = (row & ~(block_rows - 1)) * frame.cols + (col & ~(block_cols - 1));
-      for (int list = 0; list < 2; ++list) {
+      for (int list = 0; list < frame.num_lists; ++list) {
         if (origin != unit) {
           verdicts_[list][unit] = verdicts_[list][origin];
           continue;
@@ -219,7 +227,7 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) {
     }
   }
   for (std::size_t unit = 0; unit < frame.mi_size.size(); ++unit) {
-    for (int list = 0; list < 2; ++list) {
+    for (int list = 0; list < frame.num_lists; ++list) {
       frame.motion[list][unit].variance = verdicts_[list][unit].variance;
       if (verdicts_[list][unit].rough) frame.motion[list][unit].ref = 0;
     }
@@ -232,7 +240,7 @@ void TrackBuilder::judge_blocks(Frame& frame, const CodedFrame& coded) {
 // unit's displacement counts where that unit lies.
 void TrackBuilder::interpolate(Frame& frame) {
   const auto limit = static_cast<float>(options_.interpolation);
-  for (auto& list : frame.motion) {
+  for (auto& list : frame.lists()) {
     block_motion_.assign(list.begin(), list.end());
     for (int row = 0; row < frame.visible_rows; ++row) {
       for (int col = 0; col < frame.visible_cols; ++col) {
@@ -285,7 +293,7 @@ void TrackBuilder::bridge(Frame& frame) {
   for (int row = 0; row < frame.visible_rows; ++row) {
     for (int col = 0; col < frame.visible_cols; ++col) {
       const int unit = row * frame.cols + col;
-      if (block_motion_[unit].ref != 0 || frame.motion[1][unit].ref != 0) continue;
+      if (frame.moves(unit)) continue;
       UnitMotion between;
       float total = 0.F;
       bool agrees = true;
@@ -336,7 +344,7 @@ TrackBuilder::Agreement TrackBuilder::judge_border(const Frame& frame, int row, 
     if (own.ref == 0) return;
     const double interval = frame.ref_interval[own.ref];
     double best = std::numeric_limits<double>::infinity();
-    for (const auto& motion : frame.motion) {
+    for (const auto& motion : frame.lists()) {
       const UnitMotion& other = motion[outer_row * frame.cols + outer_col];
       if (other.ref == 0) continue;
       double ratio = 1;
@@ -395,16 +403,13 @@ void TrackBuilder::chain_frame(Frame& frame) {
   note_open_units();
   for (Link& link : links_) {
     if (uses_cosine() && options_.cosine_relative_to_dominant) fit_dominant(link);
-    for (int list = 0; list < 2; ++list) {
-      if (link.forward) {
-        chain_forward(link, list);
-      } else {
-        chain_backward(link, list, Reach::kOwn);
-      }
+    if (link.forward) {
+      for (int list = 0; list < link.other->num_lists; ++list) chain_forward(link, list);
+      continue;
     }
-    for (int list = 0; list < 2 && !link.forward && options_.bridge > 0; ++list) {
-      chain_backward(link, list, Reach::kBeside);
-    }
+    for (int list = 0; list < frame.num_lists; ++list) chain_backward(link, list, Reach::kOwn);
+    if (options_.bridge <= 0) continue;
+    for (int list = 0; list < frame.num_lists; ++list) chain_backward(link, list, Reach::kBeside);
   }
   seed();
   if (frame.display_index >= 0) observe();
@@ -463,7 +468,7 @@ void TrackBuilder::fit_dominant(Link& link) {
   const std::size_t stride = count / kMaxDominantSamples + 1;
   samples_.clear();
   std::size_t index = 0;
-  for (const auto& motion : frame.motion) {
+  for (const auto& motion : frame.lists()) {
     for (std::size_t unit = 0; unit < motion.size(); ++unit) {
       if (!link.refs[motion[unit].ref] || index++ % stride != 0) continue;
       const Point centre = unit_centre(frame, static_cast<int>(unit));
@@ -482,9 +487,7 @@ void TrackBuilder::note_open_units() {
   for (int row = 0; row < current_->visible_rows; ++row) {
     for (int col = 0; col < current_->visible_cols; ++col) {
       const int unit = row * current_->cols + col;
-      if (current_->motion[0][unit].ref != 0 || current_->motion[1][unit].ref != 0) {
-        open_units_.push_back({row, col});
-      }
+      if (current_->moves(unit)) open_units_.push_back({row, col});
     }
   }
 }
@@ -774,13 +777,14 @@ int32_t TrackBuilder::start_track(Frame& frame, int cell) {
   auto index = static_cast<int32_t>(tracks_.size());
   if (free_tracks_.empty()) {
     tracks_.emplace_back();
+    serials_.emplace_back();
   } else {
     index = free_tracks_.back();
     free_tracks_.pop_back();
     tracks_[index] = Track{};
   }
+  serials_[index] = frame.first_serial + cell;
   Track& track = tracks_[index];
-  track.serial = frame.first_serial + cell;
   track.frames = 1;
   frame.cells[cell].track = index;
   if (frame.display_index >= 0) observe(track, frame, frame.cells[cell]);
@@ -874,16 +878,17 @@ void TrackBuilder::release(Frame& frame) {
     Track& track = tracks_[cell.track];
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
-    if (track.length >= options_.min_length) keep(track);
+    if (track.length >= options_.min_length) keep(cell.track);
     for (int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
       free_stretches_.push_back(s);
     }
   }
 }
 
-void TrackBuilder::keep(const Track& track) {
+void TrackBuilder::keep(int32_t index) {
+  const Track& track = tracks_[index];
   const auto first = static_cast<std::ptrdiff_t>(done_.frame.size());
-  kept_.push_back({track.serial, first, track.length});
+  kept_.push_back({serials_[index], first, track.length});
   const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.length);
   done_.frame.resize(size);
   done_.xy.resize(2 * size);

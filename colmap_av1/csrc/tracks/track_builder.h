@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <deque>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "tracks/displacement.h"
@@ -116,7 +117,8 @@ class TrackBuilder {
     float upscale = 1.F;  // picture pixels to a coded one, above 1 by super-resolution
     std::array<int, kNumRefs> ref_decode_index{};
     std::array<int, kNumRefs> ref_interval{};  // in shown frames, 0 where unknown
-    std::array<std::vector<UnitMotion>, 2> motion;
+    std::array<std::vector<UnitMotion>, 2> motion;  // the second stays unused without compounds
+    int num_lists = 0;
     std::array<int, kNumRefs> num_linked{};  // entries of `motion`, by their ref
     std::vector<int32_t> warps;
     std::vector<uint8_t> mi_size;
@@ -125,10 +127,18 @@ class TrackBuilder {
     // Velocity per shown frame by which the track came here, less the frame's dominant
     // motion; NaN at a seed. Empty without the cosine test.
     std::vector<Point> velocity;
+
+    std::span<std::vector<UnitMotion>> lists() { return std::span(motion).first(num_lists); }
+    std::span<const std::vector<UnitMotion>> lists() const {
+      return std::span(motion).first(num_lists);
+    }
+    bool moves(int unit) const {
+      return motion[0][unit].ref != 0 || (num_lists > 1 && motion[1][unit].ref != 0);
+    }
   };
+  // Small: tracks are looked up all the time, in no order.
   struct Track {
-    int64_t serial = 0;
-    int64_t last_seen = -1;  // number of the frame in the order of chaining
+    int32_t last_seen = -1;  // number of the frame in the order of chaining
     int32_t last_stretch = -1;
     int32_t length = 0;
     int32_t frames = 0;  // that hold it
@@ -243,7 +253,7 @@ class TrackBuilder {
   void release_frames(const int32_t* slots);
   void release(Frame& frame);
   void start_stretch(Track& track);
-  void keep(const Track& track);
+  void keep(int32_t index);
   static Window around(const Link& link, Point position, float reach);
   int unit_of(const Frame& frame, int cell) const;
   static Point unit_centre(const Frame& frame, int unit);
@@ -261,9 +271,10 @@ class TrackBuilder {
   int height_ = 0;
   int num_frames_ = 0;
   int last_display_ = -1;  // of the frames shown so far
-  int64_t frames_chained_ = 0;
+  int32_t frames_chained_ = 0;
   int64_t next_serial_ = 0;
   std::vector<Track> tracks_;
+  std::vector<int64_t> serials_;  // of the tracks' seeds
   std::vector<int32_t> free_tracks_;
   std::deque<Stretch> stretches_;
   std::vector<int32_t> previous_stretch_;  // of the same track, by stretch
