@@ -383,9 +383,9 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
     """The frames that ffmpeg's fps filter takes: the last whose time rounds to a tick or below."""
     tick = np.floor(times * fps + 0.5)
     interval = np.median(np.diff(times)) if len(times) > 1 else 0.0
-    num_ticks = max(1, math.floor((times[-1] + interval) * fps + 0.5))
-    frames = np.searchsorted(tick, np.arange(num_ticks), side="right") - 1
-    return np.unique(frames).astype(np.int32)
+    num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + 0.5))
+    is_last = np.append(tick[1:] > tick[:-1], True)
+    return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 
 
 def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -23,6 +23,8 @@ _SPELLINGS = {"seed": ("--random_seed",)}
 # Options whose value is a file.
 _FILES = ("frame_list", "keep_stream")
 _PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
+# Whole numbers are 32 bits wide where they are used.
+_LARGEST = 2**31 - 1
 
 
 def add_options(
@@ -115,7 +117,29 @@ def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
         return str, "|".join(arguments)
     if hint is bool:
         return _parse_bool, "0|1"
-    return {int: (int, "N"), float: (float, "X"), str: (str, "TEXT")}[hint]
+    parsers: dict[Any, tuple[Callable[[str], Any], str]] = {
+        int: (_parse_int, "N"),
+        float: (_parse_float, "X"),
+        str: (str, "TEXT"),
+    }
+    return parsers[hint]
+
+
+def _parse_int(word: str) -> int:
+    try:
+        value = int(word)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{word}' is no whole number") from None
+    if abs(value) > _LARGEST:
+        raise argparse.ArgumentTypeError(f"{word} is too large: give {_LARGEST} at most")
+    return value
+
+
+def _parse_float(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{word}' is no number") from None
 
 
 def _parse_bool(word: str) -> bool:

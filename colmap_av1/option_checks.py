@@ -10,6 +10,7 @@ from colmap_av1.choice import check_image_options
 from colmap_av1.database import make_camera
 from colmap_av1.density import select_tracks
 from colmap_av1.errors import OptionError
+from colmap_av1.motion import check_read_options
 from colmap_av1.options import MatchOptions, OnExisting
 from colmap_av1.pairs import schedule_pairs
 from colmap_av1.refine import refine_tracks
@@ -27,6 +28,7 @@ def check_options(options: MatchOptions, size: tuple[int, int]) -> None:
     Raises:
         OptionError: an option has a value that cannot work.
     """
+    check_read_options(options.read)
     check_image_options(options.images)
     kinds = get_args(OnExisting)
     if options.on_existing not in kinds:

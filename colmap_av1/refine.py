@@ -17,6 +17,7 @@ from colmap_av1.tracks import Tracks, order_by_frame
 
 # Pixels around a template's window: one for its gradients, two for the way back.
 _MARGIN = 3
+_LARGEST_WINDOW = 101  # a template of each track is kept in memory
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.01)
 # Frames without a confirmation after which a track is given a new template.
 _MAX_MISSES = 3
@@ -426,9 +427,10 @@ def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> N
 def _check_options(options: RefineOptions) -> None:
     if options.refine not in ("none", "lk"):
         raise OptionError(f"refine is {options.refine!r}: give 'none' or 'lk'")
-    if options.refine_window < 5 or options.refine_window % 2 == 0:
+    if not 5 <= options.refine_window <= _LARGEST_WINDOW or options.refine_window % 2 == 0:
         raise OptionError(
-            f"refine_window is {options.refine_window}: give an odd number of 5 or more"
+            f"refine_window is {options.refine_window}: give an odd number from 5 to "
+            f"{_LARGEST_WINDOW}"
         )
     for name in ("refine_move", "refine_difference"):
         value = getattr(options, name)

@@ -13,6 +13,7 @@ from colmap_av1.options import (
     ImageOptions,
     MatchOptions,
     PairOptions,
+    ReadOptions,
     RefineOptions,
     VerifyOptions,
 )
@@ -23,6 +24,9 @@ SIZE = (192, 128)
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        ({"read": ReadOptions(operating_point=-1)}, "operating_point is -1: give 0 to 31"),
+        ({"read": ReadOptions(num_threads=0)}, "num_threads is 0: give 1 or more"),
+        ({"read": ReadOptions(max_frame_size=0)}, "max_frame_size is 0: give samples above 0"),
         ({"images": ImageOptions(every=0)}, "every is 0: give 1 or more"),
         ({"images": ImageOptions(image_name="x.png")}, "'x.png' needs exactly one number field"),
         ({"on_existing": "keep"}, "on_existing is 'keep': give error, append, replace"),
