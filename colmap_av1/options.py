@@ -138,7 +138,8 @@ class VerifyOptions:
     min_num_inliers: int = 15
     # the focal length prior is believed where E has more than this share of F's inliers
     min_e_f_inlier_ratio: float = 0.95
-    # a pair is planar or panoramic where H has more than this share of the inliers
+    # a pair is planar or panoramic where the homography that COLMAP finds has more than this share
+    # of the inliers
     max_h_inlier_ratio: float = 0.8
     # matches that models are searched on, spread over the image; more of them refine a model,
     # all are tested

@@ -277,7 +277,7 @@ def test_same_decisions_as_colmap_on_real_images() -> None:
         overlap.append(len(a & b) / len(a | b))
     # Pairs of neighbours lie near COLMAP's 0.8 between homography and fundamental matrix:
     # COLMAP with another seed agrees with itself on 95 % of such pairs.
-    assert np.mean(same) >= 0.85
+    assert np.mean(same) >= 0.9
     assert np.median(overlap) >= 0.95
 
 
