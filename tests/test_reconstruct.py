@@ -349,7 +349,7 @@ def words_of(process: Path) -> bytes:
         return b""
 
 
-def test_without_adjustment(made: ReconstructReport, tmp_path: Path) -> None:
+def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
     shutil.copytree(made.output, tmp_path / "plain")
     options = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)
@@ -358,7 +358,10 @@ def test_without_adjustment(made: ReconstructReport, tmp_path: Path) -> None:
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
     np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
     adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
-    assert np.nanmax(np.abs(poses - adjusted)) > 1e-4
+    errors, before = (pose_errors(p, truth.cam_from_world) for p in (adjusted, poses))
+    # With a loss that counts errors of half a pixel nearly in full it would be 0.44 and 0.59.
+    assert errors.ate < 0.4 * before.ate
+    assert errors.rotation < 0.45 * before.rotation
 
 
 def test_folder_of_others(tmp_path: Path) -> None:
