@@ -437,6 +437,14 @@ void TrackBuilder::find_links() {
     const float cell = 2.F * half_cell_;
     link.to_cells_x = 1.F / (cell * other.upscale * link.from_picture_x);
     link.to_cells_y = 1.F / (cell * link.from_picture_y);
+    link.picture_x = current_->width / other.width;
+    link.picture_y = current_->height / other.height;
+    if (link.interval != 0) {
+      // A backward displacement spans the interval, a forward one its negative.
+      const double interval = link.forward ? -link.interval : link.interval;
+      link.to_velocity_x = current_->width / from.coded_width / interval;
+      link.to_velocity_y = current_->height / from.height / interval;
+    }
     links_.push_back(link);
   };
   for (const auto& other : frames_) {
@@ -673,11 +681,12 @@ void TrackBuilder::find_track(const Link& link, int cell, Point centre, const Un
       if (found.track == kNone) continue;
       const Point target{found.position.x * link.from_picture_x,
                          found.position.y * link.from_picture_y};
-      Claim claim;
-      if (!move_back(*current_, motion, target, &claim.position) ||
-          !is_in_cell(claim.position, centre)) {
+      Point position;
+      if (!move_back(*current_, motion, target, &position) || !is_in_cell(position, centre)) {
         continue;
       }
+      Claim claim;
+      claim.position = position;
       claim.cell = cell;
       claim.cost = distance(claim.position, centre);
       claim.variance = found.variance + motion.variance;
@@ -735,22 +744,15 @@ bool TrackBuilder::passes_cosine(const Link& link, int other_cell, Point from, P
   if (!uses_cosine()) return true;
   // Velocities are kept in pixels of the picture they belong to.
   const Point stored = link.other->velocity[other_cell];
-  const float picture_scale = current_->width / link.other->width;
-  const Point previous{stored.x * picture_scale,
-                       stored.y * current_->height / link.other->height};
+  const Point previous{stored.x * link.picture_x, stored.y * link.picture_y};
   claim->velocity = previous;
   const bool relative = options_.cosine_relative_to_dominant;
   if (link.interval == 0 || (relative && !link.dominant.valid)) return true;
 
-  // A backward displacement spans the interval, a forward one its negative.
-  const Frame& frame = link.forward ? *link.other : *current_;
-  const double interval = link.forward ? -link.interval : link.interval;
-  const double to_x = current_->width / frame.coded_width / interval;
-  const double to_y = current_->height / frame.height / interval;
-  const double vx = (moved.x - from.x) * to_x;
-  const double vy = (moved.y - from.y) * to_y;
-  const double dominant_x = relative ? link.dominant.dx(from.x, from.y) * to_x : 0;
-  const double dominant_y = relative ? link.dominant.dy(from.x, from.y) * to_y : 0;
+  const double vx = (moved.x - from.x) * link.to_velocity_x;
+  const double vy = (moved.y - from.y) * link.to_velocity_y;
+  const double dominant_x = relative ? link.dominant.dx(from.x, from.y) * link.to_velocity_x : 0;
+  const double dominant_y = relative ? link.dominant.dy(from.x, from.y) * link.to_velocity_y : 0;
   claim->velocity = {static_cast<float>(vx - dominant_x), static_cast<float>(vy - dominant_y)};
   if (std::isnan(previous.x)) return true;
   const double px = previous.x + dominant_x;
@@ -805,9 +807,10 @@ void TrackBuilder::seed() {
   };
   for (int row = 0; row < options_.cells * current_->visible_rows; row += size) {
     for (int col = 0; col < options_.cells * current_->visible_cols; col += size) {
+      if (!is_empty(row, col)) continue;
       const Point centre{2.F * half_cell_ * static_cast<float>(col) + half,
                          2.F * half_cell_ * static_cast<float>(row) + half};
-      if (!is_in_picture(centre) || !is_empty(row, col)) continue;
+      if (!is_in_picture(centre)) continue;
       const int cell = (row + size / 2) * current_->cell_cols + col + size / 2;
       current_->cells[cell] = {kSeed, {centre.x * current_->upscale, centre.y}, 0.F};
     }

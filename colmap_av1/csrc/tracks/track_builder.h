@@ -177,6 +177,12 @@ class TrackBuilder {
     float from_picture_y = 1.F;
     float to_cells_x = 1.F;
     float to_cells_y = 1.F;
+    // To the current picture, from the other one.
+    float picture_x = 1.F;
+    float picture_y = 1.F;
+    // To pixels of the current picture per shown frame, from a displacement.
+    double to_velocity_x = 0;
+    double to_velocity_y = 0;
     DominantMotion dominant;            // of the field that the displacements come from
   };
   // What a cell would do with a track, and how well it fits.
