@@ -60,6 +60,7 @@ _LEAST_FULL_SPEED = 0.25
 _FRAMES_PER_CHOICE = 8
 # Frames after which a track is drawn in the colour of an old one.
 _OLD_AGE = 32
+_LAST_PORT = 65535
 
 
 def view_video(
@@ -281,8 +282,10 @@ def serve_model(model: str | os.PathLike[str], *, port: int = 8080) -> Any:
 
     Raises:
         ModelError: the folder holds no model, or one without poses.
-        OptionError: the viewer's package is not installed, or the port is taken.
+        OptionError: the viewer's package is not installed, or the port is none or taken.
     """
+    if not 0 < port <= _LAST_PORT:
+        raise OptionError(f"port is {port}: give 1 to {_LAST_PORT}")
     scene = _read_scene(model)
     try:
         import viser  # noqa: PLC0415 - an extra that only this function needs

@@ -202,6 +202,9 @@ def test_view_says_what_it_lacks(
 ) -> None:
     assert main(["view", "--model", str(model)]) == 2
     assert "give --output" in capsys.readouterr().err
+    for port in (0, 65536):
+        with pytest.raises(OptionError, match=f"port is {port}: give 1 to 65535"):
+            view.serve_model(model, port=port)
     with pytest.raises(ModelError, match="holds no COLMAP model"):
         view.view_model(tmp_path)
     with pytest.raises(OptionError, match=r"ends in \.png"):
