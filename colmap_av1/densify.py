@@ -26,7 +26,7 @@ from colmap_av1.option_checks import check_options
 from colmap_av1.options import DensifyOptions
 from colmap_av1.progress import Clock, Progress, no_progress
 from colmap_av1.tracks import scale_tracks
-from colmap_av1.triangulate import check_triangulate_options
+from colmap_av1.triangulate import Points, check_triangulate_options
 from colmap_av1.unchanged import unchanged
 from colmap_av1.video import picture_size, read_display
 from colmap_av1.video_tracks import decoded_pictures, open_source, times_of_frames, track_video
@@ -127,13 +127,7 @@ def densify(
                 num_threads=options.match.verify.num_threads,
                 progress=progress,
             )
-        agreeing = points.num_agreeing / max(points.num_tracks, 1)
-        if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
-            raise ModelError(
-                f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses "
-                f"and {len(points.xyz)} give a point: give the video that the model's images come "
-                "from, and see that their names count its frames (--first_number, --frame_list)"
-            )
+        agreeing = _agreement(model, points)
         with clock.measure("colours"):
             colours = Colours(seen, view, points, len(images))
             image_of_frame = {int(frame): i for i, frame in enumerate(chosen.frames)}
@@ -163,6 +157,18 @@ def densify(
         seconds=clock.seconds,
         warnings=tracked.warnings,
     )
+
+
+def _agreement(model: Path, points: Points) -> float:
+    """Share of the tracks that agree with the poses; refuses a model of another video."""
+    agreeing = points.num_agreeing / max(points.num_tracks, 1)
+    if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
+        raise ModelError(
+            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses and "
+            f"{len(points.xyz)} give a point: give the video that the model's images come from, "
+            "and see that their names count its frames (--first_number, --frame_list)"
+        )
+    return agreeing
 
 
 def _check_output(output: Path) -> None:
