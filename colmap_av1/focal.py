@@ -125,12 +125,20 @@ def _widest_pairs(
         if len(rows) < _MIN_MATCHES:
             continue
         some = rows[:: max(1, len(rows) // _NUM_GLANCED)]
-        motion = (keypoints[j].xy[some[:, 1]] - keypoints[i].xy[some[:, 0]]) * shape
-        spread = float(np.median(np.linalg.norm(motion - np.median(motion, axis=0), axis=1)))
+        motion = keypoints[j].xy.take(some[:, 1], axis=0) - keypoints[i].xy.take(some[:, 0], axis=0)
+        motion = (motion - _median(motion)) * shape
+        spread = float(_median(np.hypot(motion[:, 0], motion[:, 1])))
         part = i * _NUM_PAIRS // len(keypoints)
         if part not in widest or spread > widest[part][0]:
             widest[part] = (spread, pair)
     return [pair for _, (_, pair) in sorted(widest.items())]
+
+
+def _median(values: NDArray[Any]) -> NDArray[Any]:
+    """The median along the first axis, for few values in a fraction of the time of NumPy's."""
+    ordered = np.sort(values, axis=0)
+    half = len(values) // 2
+    return np.asarray((ordered[half] + ordered[-half - 1]) / 2)
 
 
 def _loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
