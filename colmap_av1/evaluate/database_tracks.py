@@ -43,7 +43,9 @@ def database_tracks(database: Path, num_frames: int) -> Tracks:
             keypoints = [np.asarray(rows.read_keypoints(i.image_id))[:, :2] for i in images]
             pair_ids, geometries = rows.read_two_view_geometries()
     if len(sizes) != 1:
-        raise DatabaseError(f"{database}: holds images of {len(sizes)} sizes, one is needed")
+        raise DatabaseError(
+            f"{database}: holds images of {len(sizes)} sizes: give a database of one video"
+        )
     start = np.concatenate([[0], np.cumsum([len(k) for k in keypoints])])
     row_of = {image.image_id: start[i] for i, image in enumerate(images)}
     ends = [np.empty((0, 2), dtype=np.int64)]

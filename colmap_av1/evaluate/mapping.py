@@ -14,7 +14,7 @@ from colmap_av1.densify import densify
 from colmap_av1.evaluate.footage import Footage, frame_list
 from colmap_av1.evaluate.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
-from colmap_av1.model import read_model
+from colmap_av1.model import posed_images, read_model
 from colmap_av1.options import DensifyOptions, ImageOptions
 
 
@@ -128,7 +128,7 @@ def densify_model(
     output = folder / "model"
 
     def work() -> dict[str, Any]:
-        registered = {image.name for image in read_model(model).images.values() if image.has_pose}
+        registered = set(posed_images(read_model(model)))
         images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt", registered))
         given = replace(options, match=replace(options.match, images=images))
         measured = run_measured(

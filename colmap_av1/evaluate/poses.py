@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.sequence import frame_number
+from colmap_av1.model import posed_images
 
 
 @dataclass(frozen=True)
@@ -145,11 +146,11 @@ def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
         model: pycolmap.Reconstruction.
         names: names of the images.
     """
-    found = {image.name: image for image in model.images.values() if image.has_pose}
+    found = posed_images(model)
     cam_from_world = np.full((len(names), 3, 4), np.nan)
     for i, name in enumerate(names):
         if name in found:
-            cam_from_world[i] = found[name].cam_from_world().matrix()
+            cam_from_world[i] = found[name].cam_from_world
     return cam_from_world
 
 
@@ -167,9 +168,8 @@ def model_poses(model: Any, num_frames: int) -> NDArray[np.float64]:
         ImageError: an image's name holds no frame number.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
-    for image in model.images.values():
-        if image.has_pose:
-            cam_from_world[frame_number(image.name)] = image.cam_from_world().matrix()
+    for name, image in posed_images(model).items():
+        cam_from_world[frame_number(name)] = image.cam_from_world
     return cam_from_world
 
 

@@ -97,7 +97,7 @@ def frame_number(name: str) -> int:
     """
     numbers = re.findall(r"\d+", Path(name).stem)
     if not numbers:
-        raise ImageError(f"image '{name}': its name holds no frame number")
+        raise ImageError(f"image '{name}': its name holds no frame number: rename it")
     return int(numbers[-1])
 
 
@@ -127,7 +127,10 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
             continue
         frame = frame_number(words[0])
         if frame >= num_frames:
-            raise ImageError(f"{path}: '{words[0]}' is none of the {num_frames} frames")
+            raise ImageError(
+                f"{path}: '{words[0]}' is none of the {num_frames} frames: give the truth of this "
+                "video"
+            )
         try:
             values = np.array(words[1:], dtype=np.float64)
             rotation = Rotation.from_quat(values[3:7]).as_matrix().T

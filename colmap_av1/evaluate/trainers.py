@@ -108,7 +108,9 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
     split = Split(folder / "data", folder / "train", folder / "test")
     registered = sorted(posed_images(read_model(model)))
     if len(registered) < 2:
-        raise EvaluationError(f"{model}: a single image cannot be parted for training and test")
+        raise EvaluationError(
+            f"{model}: one image cannot be parted for training and test: give a larger model"
+        )
 
     def work() -> dict[str, Any]:
         run_measured(_undistort, model, image_path, split.data, registered, log=folder / "log.txt")
