@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from colmap_av1.options import CameraOptions, VerifyOptions
 
 _Options = TypeVar("_Options")
+_Number = TypeVar("_Number", int, float)
 
 # Prefix of the namespace entries that are fields of options.
 _OPTION = "option."
@@ -130,16 +131,22 @@ def _parse_int(word: str) -> int:
         value = int(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{word}' is no whole number") from None
-    if abs(value) > _LARGEST:
-        raise argparse.ArgumentTypeError(f"{word} is too large: give {_LARGEST} at most")
-    return value
+    return _checked(value, word)
 
 
 def _parse_float(word: str) -> float:
     try:
-        return float(word)
+        value = float(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{word}' is no number") from None
+    return _checked(value, word)
+
+
+def _checked(value: _Number, word: str) -> _Number:
+    """The value where stages can hold it and its square."""
+    if abs(value) > _LARGEST:
+        raise argparse.ArgumentTypeError(f"{word} is too large: give {_LARGEST} at most")
+    return value
 
 
 def _parse_bool(word: str) -> bool:

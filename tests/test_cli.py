@@ -103,6 +103,7 @@ BAD = [
     (["--min_length", "0"], "min_length is 0"),
     (["--min_length", "many"], "argument --min_length: 'many' is no whole number"),
     (["--max_interval", "9999999999"], "9999999999 is too large: give 2147483647 at most"),
+    (["--max_sigma", "1e300"], "1e300 is too large: give 2147483647 at most"),
     (["--offsets", "1,two"], "argument --offsets: 'two' is no whole number"),
     (["--spacing", "wide"], "argument --spacing: 'wide' is no number"),
     (["--operating_point", "-1"], "operating_point is -1"),
