@@ -24,7 +24,7 @@ _SPELLINGS = {"seed": ("--random_seed",)}
 # Options whose value is a file.
 _FILES = ("frame_list", "keep_stream")
 _PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
-# Whole numbers are 32 bits wide where they are used.
+# Whole numbers are 32 bits wide where they are used; squares of others fit, too.
 _LARGEST = 2**31 - 1
 
 
