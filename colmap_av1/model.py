@@ -74,6 +74,12 @@ def no_points() -> ModelPoints:
     )
 
 
+def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
+    rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
+    return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
+
+
 def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
     """The images of a pycolmap.Reconstruction that have a pose, by name."""
     return {

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
+from colmap_av1.model import camera_centres
 from colmap_av1.options import TriangulateOptions
 
 _Floats = NDArray[np.float64]
@@ -46,11 +47,6 @@ class Views:
 
     cam_from_world: _Floats
     focal: _Floats
-
-    def centres(self) -> _Floats:
-        """Camera centres in the world, float64 [n, 3]."""
-        rotation, translation = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
-        return np.asarray(-np.einsum("nji,nj->ni", rotation, translation))
 
 
 @dataclass(frozen=True)
@@ -381,7 +377,7 @@ def _midpoint(group: _Group, one: float, two: float) -> _Floats:
     a = group.starts + np.floor(one * last).astype(np.int64)
     b = group.starts + np.ceil(two * last).astype(np.int64)
     da, db = _directions(group, a), _directions(group, b)
-    centre = group.views.centres()
+    centre = camera_centres(group.views.cam_from_world)
     ca, cb = centre[group.view[a]], centre[group.view[b]]
     between = cb - ca
     cosine = np.einsum("ni,ni->n", da, db)
@@ -406,7 +402,9 @@ def _widest_angle(group: _Group, xyz: _Floats, kept: NDArray[np.bool_]) -> _Floa
 
     Measured against the first and the last of them, so at most a little less than the widest.
     """
-    ray = np.ascontiguousarray((xyz[group.track] - group.views.centres()[group.view]).T)
+    ray = np.ascontiguousarray(
+        (xyz[group.track] - camera_centres(group.views.cam_from_world)[group.view]).T
+    )
     norm = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
     ray /= np.where(norm > 0, norm, 1.0)
     index = np.arange(len(kept))

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from colmap_av1.evaluate.poses import camera_centres
 from colmap_av1.evaluate.results import Cloud, Column, CompareReport
+from colmap_av1.model import camera_centres
 
 _Image = NDArray[np.uint8]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.sequence import frame_number
-from colmap_av1.model import posed_images
+from colmap_av1.model import camera_centres, posed_images
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,6 @@ def pose_errors(
         relative_translation=relative[0],
         relative_rotation=relative[1],
     )
-
-
-def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
-    rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
-    return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
 
 
 def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
