@@ -11,6 +11,7 @@ import poselib
 from numpy.typing import NDArray
 
 from colmap_av1.pairs import ImageKeypoints
+from colmap_av1.two_view_models import poselib_camera
 
 _Floats = NDArray[np.float64]
 
@@ -143,13 +144,7 @@ def _median(values: NDArray[Any]) -> NDArray[Any]:
 
 def _loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
     """Mean robust loss of the epipolar errors of a pair for one focal length."""
-    camera: dict[str, Any] = {
-        "model": "SIMPLE_PINHOLE",
-        # PoseLib does not use the size.
-        "width": 1,
-        "height": 1,
-        "params": [focal_length, 0.0, 0.0],
-    }
+    camera = poselib_camera(focal_length)
     some = slice(_NUM_SEARCHED)
     pose, _ = poselib.estimate_relative_pose(
         xa[some], xb[some], camera, camera, {**_RANSAC, "seed": seed}, {"max_iterations": 0}

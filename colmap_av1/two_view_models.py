@@ -1,0 +1,349 @@
+"""The models of a pair of images: its essential, fundamental and homography matrix.
+
+Nearly all matches of tracks are right, so a linear fit or few iterations of PoseLib's robust
+estimators on matches that are spread over the image find a model; more of them refine it and all
+are tested against it. Where few are right, the robust estimators go on by themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from colmap_av1.options import VerifyOptions
+
+_Floats = NDArray[np.float64]
+
+# A fundamental matrix takes seven matches; an eighth is the first that can disagree.
+MIN_MATCHES = 8
+# Iterations of a robust estimator at least; more follow where few matches agree.
+_MIN_ITERATIONS = 15
+# Share of inliers below which COLMAP spends no more iterations on a model.
+_MIN_INLIER_RATIO = 0.25
+# Matches a model is refined on, and steps of refinement.
+MAX_REFINED = 500
+_REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
+# What keeps sums of points that coincide or lie on a line apart from 0.
+_ROUNDING = 1e-12
+_IDENTITY = np.eye(3)
+# A model with this share of the matches is not searched any longer.
+_TRUSTED_SHARE = 0.95
+# A search finds no more inliers than a quick fit by this share of the matches, and hardly ever
+# less by that one.
+_SEARCH_GAINS, _SEARCH_LOSES = 0.1, 0.04
+# COLMAP's homographies leave out this many times as many matches as those that are found here:
+# with it, pairs of six real and rendered videos are planar or not as COLMAP says most often.
+_COLMAP_LEAVES_OUT = 1.08
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model and the matches that agree with it.
+
+    Attributes:
+        matrix: float64 [3, 3] in the coordinates the matches were tested in; None where none
+            was found.
+        inliers: bool [n].
+        count: number of inliers.
+        pose: PoseLib's pose of an essential matrix.
+    """
+
+    matrix: _Floats | None
+    inliers: NDArray[np.bool_]
+    count: int
+    pose: Any = None
+
+
+@dataclass(frozen=True)
+class Points:
+    """Matched points of a pair, all in the same coordinates.
+
+    Attributes:
+        a: float64 [2, n] those in the first image.
+        b: float64 [2, n] those in the second image.
+        spread_a: float64 [2, k] the first of an order that is spread over the image.
+        spread_b: float64 [2, k] likewise.
+    """
+
+    a: _Floats
+    b: _Floats
+    spread_a: _Floats
+    spread_b: _Floats
+
+    def first(self, count: int) -> tuple[_Floats, _Floats]:
+        """The first matches of the spread order, float64 [2, m] in either image."""
+        return self.spread_a[:, :count], self.spread_b[:, :count]
+
+
+def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> Points:
+    """The points with those of some of them that are spread over the image.
+
+    Args:
+        a: float64 [2, n] points in the first image.
+        b: float64 [2, n] points in the second image.
+        order: int64 [k] indices of the spread ones.
+    """
+    return Points(a, b, a.take(order, axis=1), b.take(order, axis=1))
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the models of one pair are looked for.
+
+    Attributes:
+        options: thresholds and effort.
+        seed: seed of the robust estimators.
+    """
+
+    options: VerifyOptions
+    seed: int
+
+    def part(self, share: float) -> int:
+        """Number of matches in a share of a full sample."""
+        return max(MIN_MATCHES, round(share * self.options.max_samples))
+
+    def ransac(self, min_iterations: int) -> dict[str, Any]:
+        """PoseLib's words for it."""
+        return {
+            "max_epipolar_error": self.options.max_error,
+            "max_reproj_error": self.options.max_error,
+            "max_iterations": self.options.max_iterations,
+            "min_iterations": min(min_iterations, self.options.max_iterations),
+            "success_prob": self.options.confidence,
+            "seed": self.seed,
+        }
+
+
+def find_pose(points: Points, search: Search, focal_lengths: tuple[float, float]) -> Model:
+    """The essential matrix of a pair, on undistorted pixels from the principal points.
+
+    Args:
+        points: the matches.
+        search: how to look for it.
+        focal_lengths: of the first and the second image, in pixels.
+    """
+    if points.spread_a.shape[1] < MIN_MATCHES:
+        return _no_model(points)
+
+    cameras = [poselib_camera(focal_length) for focal_length in focal_lengths]
+
+    def refine(pose: Any, xa: _Floats, xb: _Floats) -> Model:
+        pose, _ = poselib.refine_relative_pose(xa.T, xb.T, pose, *cameras, _REFINEMENT)
+        tested = _test(_epipolar_inliers, _essential(pose, *focal_lengths), points, search)
+        return replace(tested, pose=pose)
+
+    # A part of the sample is enough: what is found is refined on more than all of it.
+    xa, xb = points.first(search.part(0.5))
+    pose, _ = poselib.estimate_relative_pose(
+        xa.T, xb.T, *cameras, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
+    )
+    found = refine(pose, points.spread_a, points.spread_b)
+    return _again_on_inliers(refine, found, found.pose, points, search)
+
+
+def find_fundamental(points: Points, search: Search) -> Model:
+    """The fundamental matrix of a pair."""
+    if points.spread_a.shape[1] < MIN_MATCHES:
+        return _no_model(points)
+
+    def refine(F: _Floats, xa: _Floats, xb: _Floats) -> Model:
+        F, _ = poselib.refine_fundamental(xa.T, xb.T, F, _REFINEMENT)
+        return _test(_epipolar_inliers, F, points, search)
+
+    F = _linear_fundamental(*points.first(search.options.max_samples))
+    quick = refine(F, points.spread_a, points.spread_b)
+    if quick.count >= _TRUSTED_SHARE * points.a.shape[1]:
+        return quick
+    xa, xb = points.first(search.part(0.75))
+    F, _ = poselib.estimate_fundamental(
+        xa.T, xb.T, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
+    )
+    found = _test(_epipolar_inliers, F, points, search)
+    found = _again_on_inliers(refine, found, found.matrix, points, search)
+    return min(found, quick, key=lambda model: _epipolar_loss(model, points))
+
+
+def find_homography(points: Points, search: Search, num_rival: int) -> Model:
+    """The homography of a pair, as well as the decision between it and its rival needs it.
+
+    A search until no better one is found is the costliest part of all and seldom decides: a
+    quick fit shows whether the inliers come near the rival's.
+
+    Args:
+        points: the matches.
+        search: how to look for it.
+        num_rival: inliers of the model it competes with.
+    """
+    if points.spread_a.shape[1] < MIN_MATCHES:
+        return _no_model(points)
+    num_matches = points.a.shape[1]
+    xa, xb = points.first(search.options.max_samples)
+    H = _affine_fit(xa, xb)
+    # The first loss brings matches near that are to agree, the second drops all others.
+    for loss, steps in (("CAUCHY", 2), ("TRUNCATED", 3)):
+        robust = {
+            **_REFINEMENT,
+            "max_iterations": steps,
+            "loss_type": loss,
+            "loss_scale": search.options.max_error,
+        }
+        H, _ = poselib.refine_homography(xa.T, xb.T, H, robust)
+    found = _test(_transfer_inliers, H, points, search)
+    decisive = planar_share(search.options) * num_rival / num_matches
+    if not -_SEARCH_GAINS < found.count / num_matches - decisive < _SEARCH_LOSES:
+        return found
+    ransac = search.ransac(_MIN_ITERATIONS)
+    ransac["max_iterations"] = _num_iterations(decisive, search.options)
+    H, _ = poselib.estimate_homography(xa.T, xb.T, ransac, _REFINEMENT)
+    return _test(_transfer_inliers, H, points, search)
+
+
+def planar_share(options: VerifyOptions) -> float:
+    """Share of the rival's inliers that a homography found here needs, to decide as COLMAP does."""
+    return 1 - (1 - options.max_h_inlier_ratio) / _COLMAP_LEAVES_OUT
+
+
+def _again_on_inliers(
+    refine: Callable[[Any, _Floats, _Floats], Model],
+    found: Model,
+    model: Any,
+    points: Points,
+    search: Search,
+) -> Model:
+    """Refine a model that leaves out many matches once more, without those."""
+    if found.matrix is None or found.count >= _TRUSTED_SHARE * points.a.shape[1]:
+        return found
+    agree = _epipolar_inliers(
+        found.matrix, points.spread_a, points.spread_b, search.options.max_error
+    )
+    if np.count_nonzero(agree) < MIN_MATCHES:
+        return found
+    again = refine(model, points.spread_a[:, agree], points.spread_b[:, agree])
+    return min(found, again, key=lambda model: _epipolar_loss(model, points))
+
+
+def _epipolar_loss(model: Model, points: Points) -> float:
+    """The loss that refinement lowers: it tells models apart that have the same inliers."""
+    if model.matrix is None:
+        return math.inf
+    algebraic, gradient = _epipolar_terms(model.matrix, points.spread_a, points.spread_b)
+    squared = algebraic**2 / np.maximum(gradient, np.finfo(np.float64).tiny)
+    return float(np.log1p(squared).sum())
+
+
+def poselib_camera(focal_length: float) -> dict[str, Any]:
+    """A camera whose principal point is the origin, in PoseLib's words."""
+    # PoseLib does not use the size.
+    params = [focal_length, 0.0, 0.0]
+    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
+
+
+def _essential(pose: Any, focal_a: float, focal_b: float) -> _Floats:
+    """The essential matrix of a pose, for undistorted pixels from the principal points."""
+    R, t = np.asarray(pose.R), np.asarray(pose.t).reshape(3)
+    E = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]]) @ R
+    return np.asarray(E / np.outer([focal_b, focal_b, 1.0], [focal_a, focal_a, 1.0]))
+
+
+def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
+    """The fundamental matrix with least squares (Hartley and Zisserman, 11.1 and 11.4).
+
+    A second solution gives every match the weight of its Sampson error, and less where that is
+    above a pixel.
+    """
+    a, to_a = _normalised(xa)
+    b, to_b = _normalised(xb)
+    rows = (b[:, None] * a).reshape(9, -1)
+    F = np.linalg.eigh(rows @ rows.T)[1][:, 0].reshape(3, 3)
+    algebraic, gradient = _epipolar_terms(F, a[:2], b[:2])
+    weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _ROUNDING)
+    F = np.linalg.eigh((rows * weight) @ rows.T)[1][:, 0].reshape(3, 3)
+    # Refinement takes the nearest matrix of rank two.
+    return np.asarray(to_b.T @ F @ to_a)
+
+
+def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
+    """Points [2, n] as homogeneous ones about 0 of size 1, and what makes them so, [3, 3]."""
+    centre = x.sum(axis=1) / x.shape[1]
+    moved = x - centre[:, None]
+    scale = 1 / (math.sqrt(np.vdot(moved, moved) / x.size) + _ROUNDING)
+    transform = np.array(
+        [[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]]
+    )
+    return _homogeneous(moved * scale), transform
+
+
+def _homogeneous(x: _Floats) -> _Floats:
+    """Points [2, n] with a third coordinate 1, [3, n]."""
+    extended = np.ones((3, x.shape[1]))
+    extended[:2] = x
+    return extended
+
+
+def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
+    """Iterations after which a homography with this share of inliers is found or absent.
+
+    COLMAP searches no longer either, so a close case ends alike.
+    """
+    clean = max(inlier_ratio, _MIN_INLIER_RATIO) ** 4
+    if clean >= 1 or options.confidence >= 1:
+        wanted = options.max_iterations if options.confidence >= 1 else 1
+    else:
+        wanted = math.ceil(3 * math.log(1 - options.confidence) / math.log(1 - clean))
+    return min(max(wanted, _MIN_ITERATIONS), options.max_iterations)
+
+
+def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
+    """The affine map, as a 3x3 matrix, that takes `xa` to `xb` with the least squares."""
+    a = _homogeneous(xa)
+    square = a @ a.T
+    # A little more than that, so points on a line have a solution.
+    square += _ROUNDING * np.trace(square) * _IDENTITY
+    return np.vstack([np.linalg.solve(square, a @ xb.T).T, _IDENTITY[2]])
+
+
+def _no_model(points: Points) -> Model:
+    return Model(None, np.zeros(points.a.shape[1], dtype=bool), 0)
+
+
+def _test(
+    inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: Points, search: Search
+) -> Model:
+    """The matrix at unit norm with its inliers; no model where an estimator found none."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    norm = float(np.linalg.norm(matrix))
+    if not (math.isfinite(norm) and norm > 0):
+        return _no_model(points)
+    matrix = matrix / norm
+    inliers = inliers_of(matrix, points.a, points.b, search.options.max_error)
+    return Model(matrix, inliers, int(np.count_nonzero(inliers)))
+
+
+def _epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+    """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
+    algebraic, gradient = _epipolar_terms(F, xa, xb)
+    return np.asarray(algebraic**2 <= max_error**2 * gradient)
+
+
+def _epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floats]:
+    """Algebraic error of matches [2, n], and the square of its gradient, float64 [n] each."""
+    lines_b = F[:, :2] @ xa + F[:, 2:]
+    lines_a = F.T[:2, :2] @ xb + F.T[:2, 2:]
+    algebraic = xb[0] * lines_b[0] + xb[1] * lines_b[1] + lines_b[2]
+    gradient = lines_b[0] ** 2 + lines_b[1] ** 2 + lines_a[0] ** 2 + lines_a[1] ** 2
+    return algebraic, gradient
+
+
+def _transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+    """Matches that H maps to within `max_error` of their place in the second image."""
+    mapped = H[:, :2] @ xa + H[:, 2:]
+    # Multiplied out by the third coordinate, so no point at infinity divides by zero.
+    x = mapped[0] - xb[0] * mapped[2]
+    y = mapped[1] - xb[1] * mapped[2]
+    return np.asarray(x**2 + y**2 <= (max_error * mapped[2]) ** 2)
