@@ -36,6 +36,8 @@ from colmap_av1.two_view_models import (
 
 _Floats = NDArray[np.float64]
 
+# Pairs that a thread verifies before it hands them over.
+_PAIRS_AT_A_TIME = 16
 # Cells of an image that one point each is taken from before any gives its second.
 _NUM_CELLS = 128
 
@@ -122,22 +124,29 @@ def verify_pairs(
             found = views[image] = _view(keypoints[image], cameras[image], seed)
         return found
 
-    def verify(index: int) -> TwoViewGeometry:
-        i, j = (int(k) for k in pairs[index])
-        return _verify_pair(view(i), view(j), matches[index], (i, j), options)
+    def verify(some: range) -> list[TwoViewGeometry]:
+        found = []
+        for index in some:
+            i, j = pairs[index].tolist()
+            found.append(_verify_pair(view(i), view(j), matches[index], (i, j), options))
+        return found
 
     geometries: list[TwoViewGeometry] = []
+    # Threads that hand over every pair by itself would be busy with that.
+    indices = range(len(pairs))
+    parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
     num_threads = options.num_threads if options.num_threads is not None else _num_cpus()
     # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
-            for geometry in executor.map(verify, range(len(pairs))):
-                for image in pairs[len(geometries)].tolist():
-                    if last_pair[image] == len(geometries):
-                        views.pop(image, None)
-                geometries.append(geometry)
-                if progress is not None:
-                    progress(len(geometries))
+            for found in executor.map(verify, parts):
+                for image in np.unique(pairs[len(geometries) : len(geometries) + len(found)]):
+                    if last_pair[image] < len(geometries) + len(found):
+                        views.pop(int(image), None)
+                for geometry in found:
+                    geometries.append(geometry)
+                    if progress is not None:
+                        progress(len(geometries))
         except BaseException:
             executor.shutdown(wait=True, cancel_futures=True)
             raise
