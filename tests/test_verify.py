@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, Scene, make_scene
 
+from colmap_av1 import verify
 from colmap_av1.database import make_camera
 from colmap_av1.errors import OptionError
 from colmap_av1.options import CameraOptions, VerifyOptions
@@ -163,7 +164,8 @@ def test_outliers_are_left_out() -> None:
         assert len(kept - true) <= 0.25 * len(m), (i, j)
 
 
-def test_bytes_do_not_depend_on_threads_but_on_the_seed() -> None:
+def test_bytes_do_not_depend_on_threads_but_on_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verify, "_PAIRS_FOR_A_THREAD", 10)
     keypoints, pairs, matches = prepare(make_scene(num_points=2500), outliers=0.2)
 
     def run(**changes: int) -> list[tuple[object, ...]]:
