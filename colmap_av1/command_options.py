@@ -9,6 +9,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from colmap_av1.options import CameraOptions, VerifyOptions
@@ -119,31 +120,18 @@ def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
     if hint is bool:
         return _parse_bool, "0|1"
     parsers: dict[Any, tuple[Callable[[str], Any], str]] = {
-        int: (_parse_int, "N"),
-        float: (_parse_float, "X"),
+        int: (partial(_parse_number, int, "whole number"), "N"),
+        float: (partial(_parse_number, float, "number"), "X"),
         str: (str, "TEXT"),
     }
     return parsers[hint]
 
 
-def _parse_int(word: str) -> int:
+def _parse_number(kind: type[_Number], what: str, word: str) -> _Number:
     try:
-        value = int(word)
+        value = kind(word)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{word}' is no whole number") from None
-    return _checked(value, word)
-
-
-def _parse_float(word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{word}' is no number") from None
-    return _checked(value, word)
-
-
-def _checked(value: _Number, word: str) -> _Number:
-    """The value where stages can hold it and its square."""
+        raise argparse.ArgumentTypeError(f"'{word}' is no {what}") from None
     if abs(value) > _LARGEST:
         raise argparse.ArgumentTypeError(f"{word} is too large: give {_LARGEST} at most")
     return value

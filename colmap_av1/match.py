@@ -192,6 +192,7 @@ def match(
             geometries=matched.geometries,
             on_existing=options.on_existing,
         )
+    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
     return MatchReport(
@@ -204,7 +205,7 @@ def match(
         num_images=len(matched.keypoints),
         num_written_images=num_written,
         num_tracks=len(lengths),
-        track_lengths={q: int(np.quantile(lengths, q, method="lower")) for q in _LENGTH_QUANTILES},
+        track_lengths=dict(zip(_LENGTH_QUANTILES, quantiles.tolist(), strict=True)),
         num_observations=sum(len(k.xy) for k in matched.keypoints),
         focal_length=focal_length,
         num_pairs=len(matched.geometries),

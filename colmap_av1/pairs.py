@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.options import PairOptions
-from colmap_av1.tracks import Tracks
+from colmap_av1.tracks import Tracks, order_by_frame
 
 # Spans up to this many images pair every image. A longer one starts only at every n-th
 # image, n growing with the span, so the number of pairs stays linear in the number of
@@ -72,7 +72,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     kept = np.flatnonzero(seen & often_enough[track])
 
     # Observations come by track, so a stable sort by image leaves tracks ascending.
-    kept = kept[np.argsort(image[kept], kind="stable")]
+    kept = kept[order_by_frame(image[kept], chosen.size)]
     bounds = np.searchsorted(image[kept], np.arange(chosen.size + 1))
     return [
         ImageKeypoints(

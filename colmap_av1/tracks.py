@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,7 +212,7 @@ def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
     return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
 
 
-def order_by_frame(frame: NDArray[np.int32], num_frames: int) -> NDArray[np.int64]:
+def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
     """Indices of observations by their frames, those of a frame in their former order."""
     # A type of two bytes is sorted by radix, in a quarter of the time.
     return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")

@@ -143,10 +143,10 @@ def verify_pairs(
     # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
-            for found in executor.map(verify, parts):
-                for image in np.unique(pairs[len(geometries) : len(geometries) + len(found)]):
-                    if last_pair[image] < len(geometries) + len(found):
-                        views.pop(int(image), None)
+            for part, found in zip(parts, executor.map(verify, parts), strict=True):
+                for image in np.unique(pairs[part.start : part.stop]).tolist():
+                    if last_pair[image] < part.stop:
+                        views.pop(image, None)
                 for geometry in found:
                     geometries.append(geometry)
                     if progress is not None:
