@@ -1,9 +1,8 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
-from colmap_av1 import ending  # noqa: F401 - first, so that the program ends quietly from here on
-from colmap_av1.check import CheckReport, check
+from colmap_av1.database.check import CheckReport, check
+from colmap_av1.database.hloc import HlocMatches, export_hloc, read_hloc
 from colmap_av1.densify import DensifyReport, densify
-from colmap_av1.encode import EncodeReport, encode
 from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
@@ -17,11 +16,11 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.export import HlocMatches, export_hloc, read_hloc
-from colmap_av1.info import StreamReport, inspect
 from colmap_av1.match import MatchReport, match
-from colmap_av1.motion import FrameMotion, read_motion
-from colmap_av1.motion_file import export_motion
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.info import StreamReport, inspect
+from colmap_av1.motion.motion_file import export_motion
+from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import (
     CameraOptions,
     DensifyOptions,
@@ -40,7 +39,9 @@ from colmap_av1.options import (
     VerifyOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
-from colmap_av1.tracks import Tracks, build_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks
+from colmap_av1.util import signals  # noqa: F401 - first, so that the program ends quietly from here on
+from colmap_av1.video.encode import EncodeReport, encode
 
 __all__ = [
     "BitstreamError",

@@ -13,25 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ColmapAv1Error, EvaluationError, ModelError, OptionError
-from colmap_av1.evaluate.clouds import cloud_distances, model_points
-from colmap_av1.evaluate.footage import Footage, choose_footage
-from colmap_av1.evaluate.frontends import Frontend, imported_frontend, make_frontends, run_frontend
-from colmap_av1.evaluate.learned import check_learned_options
-from colmap_av1.evaluate.mapping import (
+from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
+from colmap_av1.evaluate.frontends.frontends import (
+    Frontend,
+    imported_frontend,
+    make_frontends,
+    run_frontend,
+)
+from colmap_av1.evaluate.frontends.learned import check_learned_options
+from colmap_av1.evaluate.frontends.mapping import (
     MapperSettings,
     densify_model,
     map_database,
     model_figures,
 )
-from colmap_av1.evaluate.poses import fit_similarity, image_poses, pose_errors
-from colmap_av1.evaluate.results import Cloud, Column, CompareReport
-from colmap_av1.evaluate.sequence import read_poses
-from colmap_av1.evaluate.trainers import check_trainer, train, write_split
-from colmap_av1.model import read_model
+from colmap_av1.evaluate.metrics.clouds import cloud_distances, model_points
+from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
+from colmap_av1.evaluate.metrics.sequence import read_poses
+from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
+from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
+from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions
-from colmap_av1.progress import Progress, no_progress
-from colmap_av1.stages import open_stages
-from colmap_av1.video import picture_size
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.stages import open_stages
+from colmap_av1.video.facts import picture_size
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"
@@ -169,7 +174,7 @@ def _writing(output: Path) -> Iterator[None]:
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:
     try:
-        from colmap_av1.evaluate.report import write_report  # noqa: PLC0415 - of an extra
+        from colmap_av1.evaluate.report.report import write_report  # noqa: PLC0415 - of an extra
     except ImportError as error:
         raise EvaluationError(
             f"the report needs the package {error.name}: pip install 'colmap-av1[evaluate]'"

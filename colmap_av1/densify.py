@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_av1.choice import choose_images
-from colmap_av1.dense_points import (
+from colmap_av1.errors import ImageError, ModelError, OptionError, cannot_write
+from colmap_av1.images.choosing import choose_images
+from colmap_av1.images.files import size_of_images
+from colmap_av1.model.colmap_model import posed_images, read_model, write_model
+from colmap_av1.model.dense_points import (
     LEAST_AGREEING,
     Colours,
     chaining_for_points,
@@ -18,18 +21,20 @@ from colmap_av1.dense_points import (
     seen_in,
     triangulate_tracks,
 )
-from colmap_av1.errors import ImageError, ModelError, OptionError, cannot_write
-from colmap_av1.files import remove_leftovers, whole_folder
-from colmap_av1.images import size_of_images
-from colmap_av1.model import posed_images, read_model, write_model
+from colmap_av1.model.triangulate import Points, check_triangulate_options
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import DensifyOptions
-from colmap_av1.progress import Clock, Progress, no_progress
-from colmap_av1.tracks import scale_tracks
-from colmap_av1.triangulate import Points, check_triangulate_options
-from colmap_av1.unchanged import unchanged
-from colmap_av1.video import picture_size, read_display
-from colmap_av1.video_tracks import decoded_pictures, open_source, times_of_frames, track_video
+from colmap_av1.tracks.tracks import scale_tracks
+from colmap_av1.tracks.video_tracks import (
+    decoded_pictures,
+    open_source,
+    times_of_frames,
+    track_video,
+)
+from colmap_av1.util.files import remove_leftovers, whole_folder
+from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.unchanged import unchanged
 
 
 @dataclass(frozen=True)

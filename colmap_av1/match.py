@@ -12,22 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from colmap_av1.database import (
-    DatabaseImage,
-    is_square,
-    make_camera,
-    read_cameras,
-    read_images,
-    write_matches,
-)
-from colmap_av1.density import select_tracks
+from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
-from colmap_av1.image_matches import pair_images, shared_focal_length, verify_images
+from colmap_av1.images.camera import is_square, make_camera
+from colmap_av1.images.preparing import prepare_images, write_chosen
+from colmap_av1.matching.image_matches import pair_images, shared_focal_length, verify_images
 from colmap_av1.options import CameraOptions, MatchOptions
-from colmap_av1.progress import Clock, Progress, no_progress
-from colmap_av1.tracks import keep_frames
-from colmap_av1.unchanged import unchanged
-from colmap_av1.video_images import prepare_images, write_chosen
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import keep_frames
+from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.video.unchanged import unchanged
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)

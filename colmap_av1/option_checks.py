@@ -6,16 +6,16 @@ from typing import get_args
 
 import numpy as np
 
-from colmap_av1.choice import check_image_options
-from colmap_av1.database import make_camera
-from colmap_av1.density import select_tracks
 from colmap_av1.errors import OptionError
-from colmap_av1.motion import check_read_options
+from colmap_av1.images.camera import make_camera
+from colmap_av1.images.choosing import check_image_options
+from colmap_av1.matching.pairs import schedule_pairs
+from colmap_av1.matching.verify import verify_pairs
+from colmap_av1.motion.reading import check_read_options
 from colmap_av1.options import MatchOptions, OnExisting
-from colmap_av1.pairs import schedule_pairs
-from colmap_av1.refine import refine_tracks
-from colmap_av1.tracks import Tracks
-from colmap_av1.verify import verify_pairs
+from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks
 
 
 def check_options(options: MatchOptions, size: tuple[int, int]) -> None:

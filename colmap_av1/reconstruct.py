@@ -9,13 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from colmap_av1.dense_points import LEAST_AGREEING
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, cannot_write
-from colmap_av1.files import whole_file
-from colmap_av1.option_checks import check_options
-from colmap_av1.options import MapperOptions, ReconstructOptions
-from colmap_av1.progress import Clock, Progress, no_progress
-from colmap_av1.reconstruct_stages import (
+from colmap_av1.model.dense_points import LEAST_AGREEING
+from colmap_av1.model.reconstruct_stages import (
     Run,
     adjustment_stage,
     match_stage,
@@ -25,11 +21,15 @@ from colmap_av1.reconstruct_stages import (
     read_tracks,
     track_stage,
 )
-from colmap_av1.stages import open_stages
-from colmap_av1.triangulate import check_triangulate_options
-from colmap_av1.unchanged import check_unchanged, file_states
-from colmap_av1.video import picture_size
-from colmap_av1.video_tracks import open_source
+from colmap_av1.model.triangulate import check_triangulate_options
+from colmap_av1.option_checks import check_options
+from colmap_av1.options import MapperOptions, ReconstructOptions
+from colmap_av1.tracks.video_tracks import open_source
+from colmap_av1.util.files import whole_file
+from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.stages import open_stages
+from colmap_av1.video.facts import picture_size
+from colmap_av1.video.unchanged import check_unchanged, file_states
 
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_av1 import _core
-from colmap_av1.video import open_stream
+from colmap_av1.video.container import open_stream
 
 _UNIT_FIELDS = (
     "mv",

@@ -20,6 +20,14 @@ AV1 = [
     *("-row-mt", "1", "-crf", "20", "-b:v", "0", "-g", "9999"),
 ]
 
+# Shells let what they start in the background ignore interrupts, and Python then does, too.
+HEED_INTERRUPTS = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from colmap_av1.cli import main
+sys.exit(main())
+"""
+
 Ffmpeg = Callable[..., Path]
 Encode = Callable[..., Path]
 

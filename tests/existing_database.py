@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scene
 
-from colmap_av1.database import make_camera, pair_id_from_image_ids
+from colmap_av1.database.reading import pair_id_from_image_ids
+from colmap_av1.images.camera import make_camera
 from colmap_av1.options import CameraOptions
 
 LAYOUTS = ("3.8", "3.11", "3.13", "4.2")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
+TESTS = Path(__file__).parent
+
 _WAITING = """
-    import sys, time
-    sys.path.insert(0, sys.argv[2])
+    import os, sys, time
+    sys.path[:0] = sys.argv[2].split(os.pathsep)
     import importlib
-    from colmap_av1 import database, database_file
+    from colmap_av1.database import file as database_file
+    from colmap_av1.database import writing as database
 
     data = importlib.import_module(sys.argv[3])
-    rows = getattr(data, sys.argv[4])
+    new_rows = getattr(data, sys.argv[4])
 
     class Waiting(list):
         def __getitem__(self, index):
@@ -31,8 +35,9 @@ _WAITING = """
         connection.execute("PRAGMA cache_size = 5")
         return connection
     database_file.sqlite3.connect = connect_small
-    rows = {**rows, "geometries": Waiting(rows["geometries"])}
-    database.write_matches(sys.argv[1], data.NAMES, data.CAMERA, **rows, on_existing=sys.argv[5])
+    new_rows = {**new_rows, "geometries": Waiting(new_rows["geometries"])}
+    images = (data.NAMES, data.CAMERA)
+    database.write_matches(sys.argv[1], *images, **new_rows, on_existing=sys.argv[5])
 """
 
 
@@ -45,7 +50,15 @@ def start_writing(
     """
     script = textwrap.dedent(_WAITING)
     process = subprocess.Popen(
-        [sys.executable, "-c", script, path, Path(__file__).parent, module, rows, mode],
+        [
+            sys.executable,
+            "-c",
+            script,
+            os.pathsep.join([str(TESTS), str(TESTS / "database")]),
+            module,
+            rows,
+            mode,
+        ],
         stdout=subprocess.PIPE,
         text=True,
         cwd=path.parent,  # else the checkout would hide the installed package

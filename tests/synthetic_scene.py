@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.matching.pairs import image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.matching.verify import TwoViewGeometry, verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
-from colmap_av1.pairs import image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.tracks import Tracks
-from colmap_av1.verify import TwoViewGeometry, verify_pairs
+from colmap_av1.tracks.tracks import Tracks
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 CAMERA_PARAMS = f"{FOCAL},{WIDTH / 2},{HEIGHT / 2},0"

@@ -17,10 +17,10 @@ from conftest import PROJECT
 from colmap_av1 import compare as compare_module
 from colmap_av1.cli import main
 from colmap_av1.compare import compare
+from colmap_av1.database.hloc import export_hloc
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
-from colmap_av1.evaluate.learned import pairs_of
-from colmap_av1.evaluate.trainers import match_renders
-from colmap_av1.export import export_hloc
+from colmap_av1.evaluate.frontends.learned import pairs_of
+from colmap_av1.evaluate.training.trainers import match_renders
 from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
 
 pytest.importorskip("matplotlib")
@@ -345,7 +345,7 @@ def test_learned_features_are_matched_at_growing_distances():
 
 
 def test_learned_features_without_their_extra(tmp_path):
-    program = PROJECT / "colmap_av1" / "evaluate" / "lightglue_matches.py"
+    program = PROJECT / "colmap_av1" / "evaluate" / "frontends" / "lightglue_matches.py"
     (tmp_path / "torch.py").write_text("raise ImportError(name='torch')")
     run = subprocess.run(
         [sys.executable, program],

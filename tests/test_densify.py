@@ -11,9 +11,9 @@ from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.model import ModelImage, no_points, write_model
+from colmap_av1.model.colmap_model import ModelImage, no_points, write_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions
-from colmap_av1.video import decode_frames
+from colmap_av1.video.decoding import decode_frames
 
 
 def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -> Path:

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from conftest import AV1, Encode, Ffmpeg, make_frames
 
-from colmap_av1.database import read_images
+from colmap_av1.database.reading import read_images
 from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
@@ -22,7 +22,8 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.images import image_names, write_images
+from colmap_av1.images.files import write_images
+from colmap_av1.images.names import image_names
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,

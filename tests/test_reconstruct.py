@@ -18,11 +18,11 @@ import pytest
 from conftest import Encode, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
 
-from colmap_av1 import mapper as mapper_module
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.evaluate.poses import model_poses, pose_errors
-from colmap_av1.model import read_model
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.model import mapper as mapper_module
+from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -271,7 +271,9 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(importlib.import_module("colmap_av1.reconstruct_stages"), "write_model", full)
+        patch.setattr(
+            importlib.import_module("colmap_av1.model.reconstruct_stages"), "write_model", full
+        )
         with pytest.raises(ModelError, match="No space left on device: the stages before are kept"):
             reconstruct(SCENE, made.output, options=other)
     assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before
@@ -296,7 +298,7 @@ def test_model_of_two_images_is_none(
         return mapper_module.MapperRun((2,))
 
     shutil.copytree(made.output, tmp_path / "out")
-    stages = importlib.import_module("colmap_av1.reconstruct_stages")
+    stages = importlib.import_module("colmap_av1.model.reconstruct_stages")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(ModelError, match=r"incremental mapper finds no start: .* try --mapper"):

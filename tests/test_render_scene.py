@@ -1,14 +1,13 @@
 """The example clip and its truth agree with each other and with themselves."""
 
-from pathlib import Path
-
 import av
 import cv2
 import numpy as np
 import pytest
 import render_scene
+from conftest import PROJECT
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+EXAMPLES = PROJECT / "examples"
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from conftest import PROJECT
 
-from colmap_av1.database import read_images
+from colmap_av1.database.reading import read_images
 
 pytestmark = [
     pytest.mark.slow,

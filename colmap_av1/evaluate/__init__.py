@@ -1,15 +1,14 @@
 """What tracks, models and front-ends are worth: one module for each family of metrics."""
 
-from colmap_av1.evaluate.database_tracks import database_tracks
-from colmap_av1.evaluate.footage import Footage, choose_footage, prepare_footage
-from colmap_av1.evaluate.frontends import (
+from colmap_av1.evaluate.frontends.footage import Footage, choose_footage, prepare_footage
+from colmap_av1.evaluate.frontends.frontends import (
     FRONTENDS,
     Frontend,
     FrontendRun,
     make_frontends,
     run_frontend,
 )
-from colmap_av1.evaluate.mapping import (
+from colmap_av1.evaluate.frontends.mapping import (
     MapperRun,
     MapperSettings,
     ModelFigures,
@@ -17,17 +16,23 @@ from colmap_av1.evaluate.mapping import (
     map_database,
     model_figures,
 )
-from colmap_av1.evaluate.measure import Measured, run_measured
-from colmap_av1.evaluate.poses import PoseErrors, model_poses, pose_errors
-from colmap_av1.evaluate.sequence import Sequence, read_sequence
-from colmap_av1.evaluate.splatting import (
+from colmap_av1.evaluate.frontends.measure import Measured, run_measured
+from colmap_av1.evaluate.metrics.database_tracks import database_tracks
+from colmap_av1.evaluate.metrics.poses import PoseErrors, model_poses, pose_errors
+from colmap_av1.evaluate.metrics.sequence import Sequence, read_sequence
+from colmap_av1.evaluate.metrics.track_errors import (
+    SPANS,
+    epipolar_errors,
+    exact_errors,
+    pairs_at_span,
+)
+from colmap_av1.evaluate.metrics.track_statistics import TrackStatistics, track_statistics
+from colmap_av1.evaluate.training.splatting import (
     Milestone,
     share_of_time,
     split_images,
     train_gaussians,
 )
-from colmap_av1.evaluate.track_errors import SPANS, epipolar_errors, exact_errors, pairs_at_span
-from colmap_av1.evaluate.track_statistics import TrackStatistics, track_statistics
 
 __all__ = [
     "FRONTENDS",

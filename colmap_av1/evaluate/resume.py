@@ -53,5 +53,5 @@ def content_of(path: Path) -> str:
 def own_code() -> str:
     """Digest of this package's code but for its metrics: results of other code are not its."""
     root = Path(colmap_av1.__file__).parent
-    files = [p for p in root.iterdir() if p.suffix in (".py", ".so", ".pyd")]
+    files = [p for p in root.rglob("*") if p.suffix in (".py", ".so", ".pyd")]
     return hashlib.sha256("".join(content_of(p) for p in sorted(files)).encode()).hexdigest()

@@ -23,8 +23,8 @@ from tracks import load_render_scene
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
-from colmap_av1.evaluate.clouds import depth_differences, model_points
-from colmap_av1.model import ModelImage, no_points, read_model, write_model
+from colmap_av1.evaluate.metrics.clouds import depth_differences, model_points
+from colmap_av1.model.colmap_model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
 
 EXAMPLES = Path(__file__).resolve().parents[1]

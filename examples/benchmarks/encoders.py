@@ -30,7 +30,6 @@ from colmap_av1 import (
     build_tracks,
     read_motion,
 )
-from colmap_av1.encode import encode, find_encoder
 from colmap_av1.evaluate import (
     MapperSettings,
     epipolar_errors,
@@ -39,9 +38,11 @@ from colmap_av1.evaluate import (
     prepare_footage,
     run_frontend,
 )
-from colmap_av1.evaluate.measure import run_measured
+from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept
-from colmap_av1.model import read_model
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.video.encode import encode
+from colmap_av1.video.encoders import find_encoder
 
 HARDWARE = ("nvenc", "qsv", "amf", "vaapi")
 SETTINGS = (

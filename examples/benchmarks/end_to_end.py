@@ -58,7 +58,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
 )
-from colmap_av1.model import read_model
+from colmap_av1.model.colmap_model import read_model
 
 # The ways, and the one that each is compared with.
 SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"

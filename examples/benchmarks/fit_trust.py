@@ -26,8 +26,8 @@ from tracks import load_render_scene
 
 from colmap_av1 import FrameMotion, RefineOptions, Tracks, build_tracks, read_motion
 from colmap_av1.evaluate import model_poses
-from colmap_av1.refine import match_tracks
-from colmap_av1.video import decode_frames
+from colmap_av1.tracks.refine import match_tracks
+from colmap_av1.video.decoding import decode_frames
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 SAMPLES = 40_000  # of each clip

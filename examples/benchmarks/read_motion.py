@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from colmap_av1 import ColmapAv1Error, ReadOptions, _core, read_motion
-from colmap_av1.video import open_stream
+from colmap_av1.video.container import open_stream
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"

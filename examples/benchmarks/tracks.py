@@ -60,7 +60,7 @@ from colmap_av1.evaluate import (
     track_statistics,
 )
 from colmap_av1.evaluate.resume import content_of, kept
-from colmap_av1.model import read_model
+from colmap_av1.model.colmap_model import read_model
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"

@@ -29,12 +29,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1 import CameraOptions, ColmapAv1Error, MatchOptions, match
-from colmap_av1.database import image_ids_from_pair_id
+from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.evaluate import read_sequence
-from colmap_av1.evaluate.measure import run_measured
+from colmap_av1.evaluate.frontends.measure import run_measured
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import DensityOptions, VerifyOptions
-from colmap_av1.pairs import ImageKeypoints
-from colmap_av1.verify import verify_pairs
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"

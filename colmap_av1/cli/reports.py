@@ -1,0 +1,167 @@
+"""Reports as rows of a name and a value."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from colmap_av1.database.check import CheckReport
+from colmap_av1.densify import DensifyReport
+from colmap_av1.match import MatchReport
+from colmap_av1.motion.info import StreamReport
+from colmap_av1.reconstruct import ReconstructReport
+
+if TYPE_CHECKING:  # the comparison is slow to import
+    from colmap_av1.evaluate.report.results import CompareReport
+
+Rows = list[tuple[str, str]]
+
+# Rarer reference distances are summed up.
+_LEAST_LISTED_SHARE = 0.005
+
+
+def match_rows(report: MatchReport) -> Rows:
+    """What `match` wrote."""
+    lengths = {f"{q:.0%}": length for q, length in report.track_lengths.items()}
+    images = max(report.num_images, 1)
+    inlier_share = report.num_inliers / max(report.num_matches, 1)
+    rows = [
+        ("database", str(report.database)),
+        ("stream", str(report.stream)),
+        ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
+        ("images", f"{report.num_images}, {report.num_written_images} written"),
+        ("tracks", str(report.num_tracks)),
+        ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
+        (
+            "keypoints",
+            f"{report.num_observations}, {report.num_observations / images:.0f} an image",
+        ),
+        ("pairs", f"{report.num_pairs}, {report.num_verified_pairs} verified"),
+        ("matches", str(report.num_matches)),
+        ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
+        ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
+    ]
+    if report.focal_length is not None:
+        rows.append(("focal length", f"{report.focal_length:.1f} px, told by the tracks"))
+    if report.forward_motion:
+        rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
+    return [*rows, *_seconds_rows(report.seconds)]
+
+
+def reconstruct_rows(report: ReconstructReport) -> Rows:
+    """What `reconstruct` made."""
+    rows = [
+        ("output", str(report.output)),
+        ("images", f"{report.num_registered} of {report.num_images} with a pose"),
+        ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
+        ("mapper", report.mapper),
+        ("points", f"{report.num_points}, {report.num_observations} observations"),
+        ("reprojection error", f"{report.mean_error:.3f} px"),
+        ("focal length", f"{report.focal_length:.2f} px"),
+    ]
+    if report.resumed:
+        rows.append(("finished before", ", ".join(report.resumed)))
+    return [*rows, *_seconds_rows(report.seconds)]
+
+
+def densify_rows(report: DensifyReport) -> Rows:
+    """What `densify` made."""
+    return [
+        ("output", str(report.output)),
+        ("images", str(report.num_images)),
+        ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
+        ("points", f"{report.num_points}, the model had {report.num_model_points}"),
+        ("reprojection error", f"{report.mean_error:.3f} px"),
+        *_seconds_rows(report.seconds),
+    ]
+
+
+def compare_rows(report: CompareReport) -> Rows:
+    """What `compare` found, a row for each front-end."""
+    rows = []
+    for column in report.columns:
+        told = "no model"
+        if column.model is not None:
+            told = (
+                f"{column.model.num_registered} of {report.num_images} images, "
+                f"{column.model.num_points} points, {column.model.mean_error:.3f} px, "
+                f"{sum(column.cpu_seconds.values()):.1f} s of CPU time"
+            )
+        rows.append((column.name, told))
+    return [*rows, ("report", str(report.output / "report.html"))]
+
+
+def info_rows(report: StreamReport) -> Rows:
+    """What a stream is made of."""
+    rate = f"{report.frame_rate:.2f} per second" if report.frame_rate else "unknown"
+    distances = sorted(report.reference_distances.items(), key=lambda item: -item[1])
+    listed = [item for item in distances if item[1] >= _LEAST_LISTED_SHARE]
+    references = [f"{distance:+d} {share:.1%}" for distance, share in listed]
+    if len(listed) < len(distances):
+        rest = sum(share for _, share in distances[len(listed) :])
+        references.append(f"others {rest:.1%}")
+    if report.hidden_reference_share > 0:
+        references.append(f"hidden {report.hidden_reference_share:.1%}")
+    frames = (
+        f"{report.num_shown} shown, {report.num_coded} coded, {report.num_hidden} never shown, "
+        f"{report.num_key_frames} intra"
+    )
+    if report.num_cut:
+        frames += f", {report.num_cut} hidden by an edit list"
+    display = report.display
+    cropped = any(display.crop)
+    return [
+        ("video", str(report.path)),
+        ("container", report.container),
+        ("codec", "av1"),
+        ("size", f"{report.width}x{report.height}"),
+        ("rotation", f"{display.rotation}{', upside down' if display.is_mirrored else ''}"),
+        *([("cropped", "{} left, {} top, {} right, {} bottom".format(*display.crop))] * cropped),
+        *([("pixel aspect", f"{display.pixel_aspect:.3f}")] * (display.pixel_aspect != 1)),
+        ("frame rate", rate),
+        ("frames", frames),
+        ("references", ", ".join(references) or "none"),
+        ("inter units", f"{report.inter_share:.1%}"),
+        ("median motion", f"{report.median_motion:.2f} px per frame"),
+        ("bytes per frame", f"{report.bytes_per_frame:.0f}"),
+        ("bits per pixel", f"{report.bits_per_pixel:.3f}"),
+        ("for matching", "; ".join(report.reasons) or "good"),
+    ]
+
+
+def check_rows(report: CheckReport) -> Rows:
+    """What a database holds, and what the mappers will make of it."""
+    sizes = [f"{w}x{h} {n}" for (w, h), n in report.image_sizes.items()]
+    shapes = [f"{n} with {c} columns" for c, n in report.keypoint_columns.items()]
+    share = report.num_matched_keypoints / max(report.num_keypoints, 1)
+    rows = [
+        ("database", str(report.database)),
+        ("layout", f"COLMAP {report.layout} (version {report.user_version})"),
+        ("opened by", f"COLMAP {report.readers}"),
+        ("images", f"{report.num_images}, {report.num_connected_images} connected"),
+        ("sizes", ", ".join(sizes) or "none"),
+        ("cameras", f"{report.num_cameras}, {report.num_priors} with a known focal length"),
+        ("keypoints", f"{report.num_keypoints}, {share:.1%} matched"),
+        ("keypoint rows", ", ".join(shapes) or "none"),
+        ("descriptors", f"of {report.num_described_images} images"),
+        (
+            "pairs",
+            f"{report.num_pairs} with inliers, {report.num_used_pairs} used, "
+            f"{report.num_empty_pairs} empty",
+        ),
+        ("inliers", str(report.num_inliers)),
+        ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items()) or "none"),
+    ]
+    if report.parallax is not None:
+        wide = report.parallax
+        how = "" if wide.focal_known else " for a guessed focal length"
+        angle = "unknown" if wide.angle is None else f"{wide.angle:.1f} degrees{how}"
+        pair = f"widest pair {wide.displacement:.0f} px ({' - '.join(wide.names)})"
+        rows.append(("parallax", f"{angle}, {pair}"))
+    rows += [(finding.severity, finding.text) for finding in report.findings]
+    rows.append(("for mapping", "good" if report.mappable else "not ready"))
+    return rows
+
+
+def _seconds_rows(seconds: dict[str, float]) -> Rows:
+    rows = [(f"seconds, {stage}", f"{s:.2f}") for stage, s in seconds.items()]
+    return [*rows, ("seconds, total", f"{sum(seconds.values()):.2f}")]

@@ -1,0 +1,101 @@
+"""What the command line prints: progress, summaries, warnings."""
+
+from __future__ import annotations
+
+import io
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBars
+from rich.table import Table
+from rich.text import Text
+
+from colmap_av1.cli.reports import Rows
+from colmap_av1.match import MatchReport
+from colmap_av1.util.progress import Progress, no_progress
+
+PROGRAM = "colmap-av1"
+
+
+@contextmanager
+def progress_bars(quiet: bool) -> Iterator[Progress]:
+    """Progress bars on standard error where it is a terminal, one for each stage."""
+    if quiet or not sys.stderr.isatty():
+        yield no_progress
+        return
+    columns = (
+        TextColumn("{task.description:12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with ProgressBars(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int | None) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total, rate="")
+            speed = progress.tasks[tasks[stage]].speed
+            rate = f"{speed:.1f}/s" if speed else ""
+            progress.update(tasks[stage], completed=done, rate=rate)
+
+        yield report
+
+
+def print_summary(rows: Rows) -> None:
+    """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
+    if not sys.stdout.isatty():
+        for name, value in rows:
+            print(f"{name}\t{value}")
+        return
+    table = Table(show_header=False)
+    for name, value in rows:
+        table.add_row(Text(name), Text(value))  # as they are: in brackets is no markup
+    Console().print(table)
+
+
+def print_next(report: MatchReport) -> None:
+    """Print the commands that map what `match` wrote."""
+    with_colmap, with_pycolmap = report.next_commands
+    if sys.stdout.isatty():
+        # Printed bare, so that they can be copied from any terminal.
+        print(f"Map it with COLMAP:\n  {with_colmap}\nor with pycolmap:\n  {with_pycolmap}")
+    else:
+        print(f"next\t{with_colmap}\nor\t{with_pycolmap}")
+    if report.image_path is None:
+        print(f"{PROGRAM}: IMAGES stands for a folder of the frames", file=sys.stderr)
+
+
+def print_warning(message: object) -> None:
+    """Print a warning on a line of standard error."""
+    _print_line(f"{PROGRAM}: warning: {message}")
+
+
+def print_error(message: object) -> None:
+    """Print what is wrong on a line of standard error."""
+    _print_line(f"{PROGRAM}: error: {message}")
+
+
+def _print_line(text: str) -> None:
+    # Names of files may hold ends of lines.
+    print(text.replace("\n", "\\n"), file=sys.stderr)
+
+
+def allow_any_file_name() -> None:
+    """Let standard output take names of files that are no text, as the bytes they are."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="surrogateescape")
+
+
+@contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print the warnings of the body as lines."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: print_warning(message)
+        yield

@@ -1,0 +1,1 @@
+"""COLMAP's database and what other programs keep in its place."""

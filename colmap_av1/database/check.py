@@ -1,0 +1,167 @@
+"""What COLMAP's mappers will make of a database, found without altering it."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.database.contents import (
+    Parallax,
+    images_with_rows,
+    layout_of,
+    name_of_config,
+    pairs_with_rows,
+    parallax_of,
+)
+from colmap_av1.database.file import check_layout, is_new, open_unaltered
+from colmap_av1.database.findings import (
+    Finding,
+    frame_findings,
+    image_findings,
+    keypoint_findings,
+    motion_findings,
+    orphan_findings,
+    pair_findings,
+)
+from colmap_av1.database.reading import (
+    cameras_of,
+)
+from colmap_av1.errors import DatabaseError
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a database holds, and what the mappers will make of it.
+
+    Attributes:
+        database: the database file.
+        user_version: the number by which COLMAP tells layouts apart.
+        layout: versions of COLMAP whose layout it is.
+        readers: versions of COLMAP that open it.
+        num_images: images listed.
+        num_cameras: cameras listed.
+        num_priors: cameras with a focal length known beforehand.
+        image_sizes: number of images by (width, height) in pixels.
+        num_keypoints: keypoints of all images.
+        num_matched_keypoints: those that are inliers of a pair that mappers use.
+        keypoint_columns: number of images by the columns of their keypoints: 2: x, y; 4: scale
+            and orientation too; 6: an affine shape too.
+        num_described_images: images with descriptors.
+        num_pairs: pairs with inliers.
+        num_used_pairs: those that the mappers use.
+        num_empty_pairs: pairs that matchers tried in vain.
+        num_inliers: inliers of all pairs that mappers use.
+        configs: number of pairs with inliers by COLMAP's name of their geometry.
+        num_connected_images: images of the largest group that used pairs connect.
+        parallax: of the widest pairs; None where no pair is used.
+        findings: what stands out, most severe first.
+    """
+
+    database: Path
+    user_version: int
+    layout: str
+    readers: str
+    num_images: int
+    num_cameras: int
+    num_priors: int
+    image_sizes: dict[tuple[int, int], int]
+    num_keypoints: int
+    num_matched_keypoints: int
+    keypoint_columns: dict[int, int]
+    num_described_images: int
+    num_pairs: int
+    num_used_pairs: int
+    num_empty_pairs: int
+    num_inliers: int
+    configs: dict[str, int]
+    num_connected_images: int
+    parallax: Parallax | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def mappable(self) -> bool:
+        """Whether nothing was found that stops the mappers."""
+        return all(finding.severity != "error" for finding in self.findings)
+
+
+def check(database: str | os.PathLike[str]) -> CheckReport:
+    """Read a COLMAP database of any version and say what the mappers will make of it.
+
+    The file is opened so that neither it nor anything beside it changes: it is not migrated,
+    and no log is made. The thresholds are the defaults of COLMAP's mappers.
+
+    Args:
+        database: path of the file.
+
+    Raises:
+        DatabaseError: the file is missing, locked, unreadable, or not a COLMAP database.
+    """
+    path = Path(database)
+    if is_new(path):
+        what = "is an empty file" if path.exists() else "no such file"
+        raise DatabaseError(f"{path}: {what}: give the path of a COLMAP database")
+    with open_unaltered(path) as connection:
+        check_layout(connection, path)
+        return _check(connection, path)
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
+    cameras = cameras_of(connection, path)
+    images = images_with_rows(connection, path)
+    pairs = pairs_with_rows(connection, path, images)
+    used = pairs.used
+    layout, readers = layout_of(connection)
+    group = _largest_group(len(images.ids), pairs.index[used])
+    parallax = parallax_of(connection, path, images, pairs, cameras)
+    configs = [name_of_config(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
+    sizes = [
+        (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
+    ]
+    findings = [
+        *image_findings(images, cameras),
+        *frame_findings(connection, images),
+        *keypoint_findings(images, pairs),
+        *pair_findings(pairs, images),
+        *motion_findings(pairs, parallax, group, len(images.ids)),
+        *orphan_findings(connection, pairs),
+    ]
+    order = ("error", "warning", "note")
+    return CheckReport(
+        database=path,
+        user_version=connection.execute("PRAGMA user_version").fetchone()[0],
+        layout=layout,
+        readers=readers,
+        num_images=len(images.ids),
+        num_cameras=len(cameras),
+        num_priors=sum(bool(camera.has_prior_focal_length) for camera in cameras.values()),
+        image_sizes={size: sizes.count(size) for size in sorted(set(sizes))},
+        num_keypoints=sum(map(len, images.keypoints)),
+        num_matched_keypoints=sum(int(np.count_nonzero(m)) for m in pairs.matched),
+        keypoint_columns={n: images.columns.count(n) for n in sorted(set(images.columns) - {0})},
+        num_described_images=sum(n > 0 for n in images.num_descriptors),
+        num_pairs=int(np.count_nonzero(pairs.num_inliers > 0)),
+        num_used_pairs=int(np.count_nonzero(used)),
+        num_empty_pairs=int(np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))),
+        num_inliers=int(pairs.num_inliers[used].sum()),
+        configs={name: configs.count(name) for name in sorted(set(configs))},
+        num_connected_images=group,
+        parallax=parallax,
+        findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
+    )
+
+
+def _largest_group(num_images: int, edges: NDArray[np.int64]) -> int:
+    if len(edges) == 0:
+        return 0
+    # Slow to import, and nothing else of the package's daily work needs it.
+    from scipy.sparse import coo_array  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(num_images, num_images))
+    _, label = connected_components(graph, directed=False)
+    return int(np.bincount(label).max())

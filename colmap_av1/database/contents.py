@@ -1,0 +1,280 @@
+"""What stands in a COLMAP database, image by image and pair by pair, for `check`."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.database.file import columns
+from colmap_av1.database.reading import (
+    image_ids_from_pair_id,
+    keypoints_from_row,
+    matches_from_row,
+)
+
+# COLMAP's kinds of two-view geometry, by number.
+CONFIGS = (
+    "UNDEFINED",
+    "DEGENERATE",
+    "CALIBRATED",
+    "UNCALIBRATED",
+    "PLANAR",
+    "PANORAMIC",
+    "PLANAR_OR_PANORAMIC",
+    "WATERMARK",
+    "MULTIPLE",
+)
+_IGNORED_CONFIGS = ("UNDEFINED", "DEGENERATE", "WATERMARK")
+# Defaults of COLMAP's mappers: inliers of a pair they use, of one they start with, and the
+# angles of one they start with, at first and after halving it twice.
+MIN_INLIERS = 15
+MIN_INITIAL_INLIERS = 100
+_MAX_FORWARD_MOTION = 0.95
+# Pairs whose geometry is computed for the parallax, and the quantile of their angles that is
+# taken for the largest: a wrong model may give any angle.
+_NUM_DEEPEST = 24
+_LARGEST = 0.9
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """How far apart the views are.
+
+    Attributes:
+        names: names of the images of the widest pair.
+        displacement: median distance between its matching keypoints, in pixels.
+        angle: median triangulation angle, in degrees, that the best pairs reach: those whose
+            keypoints move most unlike each other; None where none of them has a model.
+        focal_known: the angle rests on focal lengths that are known beforehand.
+        forward_share: share of these pairs whose motion is along the camera's axis.
+    """
+
+    names: tuple[str, str]
+    displacement: float
+    angle: float | None
+    focal_known: bool
+    forward_share: float
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images by id, ascending, with what is stored for each.
+
+    Attributes:
+        ids: int64 [n].
+        names: their names.
+        camera_ids: their cameras.
+        keypoints: float32 [k, 2] positions of each one's keypoints.
+        columns: columns of each one's keypoints; 0 where there is no row.
+        num_descriptors: descriptors of each one; -1 where there is no row.
+    """
+
+    ids: NDArray[np.int64]
+    names: list[str]
+    camera_ids: list[int]
+    keypoints: list[NDArray[np.float32]]
+    columns: list[int]
+    num_descriptors: list[int]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of listed images that have a row, in any of the two tables.
+
+    Attributes:
+        ids: int64 [m] pair ids.
+        index: int64 [m, 2] place of their images in `Images`.
+        num_matches: int64 [m]; -1 where there is no row.
+        num_inliers: int64 [m]; -1 where there is no row.
+        config: int64 [m] kind of geometry.
+        displacement: float64 [m] median distance of the inliers' keypoints, in pixels.
+        spread: float64 [m] how far these displacements differ, in pixels: parallax does that,
+            and a turn of the camera much less.
+        matched: for each image, bool [k] the keypoints that are inliers of a used pair.
+        num_astray: pairs with matches of keypoints that are not there.
+        num_foreign: pairs of images that are not listed, but with inliers enough to be used.
+    """
+
+    ids: NDArray[np.int64]
+    index: NDArray[np.int64]
+    num_matches: NDArray[np.int64]
+    num_inliers: NDArray[np.int64]
+    config: NDArray[np.int64]
+    displacement: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    matched: list[NDArray[np.bool_]]
+    num_astray: int
+    num_foreign: int
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Pairs that the mappers of all versions use."""
+        ignored = [CONFIGS.index(name) for name in _IGNORED_CONFIGS]
+        return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, ignored)
+
+
+def layout_of(connection: sqlite3.Connection) -> tuple[str, str]:
+    """Versions of COLMAP that lay out a file so, and those that open it."""
+    oldest = "prior_qw" in columns(connection, "images")
+    newest = "pose_prior_id" in columns(connection, "pose_priors")
+    if newest:
+        migrated = ("3.8 or 3.9, migrated by 4.x", "3.8, 3.9 and 4.x")
+        return migrated if oldest else ("4.x", "4.x")
+    if oldest:
+        return "3.8 or 3.9", "3.8 and later"
+    framed = bool(columns(connection, "frames"))
+    return ("3.12 or 3.13" if framed else "3.10 or 3.11"), "3.10 and later"
+
+
+def images_with_rows(connection: sqlite3.Connection, path: Path) -> Images:
+    """Read the images with their keypoints and descriptors."""
+    rows = connection.execute(
+        "SELECT image_id, name, camera_id FROM images ORDER BY image_id"
+    ).fetchall()
+    place = {row[0]: i for i, row in enumerate(rows)}
+    keypoints = [np.empty((0, 2), dtype=np.float32)] * len(rows)
+    num_columns, num_descriptors = [0] * len(rows), [-1] * len(rows)
+    for image_id, *row in connection.execute("SELECT image_id, rows, cols, data FROM keypoints"):
+        if image_id in place:
+            num_columns[place[image_id]] = row[1]
+            if row[0]:
+                keypoints[place[image_id]] = keypoints_from_row(path, image_id, *row)[:, :2]
+    if columns(connection, "descriptors"):
+        for image_id, count in connection.execute("SELECT image_id, rows FROM descriptors"):
+            if image_id in place:
+                num_descriptors[place[image_id]] = count
+    return Images(
+        ids=np.array([row[0] for row in rows], dtype=np.int64),
+        names=[row[1] for row in rows],
+        camera_ids=[row[2] for row in rows],
+        keypoints=keypoints,
+        columns=num_columns,
+        num_descriptors=num_descriptors,
+    )
+
+
+def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) -> Pairs:
+    """Read pair by pair: the matches of a large database do not fit into memory."""
+    place = {int(image_id): i for i, image_id in enumerate(images.ids)}
+    num_matches = dict(connection.execute("SELECT pair_id, rows FROM matches").fetchall())
+    matched = [np.zeros(len(k), dtype=np.bool_) for k in images.keypoints]
+    rows: dict[int, tuple[int, int, float, float]] = {}
+    num_astray = 0
+    ignored = [CONFIGS.index(name) for name in _IGNORED_CONFIGS]
+    for pair_id, num_rows, data, config in connection.execute(
+        "SELECT pair_id, rows, data, config FROM two_view_geometries"
+    ):
+        rows[pair_id] = (num_rows, config, 0.0, 0.0)
+        i, j = (place.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
+        if min(i, j) < 0 or num_rows == 0:
+            continue
+        inliers = matches_from_row(path, pair_id, num_rows, data)
+        there = (inliers < [len(images.keypoints[i]), len(images.keypoints[j])]).all(axis=1)
+        num_astray += not there.all()
+        a, b = inliers[there].T
+        if len(a):
+            step = images.keypoints[j][b].astype(np.float64) - images.keypoints[i][a]
+            spread = np.hypot(*np.subtract(*np.quantile(step, (0.9, 0.1), axis=0)))
+            rows[pair_id] = (num_rows, config, np.median(np.hypot(*step.T)), spread)
+        if num_rows >= MIN_INLIERS and config not in ignored:
+            matched[i][a] = matched[j][b] = True
+    pair_ids = np.array(sorted(rows.keys() | num_matches.keys()), dtype=np.int64)
+    index = np.array(
+        [[place.get(i, -1) for i in image_ids_from_pair_id(int(p))] for p in pair_ids],
+        dtype=np.int64,
+    ).reshape(-1, 2)
+    listed = (index >= 0).all(axis=1)
+    kept = [int(p) for p in pair_ids[listed]]
+    geometry = np.array([rows.get(p, (-1, 0, 0.0, 0.0)) for p in kept]).reshape(-1, 4)
+    return Pairs(
+        ids=pair_ids[listed],
+        index=index[listed],
+        num_matches=np.array([num_matches.get(p, -1) for p in kept], dtype=np.int64),
+        num_inliers=geometry[:, 0].astype(np.int64),
+        config=geometry[:, 1].astype(np.int64),
+        displacement=geometry[:, 2],
+        spread=geometry[:, 3],
+        matched=matched,
+        num_astray=num_astray,
+        num_foreign=sum(rows.get(int(p), (-1,))[0] >= MIN_INLIERS for p in pair_ids[~listed]),
+    )
+
+
+def parallax_of(
+    connection: sqlite3.Connection,
+    path: Path,
+    images: Images,
+    pairs: Pairs,
+    cameras: dict[int, pycolmap.Camera],
+) -> Parallax | None:
+    """Displacement of the widest pair, and the angles that the best pairs reach."""
+    used = np.flatnonzero(pairs.used)
+    if used.size == 0:
+        return None
+    # The mapper starts with pairs of many inliers; without one, any used pair will do.
+    strong = used[pairs.num_inliers[used] >= MIN_INITIAL_INLIERS]
+    candidates = strong if strong.size else used
+    deepest = candidates[np.argsort(-pairs.spread[candidates], kind="stable")]
+    angles, forward, known = [], [], True
+    for pair in deepest[:_NUM_DEEPEST]:
+        i, j = pairs.index[pair]
+        if not {images.camera_ids[i], images.camera_ids[j]} <= cameras.keys():
+            continue
+        ends = [cameras[images.camera_ids[k]] for k in (i, j)]
+        geometry = _read_geometry(connection, path, int(pairs.ids[pair]))
+        limits = [len(images.keypoints[i]), len(images.keypoints[j])]
+        if geometry is None or (geometry.inlier_matches >= limits).any():
+            continue
+        if pycolmap.estimate_two_view_geometry_pose(
+            ends[0], images.keypoints[i], ends[1], images.keypoints[j], geometry
+        ):
+            angles.append(np.rad2deg(geometry.tri_angle))
+            forward.append(abs(geometry.cam2_from_cam1.translation[2]) >= _MAX_FORWARD_MOTION)
+            known = known and all(camera.has_prior_focal_length for camera in ends)
+    widest = candidates[np.argmax(pairs.displacement[candidates])]
+    i, j = pairs.index[widest]
+    return Parallax(
+        names=(images.names[i], images.names[j]),
+        displacement=float(pairs.displacement[widest]),
+        angle=float(np.quantile(angles, _LARGEST)) if angles else None,
+        focal_known=known and bool(angles),
+        forward_share=float(np.mean(forward)) if forward else 0.0,
+    )
+
+
+def _read_geometry(
+    connection: sqlite3.Connection, path: Path, pair_id: int
+) -> pycolmap.TwoViewGeometry | None:
+    """A stored geometry; None where the model that its kind needs is missing."""
+    stored = columns(connection, "two_view_geometries")
+    names = [name for name in ("E", "F", "H") if name in stored]
+    num_rows, data, config, *blobs = connection.execute(
+        f"SELECT {', '.join(['rows', 'data', 'config', *names])} FROM two_view_geometries "
+        "WHERE pair_id = ?",
+        (pair_id,),
+    ).fetchone()
+    models = {
+        name: np.frombuffer(blob, dtype="<f8").reshape(3, 3)
+        for name, blob in zip(names, blobs, strict=True)
+        if blob is not None and len(blob) == 72
+    }
+    kind = name_of_config(config)
+    needed = {"CALIBRATED": "E", "UNCALIBRATED": "F"}.get(kind, "H")
+    if kind == "MULTIPLE" or kind not in CONFIGS or needed not in models:
+        return None
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = pycolmap.TwoViewGeometryConfiguration(config)
+    geometry.inlier_matches = matches_from_row(path, pair_id, num_rows, data)
+    for name, model in models.items():
+        setattr(geometry, name, model)
+    return geometry
+
+
+def name_of_config(config: int) -> str:
+    """COLMAP's name of a kind of geometry; the number of one that it has none for."""
+    return CONFIGS[config] if 0 <= config < len(CONFIGS) else str(config)

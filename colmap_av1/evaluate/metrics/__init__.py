@@ -1,0 +1,1 @@
+"""What is measured: tracks, poses, clouds, renderings."""

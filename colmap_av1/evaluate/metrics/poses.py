@@ -1,0 +1,203 @@
+"""Errors of estimated poses after similarity alignment to true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_av1.evaluate.metrics.sequence import frame_number
+from colmap_av1.model.colmap_model import camera_centres, posed_images
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """How far estimated poses are from the truth.
+
+    Attributes:
+        num_poses: frames whose pose is both estimated and known.
+        ate: absolute trajectory error: RMS distance of the aligned camera centres, in the
+            truth's unit.
+        max_centre: the largest of these distances.
+        extent: diagonal of the box around the true centres, in the truth's unit.
+        rotation: median angle between estimated and true camera orientations, in degrees, under
+            the one turn of the world that fits the orientations best.
+        max_rotation: the largest of these angles.
+        relative_translation: relative pose error: RMS distance between estimated and true motion
+            from a pose to the next, in the truth's unit.
+        relative_rotation: RMS angle between estimated and true turn from a pose to the next, in
+            degrees.
+    """
+
+    num_poses: int
+    ate: float
+    max_centre: float
+    extent: float
+    rotation: float
+    max_rotation: float
+    relative_translation: float
+    relative_rotation: float
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A move to other coordinates, x' = scale * rotation x + translation.
+
+    Attributes:
+        scale: the scale.
+        rotation: float64 [3, 3].
+        translation: float64 [3].
+    """
+
+    scale: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def move(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [n, 3] in the other coordinates."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def move_poses(self, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses [n, 3, 4] of the same cameras in the other coordinates."""
+        rotation = cam_from_world[:, :, :3] @ self.rotation.T
+        centres = self.move(camera_centres(cam_from_world))
+        return np.dstack([rotation, -np.einsum("nij,nj->ni", rotation, centres)])
+
+
+def fit_similarity(
+    cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
+) -> Similarity | None:
+    """The similarity that fits the centres of poses best to those of others (Umeyama).
+
+    Args:
+        cam_from_world: float64 [n, 3, 4] poses, NaN where there is none.
+        truth: float64 [n, 3, 4] the others, NaN where unknown.
+
+    Returns:
+        What brings the first to the second; None where fewer than three poses are in both or
+        where their centres determine no similarity.
+
+    Raises:
+        ValueError: the two differ in their number of poses.
+    """
+    both = _in_both(cam_from_world, truth)
+    if both.sum() < 3:
+        return None
+    found = pycolmap.estimate_sim3d(
+        camera_centres(cam_from_world[both]), camera_centres(truth[both])
+    )
+    if found is None:
+        return None
+    turn = np.asarray(found.rotation.matrix())
+    return Similarity(float(found.scale), turn, np.asarray(found.translation))
+
+
+def pose_errors(
+    cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
+) -> PoseErrors | None:
+    """Compare poses with the truth after the similarity that fits their centres best (Umeyama).
+
+    Args:
+        cam_from_world: float64 [num_frames, 3, 4] estimated poses, NaN where there is none.
+        truth: float64 [num_frames, 3, 4] true poses, NaN where unknown.
+
+    Returns:
+        The errors, over the frames that have both; None where fewer than three have or where
+        their centres determine no similarity.
+
+    Raises:
+        ValueError: the two differ in their number of frames.
+    """
+    similarity = fit_similarity(cam_from_world, truth)
+    if similarity is None:
+        return None
+    both = _in_both(cam_from_world, truth)
+    aligned, true_centres = similarity.move_poses(cam_from_world[both]), camera_centres(truth[both])
+    distance = np.linalg.norm(camera_centres(aligned) - true_centres, axis=1)
+    angle = _rotation_errors(cam_from_world[both][:, :, :3], truth[both][:, :, :3])
+    relative = _relative_errors(aligned, truth[both])
+    return PoseErrors(
+        num_poses=int(both.sum()),
+        ate=float(np.sqrt(np.mean(distance**2))),
+        max_centre=float(distance.max()),
+        extent=float(np.linalg.norm(np.ptp(true_centres, axis=0))),
+        rotation=float(np.median(angle)),
+        max_rotation=float(angle.max()),
+        relative_translation=relative[0],
+        relative_rotation=relative[1],
+    )
+
+
+def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
+    """Poses of a model's images: float64 [n, 3, 4] cam_from_world, NaN without one.
+
+    Args:
+        model: pycolmap.Reconstruction.
+        names: names of the images.
+    """
+    found = posed_images(model)
+    cam_from_world = np.full((len(names), 3, 4), np.nan)
+    for i, name in enumerate(names):
+        if name in found:
+            cam_from_world[i] = found[name].cam_from_world
+    return cam_from_world
+
+
+def model_poses(model: Any, num_frames: int) -> NDArray[np.float64]:
+    """Poses of a model's registered images, by frame.
+
+    Args:
+        model: pycolmap.Reconstruction whose image names hold the frame's number from 0.
+        num_frames: number of frames of the video.
+
+    Returns:
+        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a registered image.
+
+    Raises:
+        ImageError: an image's name holds no frame number.
+    """
+    cam_from_world = np.full((num_frames, 3, 4), np.nan)
+    for name, image in posed_images(model).items():
+        cam_from_world[frame_number(name)] = image.cam_from_world
+    return cam_from_world
+
+
+def _in_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
+    if a.shape != b.shape:
+        raise ValueError(f"{len(a)} estimated poses, {len(b)} true ones")
+    return np.asarray(np.isfinite(a).all((1, 2)) & np.isfinite(b).all((1, 2)))
+
+
+def _relative_errors(
+    aligned: NDArray[np.float64], truth: NDArray[np.float64]
+) -> tuple[float, float]:
+    """RMS errors of the motion from each pose to the next: of the translation, of the turn."""
+    translation, turn = zip(*map(_motions, (aligned, truth)), strict=True)
+    distance = np.linalg.norm(translation[0] - translation[1], axis=1)
+    angle = np.degrees((turn[0] * turn[1].inv()).magnitude())
+    return float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(angle**2)))
+
+
+def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
+    """Translation, in the first camera's axes, and turn from each pose to the next."""
+    rotation, step = cam_from_world[:, :, :3], np.diff(camera_centres(cam_from_world), axis=0)
+    turn = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
+    return np.einsum("nij,nj->ni", rotation[:-1], step), turn
+
+
+def _rotation_errors(
+    estimated: NDArray[np.float64], truth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Angles in degrees between orientations [n, 3, 3] under the turn of the world that fits best.
+
+    Not under the turn that fits the centres: these lie nearly on a line where a car drives, and
+    leave the turn about it open.
+    """
+    turn = Rotation.from_matrix(truth.transpose(0, 2, 1) @ estimated).mean()
+    between = Rotation.from_matrix(estimated) * turn.inv() * Rotation.from_matrix(truth).inv()
+    return np.asarray(np.degrees(between.magnitude()), dtype=np.float64)

@@ -1,0 +1,219 @@
+"""How close rendered images come to photographs: PSNR-Y, SSIM, VMAF, LPIPS, sharpness."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError
+from colmap_av1.util.processes import bound
+
+_Image = NDArray[np.uint8]
+
+# Zhu and Milanfar's patch side in pixels, and the share of patches of pure noise that may
+# count as structure.
+_PATCH = 8
+_SIGNIFICANCE = 0.001
+_LPIPS_SCRIPT = Path(__file__).with_name("lpips_distances.py")
+
+
+@dataclass(frozen=True)
+class RenderingMetrics:
+    """Metrics of rendered images, float64 [n] each, in the order of the images.
+
+    Attributes:
+        psnr_y: peak signal-to-noise ratio of the luma in dB (60 for equal images).
+        ssim_db: structural similarity s of the luma as -10 log10(1 - s), in dB; infinite for
+            equal images.
+        vmaf: VMAF (model vmaf_v0.6.1), 0 to 100.
+        sharpness: Zhu and Milanfar's Q of the rendered image.
+        sharpness_difference: absolute difference to the Q of the reference.
+        lpips: LPIPS (AlexNet) distance, 0 for equal images; None where `no_lpips` says why.
+        no_lpips: why there is no LPIPS; empty where there is.
+    """
+
+    psnr_y: NDArray[np.float64]
+    ssim_db: NDArray[np.float64]
+    vmaf: NDArray[np.float64]
+    sharpness: NDArray[np.float64]
+    sharpness_difference: NDArray[np.float64]
+    lpips: NDArray[np.float64] | None
+    no_lpips: str
+
+
+def rendering_metrics(
+    rendered: Sequence[Path],
+    references: Sequence[Path],
+    progress: Callable[[int], None] | None = None,
+) -> RenderingMetrics:
+    """Compare rendered images with the photographs they stand for.
+
+    PSNR-Y, SSIM and VMAF are libvmaf's, on the luma of BT.709 at limited range, as of video.
+
+    Args:
+        rendered: image files.
+        references: for each, the file of the photograph, of the same size.
+        progress: called with the number of images done so far.
+
+    Raises:
+        ImageError: a file is missing or no image, or the sizes of a pair differ.
+    """
+    if len(rendered) != len(references) or not rendered:
+        raise ImageError(
+            f"{len(rendered)} rendered images for {len(references)} references: give one for each"
+        )
+    sharpness = []
+    by_size: dict[tuple[int, ...], list[int]] = {}
+    for i, (image_path, reference_path) in enumerate(zip(rendered, references, strict=True)):
+        image, reference = _read(image_path), _read(reference_path)
+        if image.shape != reference.shape:
+            raise ImageError(
+                f"{image_path} is {image.shape[1]}x{image.shape[0]}, {reference_path} "
+                f"{reference.shape[1]}x{reference.shape[0]}: render at the size of the photographs"
+            )
+        by_size.setdefault(image.shape, []).append(i)
+        # Structure is where the reference has it, whatever the rendering made of it.
+        structure = _is_structure(_luma(reference))
+        sharpness.append([_sharpness(_luma(x), structure) for x in (image, reference)])
+        if progress is not None:
+            progress(i + 1)
+    values = np.empty((len(rendered), 3))
+    for indices in by_size.values():
+        pairs = [(rendered[i], references[i]) for i in indices]
+        values[indices] = _vmaf(pairs)
+    lpips, no_lpips = _lpips(rendered, references)
+    q = np.array(sharpness)
+    with np.errstate(divide="ignore"):
+        ssim_db = -10 * np.log10(1 - values[:, 1])
+    return RenderingMetrics(
+        psnr_y=values[:, 0],
+        ssim_db=ssim_db,
+        vmaf=values[:, 2],
+        sharpness=q[:, 0],
+        sharpness_difference=np.abs(q[:, 0] - q[:, 1]),
+        lpips=lpips,
+        no_lpips=no_lpips,
+    )
+
+
+def sharpness(image: _Image) -> float:
+    """Zhu and Milanfar's no-reference measure Q of structure over noise.
+
+    X. Zhu and P. Milanfar, "Automatic Parameter Selection for Denoising Algorithms Using a
+    No-Reference Measure of Image Content", IEEE Transactions on Image Processing 19 (2010):
+    the singular values s1 >= s2 of a patch's gradients give s1 (s1 - s2) / (s1 + s2), summed
+    over the patches with a dominant direction and divided by the number of all patches.
+
+    Args:
+        image: uint8 [height, width, 3] BGR, 8 pixels or more each way.
+    """
+    luma = _luma(image)
+    return _sharpness(luma, _is_structure(luma))
+
+
+def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float:
+    s1, s2 = _singular_values(luma)
+    total = s1 + s2
+    q = np.divide(s1 * (s1 - s2), total, out=np.zeros_like(s1), where=total > 0)
+    return float(q[structure].sum() / max(q.size, 1))
+
+
+def _is_structure(luma: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Patches whose coherence noise alone would not reach: bool [rows, cols] of patches."""
+    s1, s2 = _singular_values(luma)
+    total = s1 + s2
+    coherence = np.divide(s1 - s2, total, out=np.zeros_like(s1), where=total > 0)
+    tail = _SIGNIFICANCE ** (1 / (_PATCH**2 - 1))
+    return np.asarray(coherence > np.sqrt((1 - tail) / (1 + tail)))
+
+
+def _singular_values(luma: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Singular values of the [64, 2] gradient matrix of each 8x8 patch: [rows, cols] each."""
+    dy, dx = (np.asarray(d, dtype=np.float64) for d in np.gradient(luma))
+    rows, cols = luma.shape[0] // _PATCH, luma.shape[1] // _PATCH
+
+    def patch_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        whole = values[: rows * _PATCH, : cols * _PATCH]
+        return np.asarray(whole.reshape(rows, _PATCH, cols, _PATCH).sum(axis=(1, 3)))
+
+    xx, xy, yy = patch_sums(dx * dx), patch_sums(dx * dy), patch_sums(dy * dy)
+    spread = np.hypot((xx - yy) / 2, xy)
+    mean = (xx + yy) / 2
+    return np.sqrt(mean + spread), np.sqrt(np.maximum(mean - spread, 0))
+
+
+def _luma(image: _Image) -> NDArray[np.float64]:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.float64)
+
+
+def _read(path: Path) -> _Image:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
+        raise ImageError(f"{path}: is missing or no image: render it again")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
+    """PSNR-Y, SSIM and VMAF of pairs of image files of one size: float64 [n, 3]."""
+    height, width = _read(pairs[0][0]).shape[:2]
+    # Both come as one stream, the rendered image above its reference.
+    graph = (
+        "scale=out_color_matrix=bt709:out_range=tv,format=yuv444p,split[x][y];"
+        f"[x]crop={width}:{height}:0:0[a];[y]crop={width}:{height}:0:{height}[b];"
+        "[a][b]libvmaf=feature=name=psnr|name=float_ssim:log_fmt=json:log_path=log.json"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        command = [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo"),
+            *("-pix_fmt", "bgr24", "-s", f"{width}x{2 * height}", "-i", "-"),
+            *("-filter_complex", graph, "-f", "null", "-"),
+        ]
+        with subprocess.Popen(
+            bound(command), cwd=folder, stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            pipe: Any = process.stdin
+            # An early end of ffmpeg is explained by its own words below.
+            with contextlib.suppress(BrokenPipeError):
+                for path in itertools.chain.from_iterable(pairs):
+                    pipe.write(_read(path).tobytes())
+            words = process.communicate()[1].decode(errors="replace").split("\n")
+        if process.returncode != 0:
+            reason = next((line for line in words if line.strip()), "it ended without a word")
+            raise ImageError(f"ffmpeg cannot measure VMAF: {reason}")
+        frames: list[dict[str, Any]] = json.loads((Path(folder) / "log.json").read_text())["frames"]
+    names = ("psnr_y", "float_ssim", "vmaf")
+    return np.array([[frame["metrics"][name] for name in names] for frame in frames])
+
+
+def _lpips(
+    rendered: Sequence[Path], references: Sequence[Path]
+) -> tuple[NDArray[np.float64] | None, str]:
+    """LPIPS of pairs of files, and why there is none.
+
+    In a process of its own: torch and pycolmap do not live in one.
+    """
+    files = [[str(a), str(b)] for a, b in zip(rendered, references, strict=True)]
+    run = subprocess.run(
+        bound([sys.executable, str(_LPIPS_SCRIPT)]),
+        input=json.dumps(files),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if run.returncode != 0:
+        reason = (run.stderr.strip().splitlines() or ["it ended without a word"])[-1]
+        return None, reason
+    return np.array(json.loads(run.stdout), dtype=np.float64), ""

@@ -1,0 +1,139 @@
+"""How far tracks stray from the truth, by the number of frames they are followed over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.tracks.tracks import Tracks
+
+SPANS = (1, 2, 4, 8, 16)
+
+# Carries positions [n, 2] of frame a to frame b: their positions [n, 2] there, and whether the
+# point is visible there.
+Transfer = Callable[[NDArray[np.float64], int, int], tuple[NDArray[np.float64], NDArray[np.bool_]]]
+
+
+def pairs_at_span(
+    tracks: Tracks, span: int, *, max_pairs: int | None = None, seed: int = 0
+) -> NDArray[np.int64]:
+    """Observations of the same track that lie `span` frames apart.
+
+    Args:
+        tracks: the tracks.
+        span: frames between the two observations.
+        max_pairs: keep this many, drawn at random; None: all.
+        seed: seed of the draw.
+
+    Returns:
+        int64 [n, 2] rows of `tracks.frame` and `tracks.xy`, the earlier frame first, in the
+        tracks' order.
+    """
+    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    # Tracks are sorted by frame, so these keys ascend.
+    key = track * (tracks.num_frames + span) + tracks.frame
+    first = np.flatnonzero(tracks.frame + span < tracks.num_frames)
+    second = np.searchsorted(key, key[first] + span)
+    found = second < len(key)
+    found[found] = key[second[found]] == key[first[found]] + span
+    pairs = np.stack([first[found], second[found]], 1)
+    if max_pairs is not None and len(pairs) > max_pairs:
+        rng = np.random.default_rng(seed)
+        pairs = pairs[np.sort(rng.choice(len(pairs), max_pairs, replace=False))]
+    return pairs
+
+
+def epipolar_errors(
+    tracks: Tracks,
+    cam_from_world: NDArray[np.float64],
+    camera: Any,
+    span: int,
+    *,
+    max_pairs: int | None = 200_000,
+) -> NDArray[np.float64]:
+    """Sampson distances of tracks to the true epipolar geometry.
+
+    Only the part of an error across the epipolar line shows.
+
+    Args:
+        tracks: the tracks.
+        cam_from_world: float64 [num_frames, 3, 4] true poses, NaN where unknown.
+        camera: pycolmap.Camera with the true intrinsics.
+        span: frames between the two positions that are compared.
+        max_pairs: pairs of positions at most, drawn at random; None: all.
+
+    Returns:
+        float64 [n] distances in pixels of an undistorted image of the camera's focal length;
+        pairs of frames without known poses or without a baseline are left out.
+    """
+    pairs = pairs_at_span(tracks, span, max_pairs=max_pairs)
+    essential = _essential_matrices(cam_from_world, span)[tracks.frame[pairs[:, 0]]]
+    rays = [_rays(camera, tracks.xy[pairs[:, side]]) for side in (0, 1)]
+    line_in_b = np.einsum("nij,nj->ni", essential, rays[0])
+    line_in_a = np.einsum("nji,nj->ni", essential, rays[1])
+    residual = np.abs(np.einsum("ni,ni->n", rays[1], line_in_b))
+    slope = np.hypot(
+        np.hypot(line_in_b[:, 0], line_in_b[:, 1]), np.hypot(line_in_a[:, 0], line_in_a[:, 1])
+    )
+    with np.errstate(invalid="ignore"):
+        distance = camera.mean_focal_length() * residual / slope
+    return np.asarray(distance[np.isfinite(distance)], dtype=np.float64)
+
+
+def exact_errors(
+    tracks: Tracks, transfer: Transfer, span: int, *, max_pairs: int | None = 50_000
+) -> NDArray[np.float64]:
+    """Where tracks are, less where they would be had they kept to the surface point.
+
+    A point that another surface hides by then still has a true position: a track that goes on
+    with what hides it is wrong by its distance to that.
+
+    Args:
+        tracks: the tracks.
+        transfer: the truth: carries positions of one frame to another.
+        span: frames between the two positions that are compared.
+        max_pairs: pairs of positions at most, drawn at random; None: all.
+
+    Returns:
+        float64 [n, 2] signed errors in pixels, (x right, y down); positions that see no
+        surface are left out.
+    """
+    pairs = pairs_at_span(tracks, span, max_pairs=max_pairs)
+    frame = tracks.frame[pairs[:, 0]]
+    errors = np.full((len(pairs), 2), np.nan)
+    for a in np.unique(frame):
+        of_a = np.flatnonzero(frame == a)
+        start = tracks.xy[pairs[of_a, 0]].astype(np.float64)
+        truth, _ = transfer(start, int(a), int(a) + span)
+        errors[of_a] = tracks.xy[pairs[of_a, 1]] - truth
+    return np.asarray(errors[np.isfinite(errors).all(1)], dtype=np.float64)
+
+
+def _essential_matrices(cam_from_world: NDArray[np.float64], span: int) -> NDArray[np.float64]:
+    """[num_frames, 3, 3] from each frame to the one `span` later; NaN where there is none."""
+    essential = np.full((len(cam_from_world), 3, 3), np.nan)
+    if span >= len(cam_from_world):
+        return essential
+    a, b = cam_from_world[:-span], cam_from_world[span:]
+    rotation = b[:, :, :3] @ a[:, :, :3].transpose(0, 2, 1)
+    turned = np.einsum("nij,nj->ni", rotation, a[:, :, 3])
+    baseline = b[:, :, 3] - turned
+    # What rounding leaves of a camera at rest is no direction.
+    at_rest = np.linalg.norm(baseline, axis=1) <= 1e-12 * (1 + np.linalg.norm(turned, axis=1))
+    baseline[at_rest] = np.nan
+    x, y, z = baseline.T
+    o = np.zeros_like(x)
+    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)
+    essential[:-span] = cross @ rotation
+    return essential
+
+
+def _rays(camera: Any, xy: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[n, 3] rays of positions [n, 2], one unit long along the camera's axis."""
+    if not len(xy):
+        return np.empty((0, 3))
+    normalised = np.asarray(camera.cam_from_img(xy.astype(np.float64)), dtype=np.float64)
+    return np.concatenate([normalised, np.ones((len(xy), 1))], axis=1)

@@ -1,0 +1,1 @@
+"""What a comparison shows: results, pictures, the report."""

@@ -1,0 +1,183 @@
+"""Tables of a comparison."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_av1.evaluate.report.results import Column, CompareReport
+from colmap_av1.evaluate.training.splatting import share_of_time
+
+# What the others' figures are shares of.
+BASELINE = "sift-exhaustive"
+_NONE = "-"
+_LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table under a title, with a line about it."""
+
+    title: str
+    about: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+def models_table(report: CompareReport) -> Table:
+    """Points, errors, poses and clouds of each model."""
+    base = next((c.model for c in report.columns if c.name == BASELINE), None)
+    header = ["front-end", "images", "points"]
+    header += ["x SIFT exhaustive"] * (base is not None)
+    header += ["track length", "error px, mean / median"]
+    header += ["ATE", "relative pose error"] * bool(report.pose_reference)
+    header += ["Chamfer", "Hausdorff (95 %)"] * bool(report.cloud_reference)
+    rows = []
+    for column in report.columns:
+        model = column.model
+        if model is None:
+            rows.append([column.name, *[_NONE] * (len(header) - 1)])
+            continue
+        row = [column.name, f"{model.num_registered} of {report.num_images}"]
+        row.append(f"{model.num_points:,}")
+        if base is not None:
+            row.append(f"{model.num_points / base.num_points:.1f}" if base.num_points else _NONE)
+        row.append(f"{model.mean_track_length:.2f}")
+        row.append(f"{_number(model.mean_error)} / {_number(model.median_error)}")
+        if report.pose_reference:
+            row += _pose_cells(column, report)
+        if report.cloud_reference:
+            row += _cloud_cells(column, report)
+        rows.append(row)
+    return Table("Clouds and poses", _about_models(report), header, rows)
+
+
+def _about_models(report: CompareReport) -> str:
+    told = "Error: reprojection error of the points, as COLMAP states it."
+    if report.pose_reference:
+        whose = _whose(report.pose_reference, report.is_truth)
+        told += (
+            f" Poses against {whose}: ATE is the RMS distance of the camera centres after "
+            "similarity alignment, as a share of the path's extent; the relative pose error is "
+            "that of the motion from an image to the next, RMS, translation as a share of the "
+            "extent, and turn."
+        )
+        if report.is_truth:
+            told += " Before the share, the distance in the truth's unit."
+    if report.cloud_reference:
+        whose = _whose(
+            report.cloud_reference,
+            report.is_truth and report.cloud_reference == report.pose_reference,
+        )
+        told += (
+            f" Distances to the cloud of {whose}, as a share of the extent of its middle 90 %: "
+            "Chamfer is the mean distance to the nearest point, averaged over both directions; "
+            "Hausdorff the larger of the 95 % quantiles, with the largest distance behind it. A "
+            "cloud that is denser than the one it is measured against has points where that one "
+            "has none."
+        )
+    return told
+
+
+def _whose(source: str, is_truth: bool) -> str:
+    return f"the given truth ({Path(source).name})" if is_truth else f"{source} as pseudo truth"
+
+
+def _pose_cells(column: Column, report: CompareReport) -> list[str]:
+    poses = column.poses
+    if poses is None:
+        return ["reference" if column.name == report.pose_reference else _NONE, _NONE]
+    ate = f"{poses.ate / poses.extent:.3%}"
+    if report.is_truth:
+        ate = f"{poses.ate:.4f}, {ate}"
+    relative = f"{poses.relative_translation / poses.extent:.3%}, {poses.relative_rotation:.3f}°"
+    return [ate, relative]
+
+
+def _cloud_cells(column: Column, report: CompareReport) -> list[str]:
+    cloud = column.cloud
+    if cloud is None:
+        return ["reference" if column.name == report.cloud_reference else _NONE, _NONE]
+    share = [value / cloud.extent for value in (cloud.chamfer, cloud.robust_hausdorff)]
+    return [f"{share[0]:.2%}", f"{share[1]:.1%} ({cloud.hausdorff / cloud.extent:.1f}x)"]
+
+
+def cost_table(columns: Sequence[Column]) -> Table:
+    """Seconds and memory of each step."""
+    header = ["front-end", "matching: CPU s", "mapping: CPU s", "all tracks: CPU s", "in all"]
+    header += ["memory", "wall s of each stage"]
+    rows = []
+    for column in columns:
+        cpu = column.cpu_seconds
+        row = [column.name]
+        row += [
+            f"{cpu[s]:.1f}" if s in cpu else _NONE for s in ("matching", "mapping", "all tracks")
+        ]
+        row.append(f"{sum(cpu.values()):.1f}" if cpu else _NONE)
+        memory = column.peak_memory
+        row.append(f"{memory / 2**20:,.0f} MB" if memory is not None else _NONE)
+        row.append(", ".join(f"{k} {v:.1f}" for k, v in column.seconds.items()) or _NONE)
+        rows.append(row)
+    about = (
+        "Every stage ran in a process of its own; matching holds reading or extraction, matching "
+        "and verification. Where other work runs beside it, wall time means little: read the CPU "
+        "time."
+    )
+    return Table("What it takes", about, header, rows)
+
+
+def lengths_table(columns: Sequence[Column]) -> Table:
+    """How many images see a point."""
+    bounds = [*_LENGTH_CLASSES, math.inf]
+    spans = list(itertools.pairwise(bounds))
+    header = ["points seen by"]
+    for low, high in spans:
+        one = high == low + 1
+        header.append(f"{low}" if one else f"{low}+" if high == math.inf else f"{low}-{high - 1}")
+    header[-1] += " images"
+    rows = []
+    for column in columns:
+        lengths = column.track_lengths
+        counts = [sum(n for k, n in lengths.items() if low <= k < high) for low, high in spans]
+        rows.append([column.name, *(f"{n:,}" if lengths else _NONE for n in counts)])
+    return Table("Track lengths", "", header, rows)
+
+
+def renderings_table(columns: Sequence[Column]) -> Table:
+    """Renderings of trained Gaussians."""
+    header = ["front-end", "PSNR-Y, dB", "SSIM, dB", "LPIPS", "VMAF", "Q", "difference of Q"]
+    header += ["Gaussians", "training, s", "share of the baseline's time"]
+    base = next((c.training for c in columns if c.name == BASELINE), None)
+    rows = []
+    told = ""
+    for column in columns:
+        training = column.training
+        if training is None:
+            rows.append([column.name, *[_NONE] * (len(header) - 1)])
+            continue
+        metrics = training.metrics
+        row = [column.name, f"{metrics.psnr_y.mean():.2f}", f"{metrics.ssim_db.mean():.2f}"]
+        row.append(f"{metrics.lpips.mean():.3f}" if metrics.lpips is not None else _NONE)
+        row += [f"{metrics.vmaf.mean():.2f}", f"{metrics.sharpness.mean():.2f}"]
+        row.append(f"{metrics.sharpness_difference.mean():.2f}")
+        row.append(f"{training.states[-1].num_gaussians:,}" if training.states else _NONE)
+        row.append(f"{training.seconds:.0f}")
+        share = None
+        if base is not None and base.states and training.states:
+            share = share_of_time(training.states, base.states)
+        row.append(f"{share:.0%}" if share is not None else _NONE)
+        rows.append(row)
+        told = metrics.no_lpips or told
+    about = (
+        "Means over the test images, which are the odd ones; trained on the even ones. Q: Zhu and "
+        "Milanfar's measure of sharpness, and its absolute difference to that of the photograph. "
+        f"The baseline is {BASELINE}: when its last PSNR-Y is reached."
+    )
+    return Table("Renderings", f"{about} No LPIPS: {told}." if told else about, header, rows)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else _NONE

@@ -1,0 +1,1 @@
+"""Trainers of 3D Gaussians on models."""

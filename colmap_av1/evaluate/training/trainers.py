@@ -1,0 +1,297 @@
+"""Folders that trainers of 3D Gaussians open, trainers run on them, and what they rendered."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import string
+import subprocess
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.evaluate.frontends.measure import run_measured
+from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
+from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
+from colmap_av1.model.colmap_model import ModelPoints, posed_images, read_model, write_model
+from colmap_av1.util.processes import bound_shell
+
+GSPLAT = "gsplat"
+_PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
+_PICTURES = {".png", ".jpg", ".jpeg"}
+
+
+@dataclass(frozen=True)
+class Split:
+    """A model with undistorted images, as a whole and in two halves.
+
+    Attributes:
+        data: folder with all images and the model in `images/` and `sparse/0/`.
+        train: the same with the images to train on, the even ones in the order of their names.
+        test: the same with the others.
+    """
+
+    data: Path
+    train: Path
+    test: Path
+
+    @property
+    def references(self) -> list[Path]:
+        """The pictures that renderings are compared with, in the order of their names."""
+        return sorted(path for path in (self.test / "images").rglob("*") if path.is_file())
+
+
+@dataclass(frozen=True)
+class Training:
+    """3D Gaussians trained on a model.
+
+    Attributes:
+        seconds: wall time of the training.
+        states: milestones of the training, the last at its end; empty for other trainers.
+        names: the test images.
+        references: the picture of each.
+        renders: its rendering.
+        metrics: of these.
+    """
+
+    seconds: float
+    states: tuple[Milestone, ...]
+    names: list[str]
+    references: list[Path]
+    renders: list[Path]
+    metrics: RenderingMetrics
+
+
+def check_trainer(trainer: str) -> None:
+    """Refuse a command that cannot be filled in.
+
+    Raises:
+        OptionError: it has other placeholders, or writes no renderings.
+    """
+    if trainer == GSPLAT:
+        return
+    known = ", ".join(f"{{{name}}}" for name in _PLACEHOLDERS)
+    try:
+        fields = {name for _, name, _, _ in string.Formatter().parse(trainer) if name is not None}
+    except ValueError as error:
+        raise OptionError(f"trainer '{trainer}': {error}: write {{{{ for a brace") from error
+    if not fields <= set(_PLACEHOLDERS) or "data" not in fields:
+        raise OptionError(
+            f"trainer '{trainer}': give '{GSPLAT}', or a command with {{data}} and others of "
+            f"{known}"
+        )
+
+
+def write_split(model: Path, image_path: Path, folder: Path) -> Split:
+    """Undistort the images of a model and write them as trainers open them, whole and halved.
+
+    All points are in both halves, without the observations of the other half's images.
+
+    Args:
+        model: folder of the model.
+        image_path: folder of its images.
+        folder: gets `data/`, `train/` and `test/`; kept where they are of this model.
+
+    Raises:
+        ModelError: the model cannot be read.
+        EvaluationError: the images cannot be undistorted; there are fewer than two.
+    """
+    split = Split(folder / "data", folder / "train", folder / "test")
+    registered = sorted(posed_images(read_model(model)))
+    if len(registered) < 2:
+        raise EvaluationError(
+            f"{model}: one image cannot be parted for training and test: give a larger model"
+        )
+
+    def work() -> dict[str, Any]:
+        run_measured(_undistort, model, image_path, split.data, registered, log=folder / "log.txt")
+        halves = split_images(registered)
+        for part, names in zip((split.train, split.test), halves, strict=True):
+            (part / "sparse" / "0").mkdir(parents=True)
+            for name in names:
+                target = part / "images" / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _link(split.data / "images" / name, target)
+            _write_part(split.data / "sparse" / "0", part / "sparse" / "0", set(names))
+        return {}
+
+    files = [*sorted(model.glob("*.bin")), *(image_path / name for name in registered)]
+    kept(folder, ([content_of(file) for file in files], pycolmap.__version__), work)
+    return split
+
+
+def train(
+    trainer: str,
+    split: Split,
+    folder: Path,
+    *,
+    name: str,
+    iterations: int,
+    milestones: Sequence[int],
+) -> Training:
+    """Train 3D Gaussians and measure their renderings; a finished training is not repeated.
+
+    Args:
+        trainer: "gsplat", or the template of a shell command: `{data}` and `{test}` are the
+            halves, `{output}` an empty folder, `{renders}` the one that gets the renderings of
+            the test images, `{iterations}` and `{name}` what they say.
+        split: the data.
+        folder: gets `output/`, `renders/`, `log.txt` and the figures.
+        name: the column.
+        iterations: how many.
+        milestones: iterations after which gsplat's test images are rendered, too.
+
+    Raises:
+        ColmapAv1Error: the trainer failed, or rendered no test images.
+    """
+    renders, references = folder / "renders", split.references
+    model = sorted((split.data / "sparse" / "0").glob("*.bin"))
+    given = [content_of(path) for path in (*model, *references)]
+    if trainer == GSPLAT:
+        stops = tuple(stop for stop in milestones if stop < iterations)
+        seconds, states = _kept_gsplat(split, folder, (given, iterations, stops))
+        last = folder / "output" / str(iterations)
+        files = [last / f"{reference.stem}.png" for reference in references]
+        metrics = states[-1].metrics
+        return Training(seconds, states, [r.name for r in references], references, files, metrics)
+
+    def work() -> dict[str, Any]:
+        for path in (folder / "output", renders):
+            path.mkdir()
+        words = {
+            "data": split.train.resolve(),
+            "test": split.test.resolve(),
+            "output": (folder / "output").resolve(),
+            "renders": renders.resolve(),
+            "iterations": iterations,
+            "name": name,
+        }
+        quoted = {key: shlex.quote(str(value)) for key, value in words.items()}
+        measured = run_measured(_run, trainer.format(**quoted), log=folder / "log.txt")
+        return {"seconds": measured.seconds}
+
+    seconds = kept(folder, (trainer, given, iterations), work)["seconds"]
+    files = match_renders(renders, references)
+    metrics = rendering_metrics(files, references)
+    return Training(seconds, (), [r.name for r in references], references, files, metrics)
+
+
+def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
+    """The rendering of each reference: by its name, else by the order of as many pictures.
+
+    Raises:
+        EvaluationError: the folder does not hold them.
+    """
+    found = [p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES]
+    by_stem = {path.stem: path for path in found}
+    if all(reference.stem in by_stem for reference in references):
+        return [by_stem[reference.stem] for reference in references]
+    if len(found) == len(references):
+        return sorted(found, key=_natural)
+    raise EvaluationError(
+        f"{folder}: holds {len(found)} renderings for {len(references)} test images: let the "
+        "trainer's command write one for each into {renders}"
+    )
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(w), "") if w.isdigit() else (-1, w) for w in re.split(r"(\d+)", path.name)]
+
+
+def _kept_gsplat(
+    split: Split, folder: Path, key: tuple[Any, int, tuple[int, ...]]
+) -> tuple[float, tuple[Milestone, ...]]:
+    _, iterations, stops = key
+
+    def work() -> dict[str, Any]:
+        states = train_gaussians(
+            split.data / "sparse" / "0",
+            split.data / "images",
+            folder / "output",
+            iterations=iterations,
+            milestones=stops,
+        )
+        return {"states": [_plain(state) for state in states]}
+
+    states = tuple(_milestone(state) for state in kept(folder, (GSPLAT, *key), work)["states"])
+    return states[-1].seconds, states
+
+
+def _plain(state: Milestone) -> dict[str, Any]:
+    metrics = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(state.metrics).items()
+    }
+    return {**vars(state), "metrics": metrics}
+
+
+def _milestone(plain: dict[str, Any]) -> Milestone:
+    metrics: dict[str, Any] = {
+        name: np.array(value) if isinstance(value, list) else value
+        for name, value in plain["metrics"].items()
+    }
+    return Milestone(**{**plain, "metrics": RenderingMetrics(**metrics)})
+
+
+def _run(command: str) -> None:
+    words = bound_shell(command)
+    status = subprocess.run(
+        words, shell=isinstance(words, str), check=False, stdin=subprocess.DEVNULL
+    ).returncode
+    if status != 0:
+        raise EvaluationError(f"the trainer ended with status {status}: its log.txt says more")
+
+
+def _undistort(model: Path, image_path: Path, output: Path, names: Sequence[str]) -> None:
+    """All images of a model without distortion, in `images/` and `sparse/0/`."""
+    made = output.with_name("undistorted")
+    pycolmap.undistort_images(made, model, image_path, image_names=list(names))
+    (output / "sparse").mkdir(parents=True)
+    (made / "sparse").replace(output / "sparse" / "0")
+    (made / "images").replace(output / "images")
+    shutil.rmtree(made)
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without links
+        shutil.copyfile(source, target)
+
+
+def _write_part(model: Path, output: Path, names: Collection[str]) -> None:
+    """Write a model with some of its images and all its points."""
+    whole = read_model(model)
+    posed = posed_images(whole)
+    images = [posed[name] for name in sorted(posed) if name in names]
+    index = {image.image_id: k for k, image in enumerate(images)}
+    xy = {i: np.array([p.xy for p in whole.images[i].points2D], dtype=np.float64) for i in index}
+    points = [whole.points3D[i] for i in sorted(whole.points3D)]
+    seen: list[tuple[int, NDArray[np.float64]]] = []
+    counts = np.zeros(len(points) + 1, dtype=np.int64)
+    for k, point in enumerate(points):
+        own = [e for e in point.track.elements if int(e.image_id) in index]
+        seen += [(index[int(e.image_id)], xy[int(e.image_id)][e.point2D_idx]) for e in own]
+        counts[k + 1] = len(own)
+    write_model(
+        output,
+        {image.camera_id: whole.cameras[image.camera_id] for image in images},
+        images,
+        ModelPoints(
+            xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+            rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+            error=np.array([p.error for p in points], dtype=np.float64),
+            offsets=np.cumsum(counts),
+            image=np.array([image for image, _ in seen], dtype=np.int64),
+            xy=np.array([at for _, at in seen], dtype=np.float64).reshape(-1, 2),
+        ),
+    )

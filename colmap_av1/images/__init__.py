@@ -1,0 +1,1 @@
+"""Which frames become images, under which names, and their camera."""

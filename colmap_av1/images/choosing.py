@@ -1,0 +1,437 @@
+"""Which frames of a video become images: by count, rate, list, time or parallax."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.images.names import (
+    check_new_name,
+    frames_of_images,
+    image_file,
+    image_names,
+    last_number,
+    natural_order,
+)
+from colmap_av1.images.recognising import check_content, frames_by_content
+from colmap_av1.options import ImageOptions
+from colmap_av1.tracks.tracks import Tracks, order_by_frame
+
+_Image = NDArray[np.uint8]
+
+# Longer side in pixels at which sharpness is measured.
+_SHARPNESS_SIZE = 640
+# A frame is blurred where it is less sharp than this share of the sharpest one near it.
+_BLURRED = 0.7
+# A neighbour is as good where it shares this share of the tracks with the images beside it.
+_AS_GOOD = 0.9
+# How far from its place an image may move, as a share of the distance to the next.
+_REACH = 0.25
+# Focal length that the camera's rotation is judged with, in units of the longer side; what
+# matters is where pictures change by more than a rotation, which depends on it but little.
+_FOCAL_LENGTH = 1.2
+_IRLS_ITERATIONS = 10
+# Share of plain motion that counts as parallax: rotation explains away much of the motion
+# of a scene that is flat.
+_MOTION_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class ChosenImages:
+    """The frames that are images.
+
+    Attributes:
+        names: name of each image, its path relative to the image folder.
+        frames: int32 [n] display index of each image, strictly ascending.
+    """
+
+    names: list[str]
+    frames: NDArray[np.int32]
+
+
+def choose_images(
+    tracks: Tracks,
+    options: ImageOptions,
+    *,
+    existing: Sequence[str],
+    folder: Path | None,
+    times: Callable[[], NDArray[np.float64] | None],
+    decode: Callable[[], Iterable[tuple[int, _Image]]],
+) -> ChosenImages:
+    """Choose the frames that are images: those that existing images show, else by the options.
+
+    Existing images are told apart by `frame_list`; by `every`, in the order of their names from
+    frame 0 on, or with `first_number` by the numbers in them; or by count and names, see
+    `frames_of_images`. Where these leave doubt or turn out wrong, and the files are there, what
+    they show says it.
+
+    Args:
+        tracks: tracks through all frames.
+        options: how to choose.
+        existing: names of images that exist, in any order.
+        folder: folder of the images; None: no picture is looked at.
+        times: gives the frames' times in seconds, None where unknown.
+        decode: gives (display index, picture) of all frames.
+
+    Raises:
+        ImageError: the images do not say which frames they are, or fewer than two are chosen.
+        OptionError: an option has a value that cannot work, or does not go with existing images.
+    """
+    if existing:
+        chosen = _find_existing(tracks.num_frames, options, existing, folder, decode)
+    elif options.frame_list is not None:
+        chosen = read_frame_list(options.frame_list, tracks.num_frames, options)
+        for name in chosen.names:
+            check_new_name(name)
+    else:
+        at = times() if options.fps or options.num_images else None
+        frames = choose_frames(tracks, options, at)
+        if folder is not None and options.skip_blurred and (options.fps or options.num_images):
+            frames = skip_blurred(frames, tracks, lambda asked: _sharpness(asked, decode()))
+        chosen = ChosenImages(image_names(options.image_name, frames.tolist()), frames)
+    if len(chosen.frames) < 2:
+        raise ImageError(
+            f"{len(chosen.frames)} of {tracks.num_frames} frames become images: matches need two "
+            f"or more{': give a longer video' if tracks.num_frames < 2 else ''}"
+        )
+    return chosen
+
+
+def check_image_options(options: ImageOptions) -> None:
+    """Refuse options that cannot work.
+
+    Raises:
+        OptionError: two ways to choose are given, or a value cannot work.
+    """
+    given = [n for n in ("num_images", "every", "fps", "frame_list") if getattr(options, n)]
+    if len(given) > 1:
+        raise OptionError(f"{given[0]} and {given[1]} both say which frames are images: give one")
+    for name, least in (("num_images", 2), ("every", 1)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise OptionError(f"{name} is {value}: give {least} or more")
+    if options.fps is not None and not 0 < options.fps < math.inf:
+        raise OptionError(f"fps is {options.fps}: give images per second, above 0")
+    if options.select not in ("time", "parallax"):
+        raise OptionError(f"select is {options.select!r}: give 'time' or 'parallax'")
+    if options.select == "parallax" and options.num_images is None:
+        raise OptionError("select 'parallax' spreads a number of images: give num_images, too")
+    image_names(options.image_name, ())
+
+
+def choose_frames(
+    tracks: Tracks,
+    options: ImageOptions,
+    times: NDArray[np.float64] | None = None,
+) -> NDArray[np.int32]:
+    """Choose the frames that become images: all, unless the options say otherwise.
+
+    Args:
+        tracks: tracks through all frames.
+        options: how to choose; not by `frame_list`, see `read_frame_list`.
+        times: float64 [num_frames] time of each frame in seconds, ascending; None: frames are
+            equally spaced.
+
+    Returns:
+        int32 display indices, strictly ascending.
+
+    Raises:
+        OptionError: an option has a value that cannot work, or `fps` needs times.
+        ImageError: there are fewer frames than images wanted.
+    """
+    check_image_options(options)
+    count = tracks.num_frames
+    if options.every is not None:
+        return np.arange(0, count, options.every, dtype=np.int32)
+    if options.fps is not None:
+        if times is None:
+            raise OptionError("the video has no time stamps: give every instead of fps")
+        return _at_rate(times - times[0], options.fps)
+    if options.num_images is None:
+        return np.arange(count, dtype=np.int32)
+    if options.num_images > count:
+        raise ImageError(
+            f"the video has {count} frames, {options.num_images} images are wanted: give fewer"
+        )
+    if options.select == "parallax":
+        place = np.concatenate([[0.0], np.cumsum(parallax(tracks))])
+    else:
+        place = times if times is not None else np.arange(count, dtype=np.float64)
+    wanted = np.linspace(place[0], place[-1], options.num_images)
+    return _distinct(_nearest(place, wanted), count)
+
+
+def parallax(tracks: Tracks) -> NDArray[np.float64]:
+    """How far pictures part from the ones before by more than the camera's rotation.
+
+    To each pair of neighbouring frames the motion field of a rotation (Longuet-Higgins and
+    Prazdny 1980, for a focal length of 1.2 times the longer side) is fitted, robustly; what
+    remains is median parallax. A tenth of the plain motion is added, as the rotation also
+    takes the part of a flat scene.
+
+    Returns:
+        float64 [num_frames - 1] pixels from each frame to the next, all above 0.
+    """
+    focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
+    number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
+    order = step[order_by_frame(tracks.frame[step], tracks.num_frames)]
+    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames))
+    centre = np.array([tracks.width, tracks.height]) / 2
+    found = np.full(max(tracks.num_frames - 1, 0), np.nan)
+    for frame in range(len(found)):
+        steps = order[bounds[frame] : bounds[frame + 1]]
+        if len(steps) < 3:
+            continue
+        motion = (tracks.xy[steps + 1] - tracks.xy[steps]).astype(np.float64)
+        remains = motion - _rotation_field(tracks.xy[steps] - centre, motion, focal)
+        plain = np.median(np.hypot(motion[:, 0], motion[:, 1]))
+        found[frame] = np.median(np.hypot(remains[:, 0], remains[:, 1])) + _MOTION_SHARE * plain
+    known = np.isfinite(found)
+    # Where nothing is tracked something happened: a typical step stands for it.
+    typical = float(np.median(found[known])) if known.any() else 1.0
+    return np.maximum(np.where(known, found, typical), 1e-6)
+
+
+def skip_blurred(
+    frames: NDArray[np.int32],
+    tracks: Tracks,
+    sharpness: Callable[[Sequence[int]], NDArray[np.float64]],
+) -> NDArray[np.int32]:
+    """Move images from blurred frames to sharp ones nearby that serve as well.
+
+    An image moves within a quarter of the distance to its neighbours, to the sharpest frame
+    that shares nearly as many tracks with them. The first and the last image stay.
+
+    Args:
+        frames: chosen frames, ascending.
+        tracks: tracks through all frames.
+        sharpness: measures frames; called once, with ascending frames.
+
+    Returns:
+        int32 [len(frames)] frames, strictly ascending.
+    """
+    reach = np.floor(np.diff(frames) * _REACH).astype(np.int64)
+    windows = {
+        k: np.arange(frames[k] - reach[k - 1], frames[k] + reach[k] + 1)
+        for k in range(1, len(frames) - 1)
+        if reach[k - 1] or reach[k]
+    }
+    if not windows:
+        return frames
+    asked = np.unique(np.concatenate(list(windows.values())))
+    measured = dict(zip(asked.tolist(), sharpness(asked.tolist()), strict=True))
+    seen = _tracks_by_frame(tracks)
+    chosen = frames.copy()
+    for k, window in windows.items():
+        sharp = np.array([measured[int(f)] for f in window])
+        if measured[int(frames[k])] >= _BLURRED * sharp.max():
+            continue
+        beside = (seen(chosen[k - 1]), seen(frames[k + 1]))
+        shared = np.array([sum(_num_common(seen(f), b) for b in beside) for f in window])
+        as_good = shared >= _AS_GOOD * shared[np.searchsorted(window, frames[k])]
+        chosen[k] = window[np.argmax(np.where(as_good, sharp, -np.inf))]
+    return np.asarray(chosen, dtype=np.int32)
+
+
+def read_frame_list(
+    path: str | os.PathLike[str], num_frames: int, options: ImageOptions
+) -> ChosenImages:
+    """Read which frames are images, and their names.
+
+    A line holds the index of a frame, from 0, and if wanted the image's name; or a name
+    alone, whose last number is the frame's, from `first_number` (0 where that is None). Empty
+    lines and those that start with '#' say nothing.
+
+    Raises:
+        ImageError: the file is missing, or names a frame that the video does not have, a frame
+            twice, or two images alike.
+    """
+    try:
+        lines = Path(path).read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise ImageError(
+            f"{path}: is no list of frames that can be read: {reason}: give a text file with a "
+            "frame's index on each line"
+        ) from error
+    entries: list[tuple[int, str]] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split(maxsplit=1)
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0].isdecimal():
+            frame = int(words[0])
+            name = words[1].strip() if len(words) == 2 else options.image_name % frame
+        else:
+            name = line.strip()
+            found = last_number(name)
+            if found is None:
+                raise ImageError(f"{path}, line {number}: '{name}' names no frame: give its index")
+            frame = found - (options.first_number or 0)
+        if not 0 <= frame < num_frames:
+            raise ImageError(
+                f"{path}, line {number}: there is no frame {frame}: the video has frames 0 to "
+                f"{num_frames - 1}, give one of them"
+            )
+        entries.append((frame, name))
+    entries.sort()
+    for what, values in (
+        ("frame", [str(f) for f, _ in entries]),
+        ("name", [n for _, n in entries]),
+    ):
+        twice = next((v for v in values if values.count(v) > 1), None)
+        if twice is not None:
+            raise ImageError(f"{path}: gives the {what} {twice} twice: remove one line")
+    frames = np.array([frame for frame, _ in entries], dtype=np.int32)
+    return ChosenImages([name for _, name in entries], frames)
+
+
+def _find_existing(
+    num_frames: int,
+    options: ImageOptions,
+    names: Sequence[str],
+    folder: Path | None,
+    decode: Callable[[], Iterable[tuple[int, _Image]]],
+) -> ChosenImages:
+    """The frames of images that exist."""
+    wrong = next((n for n in ("num_images", "fps") if getattr(options, n) is not None), None)
+    if wrong is not None:
+        raise OptionError(
+            f"{wrong} chooses new images, but there are {len(names)} already: leave it out, or "
+            "give a new database and folder"
+        )
+    by_name = [names[i] for i in natural_order(names)]
+    files = [image_file(folder, name) for name in by_name] if folder is not None else []
+    if not all(file.exists() for file in files):
+        files = []
+    if options.frame_list is not None:
+        chosen = read_frame_list(options.frame_list, num_frames, options)
+        odd = sorted(set(names) ^ set(chosen.names))
+        if odd:
+            where = "has no image" if odd[0] in chosen.names else f"{options.frame_list} has no"
+            raise ImageError(f"{where} '{odd[0]}': list each image that exists, and no other")
+    elif options.every is not None:
+        chosen = _in_order(by_name, _at_steps(by_name, num_frames, options))
+    else:
+        try:
+            frames = frames_of_images(by_name, num_frames, options.first_number)
+        except ImageError:
+            if options.first_number is not None or not files:
+                raise
+            return _in_order(by_name, frames_by_content(files, decode()))
+        chosen = _in_order(by_name, frames)
+    if files:
+        # The first and the last: a wrong start or rate shows there.
+        ends = sorted({0, len(chosen.names) - 1})
+        paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
+        check_content(paths, chosen.frames[ends].tolist(), decode())
+    return chosen
+
+
+def _in_order(names: Sequence[str], frames: NDArray[np.int32]) -> ChosenImages:
+    order = np.argsort(frames, kind="stable")
+    return ChosenImages([names[i] for i in order], frames[order])
+
+
+def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> NDArray[np.int32]:
+    """The frames of images that show one in every `every` frames."""
+    step = options.every or 1
+    numbers = list(range(len(names)))
+    if options.first_number is not None:
+        found = [last_number(name) for name in names]
+        if None in found:
+            raise ImageError(f"'{names[found.index(None)]}' has no number: leave out first_number")
+        numbers = [(n or 0) - options.first_number for n in found]
+    for name, number in zip(names, numbers, strict=True):
+        if not 0 <= number * step < num_frames:
+            raise ImageError(
+                f"'{name}' would be frame {number * step} of the video, which has frames 0 to "
+                f"{num_frames - 1}: give another every or first_number"
+            )
+    if len(set(numbers)) < len(numbers):
+        raise ImageError("two images have one number: name their frames with --frame_list")
+    return np.array(numbers, dtype=np.int32) * step
+
+
+def _sharpness(
+    frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
+) -> NDArray[np.float64]:
+    """Variance of the Laplacian of some frames, at a size at which noise counts little."""
+    wanted = set(frames)
+    measured: list[float] = []
+    for index, picture in pictures:
+        if index in wanted:
+            scale = min(1.0, _SHARPNESS_SIZE / max(picture.shape[:2]))
+            grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+            small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            measured.append(float(cv2.Laplacian(small, cv2.CV_32F).var()))
+        if len(measured) == len(frames):
+            break
+    return np.array(measured)
+
+
+def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
+    """The frames that ffmpeg's fps filter takes: the last whose time rounds to a tick or below."""
+    tick = np.floor(times * fps + 0.5)
+    interval = np.median(np.diff(times)) if len(times) > 1 else 0.0
+    num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + 0.5))
+    is_last = np.append(tick[1:] > tick[:-1], True)
+    return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
+
+
+def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index of the ascending place that is nearest to each wanted one, the earlier of two."""
+    above = np.clip(np.searchsorted(places, wanted), 1, max(len(places) - 1, 1))
+    if len(places) == 1:
+        return np.zeros(len(wanted), dtype=np.int64)
+    nearer_below = wanted - places[above - 1] <= places[above] - wanted
+    return np.asarray(np.where(nearer_below, above - 1, above), dtype=np.int64)
+
+
+def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+    """Ascending frames, moved as little as it takes to be all different and below `count`."""
+    index = np.arange(len(frames))
+    pushed_up = np.maximum.accumulate(frames - index) + index
+    most = count - len(frames) + index
+    return np.asarray(np.minimum(pushed_up, most), dtype=np.int32)
+
+
+def _rotation_field(
+    xy: NDArray[np.float64], motion: NDArray[np.float64], focal: float
+) -> NDArray[np.float64]:
+    """Motion [n, 2] at places [n, 2] from the picture's centre by the rotation that fits best."""
+    x, y = xy[:, 0] / focal, xy[:, 1] / focal
+    columns = np.empty((len(xy), 2, 3))
+    columns[:, 0] = focal * np.stack([x * y, -(1 + x * x), y], axis=1)
+    columns[:, 1] = focal * np.stack([1 + y * y, -x * y, -x], axis=1)
+    weight = np.ones(len(xy))
+    field = np.zeros_like(motion)
+    for _ in range(_IRLS_ITERATIONS):
+        scale = np.sqrt(weight)[:, None]
+        rows = (columns * scale[:, :, None]).reshape(-1, 3)
+        turn = np.linalg.lstsq(rows, (motion * scale).reshape(-1), rcond=None)[0]
+        field = columns @ turn
+        # Least absolute distances: what moves otherwise pulls no harder for being far.
+        weight = 1 / np.maximum(np.hypot(*(motion - field).T), 1e-3)
+    return np.asarray(field)
+
+
+def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
+    """A function that lists the tracks a frame sees, ascending."""
+    number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    order = order_by_frame(tracks.frame, tracks.num_frames)
+    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]
+
+
+def _num_common(a: NDArray[np.int64], b: NDArray[np.int64]) -> int:
+    return len(np.intersect1d(a, b, assume_unique=True))

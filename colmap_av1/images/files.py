@@ -1,0 +1,317 @@
+"""Image files: those that exist, and those that are written."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import av
+import av.error
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, VideoError, cannot_write
+from colmap_av1.images.names import (
+    WRITE_PARAMETERS,
+    check_extension,
+    image_file,
+    image_names,
+    natural_key,
+    pattern_regex,
+)
+from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.display import Display
+from colmap_av1.video.unchanged import unchanged
+
+# Images that others wrote are only read.
+_READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
+# Frames waiting to be compressed, per thread; bounds memory.
+_QUEUE_PER_THREAD = 2
+
+
+def size_of_images(
+    sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int], pixel_aspect: float = 1.0
+) -> tuple[int, int]:
+    """The one size of images that exist: that of the video's pictures, or these scaled.
+
+    Args:
+        sizes: (width, height) of each image, by name; empty where none exist.
+        video_size: (width, height) of the pictures, turned as players do.
+        pixel_aspect: width of the pictures' pixels over their height; images whose pixels were
+            made square fit, too.
+
+    Raises:
+        ImageError: the images differ in size, or in shape from the video's pictures.
+    """
+    if not sizes:
+        return video_size
+    first_name, first = next(iter(sizes.items()))
+    for name, size in sizes.items():
+        if size != first:
+            raise ImageError(
+                f"image '{name}' is {size[0]}x{size[1]}, '{first_name}' {first[0]}x{first[1]}: "
+                "images of one video have one size; match those of other cameras apart"
+            )
+    width, height = video_size
+    square = (width * pixel_aspect, height)
+    if not has_shape(first, video_size) and not has_shape(first, square):
+        turned = first == video_size[::-1]
+        raise ImageError(
+            f"image '{first_name}' is {first[0]}x{first[1]}, the video's pictures are "
+            f"{width}x{height}{' as players turn them' if turned else ''}: give the video that "
+            "it comes from, or begin with a new database and folder"
+        )
+    return first
+
+
+def has_shape(size: tuple[int, int], of: tuple[float, float]) -> bool:
+    """Whether a (width, height) is another one scaled, rounded to whole pixels."""
+    return abs(size[0] * of[1] - size[1] * of[0]) <= max(*size, *of)
+
+
+def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> None:
+    """Check that images, which are scaled and so cannot be written, are in a folder.
+
+    Raises:
+        ImageError: one is missing.
+    """
+    missing = next((n for n in names if not image_file(Path(folder), n).exists()), None)
+    if missing is not None:
+        raise ImageError(
+            f"{Path(folder) / missing}: is missing, and the images have another size than the "
+            "video, so it cannot be written: give the folder that holds all images"
+        )
+
+
+def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
+    """Images that a folder holds already, where they are not of a run of this package before.
+
+    Args:
+        folder: the folder; it need not exist.
+        pattern: pattern of the names of new images, see `image_names`.
+
+    Returns:
+        File names in their natural order; none where frame 0 is there under the name that the
+        pattern gives it. Other programs count from 1.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        return []
+    names = [
+        p.name
+        for p in root.iterdir()
+        if p.suffix.lower() in _READABLE and not p.name.startswith(".")
+    ]
+    if image_names(pattern, [0])[0] in names:
+        return []
+    return sorted(names, key=natural_key)
+
+
+def check_image_folder(
+    folder: str | os.PathLike[str],
+    names: Sequence[str] | str,
+    video_size: tuple[int, int],
+) -> None:
+    """Check that images can be written to a folder and that those there have the right size.
+
+    Args:
+        folder: the folder; it need not exist.
+        names: the images' names, or the pattern of their names.
+        video_size: (width, height) of the video.
+
+    Raises:
+        ImageError: the folder is a file or not writable, a name leaves the folder, or an
+            image there is of another size or unreadable.
+        OptionError: the pattern or an extension is none of an image.
+    """
+    root = Path(folder)
+    existing_parent = root
+    while not existing_parent.exists() and existing_parent != existing_parent.parent:
+        existing_parent = existing_parent.parent
+    if not existing_parent.is_dir():
+        raise ImageError(f"{existing_parent}: is a file: give a folder for the images")
+    is_complete = not isinstance(names, str) and all(image_file(root, n).exists() for n in names)
+    if not is_complete and not os.access(existing_parent, os.W_OK | os.X_OK):
+        raise ImageError(
+            f"{existing_parent}: no permission to write images there: give another folder"
+        )
+    if isinstance(names, str):
+        regex = pattern_regex(names)
+        present = [p.name for p in root.iterdir()] if root.is_dir() else []
+        names = sorted(name for name in present if regex.fullmatch(name))
+    for name in names:
+        path = image_file(root, name)
+        if path.exists():
+            size = image_size(path)
+            if size != video_size:
+                raise ImageError(
+                    f"{path}: is {size[0]}x{size[1]}, the video {video_size[0]}x{video_size[1]}: "
+                    "give another folder or remove the images"
+                )
+
+
+def write_images(
+    video: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    names: Sequence[str],
+    frames: Sequence[int],
+    *,
+    num_threads: int | None = None,
+    operating_point: int = 0,
+    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
+    display: Display | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write video frames as images, PNG or JPEG (quality 95) by the names' extensions.
+
+    An image appears under its name only when complete. Existing images are kept, see
+    `check_image_folder`.
+
+    Args:
+        video: the video file.
+        folder: where the images go; made where missing.
+        names: the images' names, which may hold folders.
+        frames: display index of each image.
+        num_threads: threads; None: one per CPU.
+        operating_point: operating point of a scalable stream.
+        change: called with (display_index, picture) of each image that is not there yet, in
+            display order; gives the picture to write.
+        display: how pictures are cut and turned; None: as players do.
+        progress: called with the number of images done so far.
+
+    Returns:
+        The number of images written; the others were there.
+
+    Raises:
+        ImageError: an image cannot be written, the frames change their size, or the decoder
+            gives fewer frames than asked for.
+        BitstreamError: the stream cannot be decoded up to the last frame asked for.
+        VideoError: the video cannot be read, or changes meanwhile; then what was written of it
+            is removed.
+    """
+    root = Path(folder)
+    wanted = {
+        int(frame): image_file(root, name)
+        for frame, name in zip(frames, names, strict=True)
+        if not image_file(root, name).exists()
+    }
+    num_kept = len(names) - len(wanted)
+
+    def report(num_written: int) -> None:
+        if progress is not None:
+            progress(num_kept + num_written)
+
+    report(0)
+    if not wanted:
+        return 0
+    for parent in {path.parent for path in wanted.values()}:
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ImageError(
+                f"{parent}: cannot be made: {error.strerror}: mend that, or give another path"
+            ) from error
+        remove_leftovers(parent)
+    try:
+        with unchanged(Path(video)):
+            decoded = decode_frames(
+                video, operating_point=operating_point, num_threads=num_threads, display=display
+            )
+            with contextlib.closing(decoded):
+                _write_frames(decoded, wanted, change, num_threads or os.cpu_count() or 1, report)
+    except VideoError:  # images of two videos would be kept as those of one
+        for path in wanted.values():
+            path.unlink(missing_ok=True)
+        raise
+    return len(wanted)
+
+
+def _write_frames(
+    decoded: Iterator[tuple[int, NDArray[np.uint8]]],
+    wanted: Mapping[int, Path],
+    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None,
+    num_threads: int,
+    report: Callable[[int], None],
+) -> None:
+    """Write the wanted ones of the frames, on threads; `report` is told how many are written."""
+    size: tuple[int, ...] | None = None
+    queue: list[Future[None]] = []
+    num_taken = 0
+    last = max(wanted)
+    # OpenCV releases the interpreter lock while it compresses.
+    with ThreadPoolExecutor(max_workers=num_threads) as executor:
+        try:
+            for index, picture in decoded:
+                size = size or picture.shape
+                if picture.shape != size:
+                    raise ImageError(
+                        f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, those before "
+                        f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
+                        "re-encode the video at one size"
+                    )
+                if index in wanted:
+                    image = change(index, picture) if change is not None else picture
+                    queue.append(executor.submit(_write_image, wanted[index], image))
+                    num_taken += 1
+                while len(queue) > (num_threads * _QUEUE_PER_THREAD if index < last else 0):
+                    queue.pop(0).result()
+                    report(num_taken - len(queue))
+                if index >= last:
+                    break
+            for future in queue:  # left where the decoder ends early
+                future.result()
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+    if num_taken < len(wanted):
+        raise ImageError(
+            f"the decoder gives no frame {sorted(wanted)[num_taken]} of the {last + 1} that the "
+            "stream shows: leave out the images, or re-encode the video"
+        )
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read an image file: uint8 [height, width, 3] BGR.
+
+    Raises:
+        ImageError: it is missing, or none that can be read.
+    """
+    # COLMAP, too, takes pixels as they are stored and leaves an orientation in EXIF alone.
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imread(str(path), how) if path.is_file() else None
+    if image is None:
+        raise ImageError(f"{path}: is missing or no image: give the folder of the images")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, without decoding it in full.
+
+    Raises:
+        ImageError: it is none that can be read.
+    """
+    size = (0, 0)
+    try:
+        with av.open(os.path.abspath(path)) as container:
+            if container.streams.video:
+                size = container.streams.video[0].width, container.streams.video[0].height
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise ImageError(f"{path}: is not a readable image: remove it") from error
+    if size == (0, 0):
+        raise ImageError(f"{path}: is not a readable image: remove it")
+    return size
+
+
+def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    check_extension(path.name)
+    suffix = path.suffix.lower()
+    _, encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])
+    try:
+        with whole_file(path) as partial:
+            partial.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise ImageError(cannot_write(path, error)) from error

@@ -1,0 +1,168 @@
+"""Names of images: patterns of new ones, numbers and order of those that exist."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+
+WRITE_PARAMETERS = {
+    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+}
+
+
+def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
+    """Name the images of frames by a printf pattern such as 'frame_%06d.png'.
+
+    Args:
+        pattern: file name with one integer field, which takes the display index from 0.
+        frames: display indices.
+
+    Raises:
+        OptionError: the pattern has no integer field, or no extension of an image.
+    """
+    pattern_regex(pattern)
+    return [pattern % frame for frame in frames]
+
+
+def frames_of_images(
+    names: Sequence[str], num_frames: int, first_number: int | None = None
+) -> NDArray[np.int32]:
+    """Find the video frame of each image of a database that already lists images.
+
+    As many images as frames: they are the frames in the order of the names, numbers in
+    them compared as numbers. Otherwise the last number in a name is the frame's, counted
+    from `first_number`, which is guessed only where the names leave no doubt: gaps show
+    that they count frames of the video, and a 0 or the number of the last frame shows from
+    where. Image sequences cut at a lower rate are numbered without gaps; they say nothing.
+
+    Args:
+        names: names of the images, in any order.
+        num_frames: number of shown frames of the video.
+        first_number: number in the name of the video's first frame, usually 0 or 1; None:
+            only where names and count leave no doubt.
+
+    Returns:
+        int32 [len(names)] display index of each image.
+
+    Raises:
+        ImageError: count or names do not say which frame an image is.
+    """
+    numbers = [last_number(name) for name in names]
+    if first_number is None and len(names) == num_frames:
+        order = natural_order(names)
+        frames = np.empty(len(names), dtype=np.int32)
+        frames[order] = np.arange(len(names), dtype=np.int32)
+        return frames
+
+    counts = f"there are {len(names)} images, the video has {num_frames} frames"
+    found = [number for number in numbers if number is not None]
+    if len(found) < len(numbers):
+        unnumbered = names[numbers.index(None)]
+        raise ImageError(
+            f"{counts}, and '{unnumbered}' has no frame number: list the images in a "
+            "--frame_list, or give their folder as --image_path, to tell them by what they show"
+        )
+    lowest, highest = min(found), max(found)
+    if first_number is None:
+        first_number = _guess_first_number(found, num_frames, counts)
+    if lowest < first_number or highest - first_number >= num_frames:
+        raise ImageError(
+            f"{counts}, but the image numbers run from {lowest} to {highest} where frames are "
+            f"numbered {first_number} to {first_number + num_frames - 1}: give the video the "
+            "images were cut from"
+        )
+    if len(set(found)) < len(found):
+        twice = next(number for number in found if found.count(number) > 1)
+        raise ImageError(
+            f"two images have the frame number {twice}: list their frames in a --frame_list"
+        )
+    return np.array([number - first_number for number in found], dtype=np.int32)
+
+
+def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) -> int:
+    lowest, highest = min(numbers), max(numbers)
+    with_gaps = highest - lowest + 1 > len(numbers)
+    if with_gaps and lowest == 0 and highest < num_frames:
+        return 0
+    if with_gaps and highest == num_frames and lowest > 0:
+        return 1
+    raise ImageError(
+        f"{counts}, and the image numbers {lowest} to {highest} do not say which frames they "
+        "are: say with --first_number how the first frame of the video is numbered, list the "
+        "images in a --frame_list, or give their folder as --image_path, to tell them by what "
+        "they show"
+    )
+
+
+def natural_order(names: Sequence[str]) -> list[int]:
+    """Indices of names in the order in which 'f9' comes before 'f10'."""
+    return sorted(range(len(names)), key=lambda i: natural_key(names[i]))
+
+
+def last_number(name: str) -> int | None:
+    """The last number in an image's name, its extension left out; None where there is none."""
+    digits = re.findall(r"\d+", PurePosixPath(name).stem)
+    return int(digits[-1]) if digits else None
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key under which 'f9' comes before 'f10'; the text itself breaks ties."""
+    parts = re.split(r"(\d+)", name)
+    key = [(1, int(p), p) if p.isdigit() else (0, 0, p) for p in parts]
+    return [*key, (0, 0, name)]
+
+
+def pattern_regex(pattern: str) -> re.Pattern[str]:
+    """A regular expression that matches the names a pattern makes."""
+    fields = re.findall(r"%0?\d*d", pattern)
+    if len(fields) != 1 or pattern.count("%") != 1:
+        raise OptionError(
+            f"image name '{pattern}' needs exactly one number field, such as frame_%06d.png"
+        )
+    if Path(pattern).name != pattern or pattern.startswith("."):
+        raise OptionError(
+            f"image name '{pattern}' has a folder or a dot before it: give a plain file name"
+        )
+    check_extension(pattern)
+    before, after = pattern.split(fields[0])
+    return re.compile(re.escape(before) + r"\d+" + re.escape(after))
+
+
+def check_extension(name: str) -> None:
+    """Refuse a name that says no format of images."""
+    if PurePosixPath(name).suffix.lower() not in WRITE_PARAMETERS:
+        raise OptionError(f"image name '{name}': give one that ends in .png, .jpg or .jpeg")
+
+
+def check_new_name(name: str) -> None:
+    """Check that an image can be written under a name.
+
+    Raises:
+        OptionError: it is of no kind that can be written.
+        ImageError: it leads out of the image folder.
+    """
+    check_extension(name)
+    image_file(Path(), name)
+
+
+def image_file(root: Path, name: str) -> Path:
+    """The file of an image in a folder.
+
+    Raises:
+        ImageError: the name leads out of the folder.
+    """
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise ImageError(
+            f"image '{name}' lies outside the image folder: give names within the folder"
+        )
+    return root / name

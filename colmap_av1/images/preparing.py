@@ -1,0 +1,210 @@
+"""The frames of a video that are images, and its tracks in their pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import VideoError
+from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.files import (
+    check_image_folder,
+    check_images_there,
+    existing_images,
+    has_shape,
+    image_size,
+    size_of_images,
+    write_images,
+)
+from colmap_av1.images.recognising import check_content, is_turned_back
+from colmap_av1.option_checks import check_options
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.tracks import Tracks, scale_tracks, show_tracks
+from colmap_av1.tracks.video_tracks import (
+    TrackedVideo,
+    VideoSource,
+    decodable_frames,
+    open_source,
+    times_of_frames,
+    track_video,
+)
+from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.display import Display, shown_size, turned_back
+from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.unchanged import unchanged
+
+_Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PreparedImages:
+    """The images of a video, before anything is matched.
+
+    Attributes:
+        source: the video.
+        display: how its pictures are shown in the images.
+        tracked: the video's tracks, in its own pixels.
+        tracks: the same in pixels of the images.
+        chosen: the images.
+        size: (width, height) of the images.
+        pixel_aspect: width of a pixel of theirs over its height.
+    """
+
+    source: VideoSource
+    display: Display
+    tracked: TrackedVideo
+    tracks: Tracks
+    chosen: ChosenImages
+    size: tuple[int, int]
+    pixel_aspect: float
+
+
+def prepare_images(
+    video: Path,
+    folder: Path | None,
+    options: MatchOptions,
+    *,
+    listed: Mapping[str, tuple[int, int]],
+    clock: Clock,
+    progress: Progress,
+) -> PreparedImages:
+    """Chain the motion of a video into tracks and find or choose the frames that are images.
+
+    Args:
+        video: a video.
+        folder: folder of the images, which may exist; None: none are wanted.
+        options: all but those of density, pairs and verification are used; all are checked.
+        listed: (width, height) of images that a database lists, by name.
+        clock: gets the stages up to "choice".
+        progress: told about these stages.
+
+    Raises:
+        VideoError: the video cannot be read.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: images or names do not fit the video.
+        OptionError: an option has a value that cannot work.
+    """
+    # What can be refused is refused before the long work.
+    video_size = picture_size(video, options.read.operating_point)
+    display = read_display(video)
+    existing = dict(listed)
+    if folder is not None and not existing:
+        names = existing_images(folder, options.images.image_name)
+        existing = {name: image_size(folder / name) for name in names}
+    back = _way_back(video, display, video_size, existing, folder)
+    if back is not None:
+        # What exists was written by a program that does not turn pictures.
+        display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
+        video_size = shown_size(video_size, back)
+    size = size_of_images(existing, video_size, display.pixel_aspect)
+    check_options(options, size)
+    if folder is not None:
+        check_image_folder(folder, list(existing) or options.images.image_name, size)
+        if size != video_size:
+            check_images_there(folder, list(existing))
+
+    source = open_source(video, options, clock=clock, progress=progress)
+    with unchanged(source.stream):
+        tracked = track_video(
+            source, options, one_size=folder is not None, clock=clock, progress=progress
+        )
+        tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
+        if (tracks.width, tracks.height) != video_size:
+            raise VideoError(
+                f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+                f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
+            )
+
+        def decode() -> Iterator[tuple[int, _Image]]:
+            pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
+            for index, picture in pictures:
+                progress("looking", index + 1, tracks.num_frames)
+                yield index, picture
+
+        with clock.measure("choice"):
+            chosen = choose_images(
+                tracks,
+                options.images,
+                existing=list(existing),
+                folder=folder,
+                times=lambda: times_of_frames(source, tracks.num_frames),
+                decode=decode,
+            )
+    if folder is not None:
+        check_image_folder(folder, chosen.names, size)
+        kept = zip(chosen.names, chosen.frames.tolist(), strict=True)
+        first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
+        if not existing and first_kept is not None:
+            check_content([folder / first_kept[0]], [first_kept[1]], decode())
+    return PreparedImages(
+        source=source,
+        display=display,
+        tracked=tracked,
+        tracks=scale_tracks(tracks, size),
+        chosen=chosen,
+        size=size,
+        # Images may be scaled by different factors along x and y.
+        pixel_aspect=display.pixel_aspect * video_size[0] * size[1] / (video_size[1] * size[0]),
+    )
+
+
+def write_chosen(
+    pictures: Path,
+    folder: Path,
+    chosen: ChosenImages,
+    options: MatchOptions,
+    *,
+    display: Display,
+    progress: Progress,
+) -> int:
+    """Write the chosen frames of a video as images, see `write_images`.
+
+    Args:
+        pictures: the video.
+        folder: where the images go.
+        chosen: the images.
+        options: those of reading and the threads are used.
+        display: how pictures are cut and turned.
+        progress: told about the stage "images".
+
+    Returns:
+        The number of images written; the others were there.
+    """
+    return write_images(
+        pictures,
+        folder,
+        chosen.names,
+        chosen.frames.tolist(),
+        num_threads=options.verify.num_threads,
+        operating_point=options.read.operating_point,
+        display=display,
+        progress=lambda done: progress("images", done, len(chosen.names)),
+    )
+
+
+def _way_back(
+    video: Path,
+    display: Display,
+    video_size: tuple[int, int],
+    existing: dict[str, tuple[int, int]],
+    folder: Path | None,
+) -> Display | None:
+    """What turns shown pictures to how images that exist show them; None where they are shown so.
+
+    Their shape says it. Where either would do, the first image says it by what it shows, if its
+    file is there; else images count as turned, as players and ffmpeg do.
+    """
+    if display.turn == Display().turn or not existing:
+        return None
+    back = turned_back(display)
+    name, size = next(iter(existing.items()))
+    as_shown = has_shape(size, video_size)
+    as_stored = has_shape(size, shown_size(video_size, back))
+    if as_shown and as_stored and folder is not None and (folder / name).exists():
+        return back if is_turned_back(folder / name, decode_frames(video), display) else None
+    return back if as_stored and not as_shown else None

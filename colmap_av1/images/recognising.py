@@ -1,0 +1,182 @@
+"""Which frame of a video an image shows, found by looking at it at low resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError
+from colmap_av1.images.files import read_image
+from colmap_av1.video.display import Display, shown_picture, turned_back
+
+_Image = NDArray[np.uint8]
+
+# Side of the squares that pictures are compared at: small enough that neither scaling nor
+# JPEG shows, large enough that the motion between frames does.
+_THUMBNAIL = 48
+# Least normalised correlation of an image with its frame.
+_LEAST_LIKENESS = 0.98
+# Any other frame must be this many times less like the image than its own.
+_MARGIN = 1.5
+# Frames on either side of one that an image is compared with.
+_REACH = 2
+# Pictures that are less unlike than this differ by motion of less than half a pixel.
+_SAME = 5e-5
+
+
+def frames_by_content(
+    files: Sequence[Path], pictures: Iterable[tuple[int, _Image]]
+) -> NDArray[np.int32]:
+    """Find the frames that image files show.
+
+    An image's frame is the one it is most like. Where a camera stands still and several are,
+    the files count as being in the order of the video. It must leave no doubt: each image is
+    like its frame, and clearly less like any other that shows something else.
+
+    Args:
+        files: image files of any size with the video's aspect.
+        pictures: (display index, uint8 [h, w, 3] BGR) of all frames, in order.
+
+    Returns:
+        int32 [len(files)] display indices, all different.
+
+    Raises:
+        ImageError: there are more images than frames, an image cannot be read, shows no frame of
+            the video, or shows several as well.
+    """
+    images = np.array([_thumbnail(read_image(path)) for path in files])
+    frames = np.array([_thumbnail(picture) for _, picture in pictures])
+    if len(images) > len(frames):
+        raise ImageError(
+            f"there are {len(images)} images, but the video has {len(frames)} frames: "
+            "give the video the images were cut from"
+        )
+    likeness = images @ frames.T
+    found = np.argmax(likeness, axis=1).astype(np.int32)
+    if len(np.unique(found)) < len(found):
+        found = _ascending_assignment(likeness)
+    for k, path in enumerate(files):
+        best = int(np.argmax(likeness[k]))
+        if likeness[k, best] < _LEAST_LIKENESS:
+            raise ImageError(
+                f"{path}: shows no frame of the video (the best is frame {best}, alike by "
+                f"{likeness[k, best]:.1%}): give the images that were cut from this video, "
+                "unedited, or name their frames with --frame_list"
+            )
+        if _is_clearly_less(likeness[k, found[k]], likeness[k, best]):
+            twins = [files[int(i)].name for i in np.flatnonzero(likeness.argmax(axis=1) == best)]
+            raise ImageError(f"{' and '.join(twins)} show the same frame, {best}: keep one of them")
+        _check_rivals(path, int(found[k]), likeness[k], frames)
+    return np.asarray(found, dtype=np.int32)
+
+
+def check_content(
+    files: Sequence[Path], frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
+) -> None:
+    """Check that images show their frames, and not clearly those beside them.
+
+    Args:
+        files: image files.
+        frames: the frame that each should show, ascending.
+        pictures: (display index, picture) in order; not read beyond what is needed.
+
+    Raises:
+        ImageError: one shows something else.
+    """
+    images = np.array([_thumbnail(read_image(path)) for path in files])
+    likeness = np.zeros((len(files), 2 * _REACH + 1))
+    for index, picture in pictures:
+        near = [k for k, frame in enumerate(frames) if abs(index - frame) <= _REACH]
+        if near:
+            thumbnail = _thumbnail(picture)
+            for k in near:
+                likeness[k, index - frames[k] + _REACH] = images[k] @ thumbnail
+        if index >= frames[-1] + _REACH:
+            break
+    for path, frame, alike in zip(files, frames, likeness, strict=True):
+        best = int(np.argmax(alike))
+        if alike[_REACH] >= _LEAST_LIKENESS and not _is_clearly_less(alike[_REACH], alike[best]):
+            continue
+        shows = f"frame {frame + best - _REACH}" if alike[best] >= _LEAST_LIKENESS else "another"
+        raise ImageError(
+            f"{path}: should show frame {frame} of the video but shows {shows}: give the images "
+            "that were cut from this video, unedited, or name their frames with --frame_list"
+        )
+
+
+def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: Display) -> bool:
+    """Whether an image shows a picture as it is stored, not as players turn it.
+
+    Args:
+        path: the image file.
+        pictures: (display index, picture) of all frames as players show them.
+        display: how players show them.
+
+    Raises:
+        ImageError: the image cannot be read.
+    """
+    image = _thumbnail(read_image(path))
+    back = turned_back(display)
+    best = np.zeros(2)
+    for _, picture in pictures:
+        both = (picture, shown_picture(picture, back))
+        best = np.maximum(best, [float(image @ _thumbnail(p)) for p in both])
+        if best.max() >= _LEAST_LIKENESS:
+            break
+    return bool(best[1] > best[0])
+
+
+def _check_rivals(
+    path: Path, frame: int, likeness: NDArray[np.float32], frames: NDArray[np.float32]
+) -> None:
+    """Refuse an image that another frame fits, too, unless the camera stands still meanwhile."""
+    rivals = ~_is_clearly_less(likeness, likeness[frame])
+    # Frames without motion between them are one picture, and have one set of places.
+    differs = 1 - frames @ frames[frame] > _SAME
+    still = np.ones(len(frames), dtype=np.bool_)
+    still[: frame + 1] = ~np.maximum.accumulate(differs[frame::-1])[::-1]
+    still[frame:] = ~np.maximum.accumulate(differs[frame:])
+    rivals &= ~still & (likeness <= likeness[frame])
+    if rivals.any():
+        rival = int(np.argmax(np.where(rivals, likeness, -1)))
+        raise ImageError(
+            f"{path}: looks like frame {frame} and like frame {rival}: name the images' frames "
+            "with --frame_list"
+        )
+
+
+def _is_clearly_less(likeness: Any, than: Any) -> NDArray[np.bool_]:
+    """Whether one likeness leaves no doubt that another one is greater."""
+    return np.asarray((1 - likeness) > _MARGIN * (1 - than) + _SAME / 2)
+
+
+def _ascending_assignment(likeness: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Strictly ascending columns, one for each row, with the greatest sum."""
+    num_images, num_frames = likeness.shape
+    total = likeness[0].astype(np.float64)
+    best_before = np.empty((num_images, num_frames), dtype=np.int32)
+    for k in range(1, num_images):
+        # The best end of the first k rows in any column before each.
+        running = np.maximum.accumulate(total)
+        is_new = np.concatenate([[True], total[1:] > running[:-1]])
+        where = np.maximum.accumulate(np.where(is_new, np.arange(num_frames), 0))
+        best_before[k, 1:], best_before[k, 0] = where[:-1], 0
+        total = likeness[k] + np.concatenate([[-np.inf], running[:-1]])
+    frames = np.empty(num_images, dtype=np.int32)
+    frames[-1] = np.argmax(total)
+    for k in range(num_images - 1, 0, -1):
+        frames[k - 1] = best_before[k, frames[k]]
+    return frames
+
+
+def _thumbnail(image: _Image) -> NDArray[np.float32]:
+    """The picture's grey values at low resolution, of mean 0 and length 1."""
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    small = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).reshape(-1)
+    small -= small.mean()
+    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), dtype=np.float32)

@@ -1,0 +1,1 @@
+"""Image pairs, their matches and two-view geometries, the focal length."""

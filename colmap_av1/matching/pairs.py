@@ -1,0 +1,197 @@
+"""Keypoints of the written images, and the image pairs that are matched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.options import PairOptions
+from colmap_av1.tracks.tracks import Tracks, order_by_frame
+
+# Spans up to this many images pair every image. A longer one starts only at every n-th
+# image, n growing with the span, so the number of pairs stays linear in the number of
+# images even where tracks live as long as the video.
+_UNTHINNED_SPAN = 64
+
+
+@dataclass(frozen=True)
+class ImageKeypoints:
+    """Keypoints of one written image: one for each track it sees.
+
+    Attributes:
+        frame: display index of the image's video frame.
+        xy: float32 [n, 2] position in pixels, (x right, y down), origin at the top-left
+            corner of the image: the first pixel's centre is (0.5, 0.5).
+        track: int64 [n] track of each keypoint, strictly ascending.
+    """
+
+    frame: int
+    xy: NDArray[np.float32]
+    track: NDArray[np.int64]
+
+
+def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoints]:
+    """Collect the track observations of the frames that become images.
+
+    A track seen in fewer than two of the frames matches nothing and is left out.
+
+    Args:
+        tracks: tracks of the whole video.
+        frames: display index of each image, strictly ascending.
+
+    Returns:
+        One entry per frame, in the same order.
+
+    Raises:
+        ImageError: a frame is not one of the video's, or frames are not ascending.
+    """
+    chosen = np.asarray(frames, dtype=np.int64).reshape(-1)
+    if chosen.size and (chosen.min() < 0 or chosen.max() >= tracks.num_frames):
+        raise ImageError(
+            f"images stand for frames {chosen.min()} to {chosen.max()}, but the video has "
+            f"{tracks.num_frames} frames: give images of this video only"
+        )
+    if np.any(np.diff(chosen) <= 0):
+        raise ImageError(
+            "two images stand for the same frame or run backwards: give one image per frame, "
+            "in display order"
+        )
+
+    image_of_frame = np.full(tracks.num_frames, -1, dtype=np.int64)
+    image_of_frame[chosen] = np.arange(chosen.size)
+    image = image_of_frame[tracks.frame]
+    num_tracks = tracks.offsets.size - 1
+    track = np.repeat(np.arange(num_tracks, dtype=np.int64), np.diff(tracks.offsets))
+    seen = image >= 0
+    often_enough = np.bincount(track[seen], minlength=num_tracks) >= 2
+    kept = np.flatnonzero(seen & often_enough[track])
+
+    # Observations come by track, so a stable sort by image leaves tracks ascending.
+    kept = kept[order_by_frame(image[kept], chosen.size)]
+    bounds = np.searchsorted(image[kept], np.arange(chosen.size + 1))
+    return [
+        ImageKeypoints(
+            frame=int(frame),
+            xy=np.ascontiguousarray(tracks.xy[kept[start:stop]], dtype=np.float32),
+            track=track[kept[start:stop]],
+        )
+        for frame, start, stop in zip(chosen, bounds[:-1], bounds[1:], strict=True)
+    ]
+
+
+def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
+    """Match the keypoints of two images that belong to the same track.
+
+    Returns:
+        uint32 [n, 2] keypoint indices (in a, in b), ascending in both columns.
+    """
+    if a.track.size == 0 or b.track.size == 0:
+        return np.empty((0, 2), dtype=np.uint32)
+    place = np.minimum(np.searchsorted(b.track, a.track), b.track.size - 1)
+    in_a = np.flatnonzero(b.track[place] == a.track)
+    return np.column_stack([in_a, place[in_a]]).astype(np.uint32)
+
+
+def schedule_pairs(
+    keypoints: Sequence[ImageKeypoints], options: PairOptions | None = None
+) -> NDArray[np.int32]:
+    """Choose the image pairs to write: dense at short spans, geometric at long ones.
+
+    Long spans carry the parallax an incremental mapper starts from; the last one is the
+    longest at which two images still share enough tracks. The triangulator follows written
+    pairs only, so short spans are paired at every image. The number of pairs is linear in
+    the number of images.
+
+    Args:
+        keypoints: the images' keypoints, in display order.
+        options: offsets and thresholds; the defaults of PairOptions if None.
+
+    Returns:
+        int32 [m, 2] indices into `keypoints`, first < second, in ascending order; each pair
+        shares at least `options.min_matches` tracks.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+    """
+    options = options if options is not None else PairOptions()
+    _check_options(options)
+    limit = _longest_track_span(keypoints)
+    if options.max_span is not None:
+        limit = min(limit, options.max_span)
+
+    def pairs_at(span: int) -> list[tuple[int, int]]:
+        step = max(1, span // _UNTHINNED_SPAN)
+        return [
+            (i, i + span)
+            for i in range(0, len(keypoints) - span, step)
+            if _count_shared(keypoints[i], keypoints[i + span]) >= options.min_matches
+        ]
+
+    pairs: list[tuple[int, int]] = []
+    reached, failed = 0, limit + 1
+    for span in sorted({offset for offset in options.offsets if offset <= limit}):
+        found = pairs_at(span)
+        pairs += found
+        if found:
+            reached, failed = span, limit + 1
+        else:
+            failed = min(failed, span)
+    if options.growth > 1:
+        while failed > limit > reached:
+            span = min(limit, max(reached + 1, round(reached * options.growth)))
+            found = pairs_at(span)
+            pairs += found
+            if found:
+                reached = span
+            else:
+                failed = span
+        # Tracks are gapless, or nearly: spans hold up to the longest one and fail beyond.
+        longest: list[tuple[int, int]] = []
+        while failed - reached > 1:
+            span = (reached + failed) // 2
+            found = pairs_at(span)
+            if found:
+                longest, reached = found, span
+            else:
+                failed = span
+        pairs += longest
+    return np.array(sorted(pairs), dtype=np.int32).reshape(-1, 2)
+
+
+def _count_shared(a: ImageKeypoints, b: ImageKeypoints) -> int:
+    if a.track.size == 0 or b.track.size == 0:
+        return 0
+    place = np.minimum(np.searchsorted(b.track, a.track), b.track.size - 1)
+    return int(np.count_nonzero(b.track[place] == a.track))
+
+
+def _longest_track_span(keypoints: Sequence[ImageKeypoints]) -> int:
+    """Largest distance, in images, between the first and the last image of a track."""
+    if not keypoints:
+        return 0
+    track = np.concatenate([k.track for k in keypoints])
+    if track.size == 0:
+        return 0
+    image = np.repeat(np.arange(len(keypoints)), [k.track.size for k in keypoints])
+    # Images ascend, so the last write wins for `last`, and for `first` once reversed.
+    first = np.zeros(int(track.max()) + 1, dtype=np.int64)
+    last = np.zeros_like(first)
+    first[track[::-1]] = image[::-1]
+    last[track] = image
+    return int((last - first).max())
+
+
+def _check_options(options: PairOptions) -> None:
+    if not options.offsets or min(options.offsets) < 1:
+        raise OptionError(f"offsets is {options.offsets}: give one or more spans of at least 1")
+    if not (1 <= options.growth < math.inf):
+        raise OptionError(f"growth is {options.growth}: give 1 (off) or more, such as 1.4")
+    if options.max_span is not None and options.max_span < 1:
+        raise OptionError(f"max_span is {options.max_span}: give 1 or more, or None")
+    if options.min_matches < 1:
+        raise OptionError(f"min_matches is {options.min_matches}: give 1 or more")

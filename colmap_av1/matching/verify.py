@@ -1,0 +1,396 @@
+"""Two-view geometry of image pairs: which matches agree with a rigid scene, and how.
+
+The decisions between the models and all thresholds are those of COLMAP 4.2's own geometric
+verification (`TwoViewGeometryOptions`), so a database filled here and one filled by COLMAP's
+matchers mean the same.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import OptionError
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_models import (
+    MAX_REFINED,
+    MIN_MATCHES,
+    Model,
+    Search,
+    find_fundamental,
+    find_homography,
+    find_pose,
+    planar_share,
+    spread_points,
+)
+from colmap_av1.options import VerifyOptions
+
+_Floats = NDArray[np.float64]
+
+# Pairs from which on another thread pays: between PoseLib's steps threads wait for the
+# interpreter, and two of them take a third more CPU time to be done a tenth to a quarter sooner.
+_PAIRS_FOR_A_THREAD = 2000
+# Pairs that a thread verifies before it hands them over.
+_PAIRS_AT_A_TIME = 16
+# Cells of an image that one point each is taken from before any gives its second.
+_NUM_CELLS = 128
+
+
+class TwoViewConfig(IntEnum):
+    """Kinds of two-view geometry, numbered as in COLMAP's databases."""
+
+    DEGENERATE = 1
+    CALIBRATED = 2
+    UNCALIBRATED = 3
+    PLANAR_OR_PANORAMIC = 6
+
+
+@dataclass(frozen=True)
+class TwoViewGeometry:
+    """Geometry of one image pair, from the pair's first image to its second.
+
+    Attributes:
+        config: kind of geometry.
+        inlier_matches: uint32 [n, 2] the matches that agree with it, in their order.
+        E: float64 [3, 3] essential matrix on normalised, undistorted coordinates, or None.
+        F: float64 [3, 3] fundamental matrix on pixels, or None, also where E explains so many
+            matches that F was not needed.
+        H: float64 [3, 3] homography on pixels, or None.
+        qvec: float64 [4] (w, x, y, z) rotation from the first camera to the second, or None.
+        tvec: float64 [3] translation likewise, of unit length, or None.
+    """
+
+    config: TwoViewConfig
+    inlier_matches: NDArray[np.uint32]
+    E: _Floats | None = None
+    F: _Floats | None = None
+    H: _Floats | None = None
+    qvec: _Floats | None = None
+    tvec: _Floats | None = None
+
+
+def verify_pairs(
+    keypoints: Sequence[ImageKeypoints],
+    pairs: NDArray[np.int32],
+    matches: Sequence[NDArray[np.uint32]],
+    cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
+    options: VerifyOptions | None = None,
+    *,
+    progress: Callable[[int], None] | None = None,
+) -> list[TwoViewGeometry]:
+    """Find the two-view geometry of every pair.
+
+    A pair of cameras with a focal length prior is CALIBRATED where the essential matrix
+    explains nearly as many matches as the fundamental matrix, any other UNCALIBRATED; where
+    a homography explains nearly as many, PLANAR_OR_PANORAMIC; with too few inliers DEGENERATE.
+
+    Args:
+        keypoints: the images' keypoints.
+        pairs: int32 [m, 2] indices into `keypoints`.
+        matches: for each pair, uint32 [n, 2] indices of matching keypoints.
+        cameras: the camera of all images, or one for each; images share a camera where theirs
+            are the same object.
+        options: thresholds and effort; the defaults of VerifyOptions if None.
+        progress: called with the number of pairs done so far, from this thread, in order.
+
+    Returns:
+        One geometry per pair, in the order of `pairs`. The result depends on the input and
+        `options.seed` only, not on the number of threads.
+
+    Raises:
+        OptionError: an option has a value that cannot work, or a camera is not a perspective
+            one.
+    """
+    options = options if options is not None else VerifyOptions()
+    _check_options(options)
+    if isinstance(cameras, pycolmap.Camera):
+        cameras = [cameras] * len(keypoints)
+    if len(cameras) != len(keypoints) or len(matches) != len(pairs):
+        raise ValueError("give one camera for each image and one array of matches for each pair")
+    views: dict[int, _View] = {}  # from the first pair that needs one to the last
+    last_pair = {int(image): index for index, pair in enumerate(pairs) for image in pair}
+
+    def view(image: int) -> _View:
+        found = views.get(image)
+        if found is None:
+            # Where two threads make it at a time, both make the same.
+            seed = _seed(options.seed, image)
+            found = views[image] = _view(keypoints[image], cameras[image], seed)
+        return found
+
+    def verify(some: range) -> list[TwoViewGeometry]:
+        found = []
+        for index in some:
+            i, j = pairs[index].tolist()
+            found.append(_verify_pair(view(i), view(j), matches[index], (i, j), options))
+        return found
+
+    geometries: list[TwoViewGeometry] = []
+    # Threads that hand over every pair by itself would be busy with that.
+    indices = range(len(pairs))
+    parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
+    num_threads = options.num_threads if options.num_threads is not None else _num_cpus()
+    num_threads = min(num_threads, 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
+    # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
+    with ThreadPoolExecutor(max_workers=num_threads) as executor:
+        try:
+            for part, found in zip(parts, executor.map(verify, parts), strict=True):
+                for image in np.unique(pairs[part.start : part.stop]).tolist():
+                    if last_pair[image] < part.stop:
+                        views.pop(image, None)
+                for geometry in found:
+                    geometries.append(geometry)
+                    if progress is not None:
+                        progress(len(geometries))
+        except BaseException:
+            executor.shutdown(wait=True, cancel_futures=True)
+            raise
+    return geometries
+
+
+@dataclass(frozen=True)
+class _View:
+    """Keypoints of an image as the estimators take them.
+
+    Attributes:
+        camera: the image's camera.
+        xy: float32 [n, 2] keypoints.
+        flat: float64 [2, n] undistorted keypoints in pixels from the principal point; None
+            without a focal length prior.
+        focal: mean focal length in pixels.
+        to_flat: float64 [3, 3] takes pixels without distortion to `flat`.
+        place: int32 [n] place of each keypoint in an order that is spread over the image from
+            its beginning on.
+    """
+
+    camera: pycolmap.Camera
+    xy: NDArray[np.float32]
+    flat: _Floats | None
+    focal: float
+    to_flat: _Floats
+    place: NDArray[np.int32]
+
+
+def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _View:
+    width, height = int(camera.width), int(camera.height)
+    pixels = keypoints.xy.astype(np.float64)
+    flat = None
+    focal = 1.0
+    if camera.has_prior_focal_length:
+        rays = np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
+        if pixels.size and np.isnan(rays).all():
+            raise OptionError(
+                f"camera model {camera.model_name} maps no keypoint to a ray in front of the "
+                "camera: give a perspective or fisheye model and parameters in pixels"
+            )
+        focal = float(camera.mean_focal_length())
+        flat = np.ascontiguousarray(rays.T * focal)
+    place = _spread_order(pixels, (width, height), seed)
+    to_flat = np.diag([focal, focal, 1.0]) @ np.linalg.inv(camera.calibration_matrix())
+    return _View(camera, keypoints.xy, flat, focal, to_flat, place)
+
+
+def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
+    """Order points so that any beginning of the order is spread over the image.
+
+    The image is divided into cells; every cell gives one random point before any gives its
+    second, and so on.
+
+    Args:
+        x: float64 [n, 2] points in pixels.
+        size: (width, height) of the image.
+        seed: seed of the random order within a cell.
+
+    Returns:
+        int32 [n] place of each point in the order.
+    """
+    edge = math.sqrt(size[0] * size[1] / _NUM_CELLS)
+    num_columns, num_rows = (math.ceil(length / edge) for length in size)
+    column = np.clip(x[:, 0] / edge, 0, num_columns - 1).astype(np.uint16)
+    row = np.clip(x[:, 1] / edge, 0, num_rows - 1).astype(np.uint16)
+    order = np.random.default_rng(seed).permutation(len(x))
+    # NumPy sorts numbers of 16 bits many times as fast as longer ones.
+    cell = (row * np.uint16(num_columns) + column)[order]
+    by_cell = np.argsort(cell, kind="stable")
+    sorted_cell = cell[by_cell]
+    count = np.arange(len(x), dtype=np.int32)
+    first = np.searchsorted(sorted_cell, sorted_cell)
+    turn = np.empty(len(x), dtype=np.uint16)
+    turn[by_cell] = np.minimum(count - first, np.iinfo(np.uint16).max)
+    place = np.empty(len(x), dtype=np.int32)
+    place[order[np.argsort(turn, kind="stable")]] = count
+    return place
+
+
+def _verify_pair(
+    a: _View,
+    b: _View,
+    matches: NDArray[np.uint32],
+    pair: tuple[int, int],
+    options: VerifyOptions,
+) -> TwoViewGeometry:
+    """Choose the model of one pair as COLMAP 4.2 does (EstimateTwoViewGeometry's rules).
+
+    Its test for watermarks is left out: the matches of a wide picture that pans slowly pass
+    it, and the mapper would lose the pairs of neighbours that tracks are made of.
+    """
+    if len(matches) < max(options.min_num_inliers, MIN_MATCHES):
+        return _degenerate()
+    # A beginning of the order that was made for the whole image stays spread in its part.
+    places = a.place.take(matches[:, 0])
+    num_refined = min(len(matches), max(MAX_REFINED, options.max_samples))
+    nearest = np.argpartition(places, num_refined - 1)[:num_refined]
+    order = nearest[np.argsort(places[nearest])]
+    search = Search(options, _seed(options.seed, *pair))
+    if a.flat is not None and b.flat is not None:
+        return _verify_calibrated(a, b, matches, order, search)
+    return _verify_uncalibrated(a, b, matches, order, search)
+
+
+def _degenerate() -> TwoViewGeometry:
+    return TwoViewGeometry(TwoViewConfig.DEGENERATE, np.empty((0, 2), dtype=np.uint32))
+
+
+def _seed(*words: int) -> int:
+    return zlib.crc32(repr(words).encode())
+
+
+def _verify_calibrated(
+    a: _View, b: _View, matches: NDArray[np.uint32], order: NDArray[np.int64], search: Search
+) -> TwoViewGeometry:
+    """The geometry of a pair whose focal lengths are known."""
+    options = search.options
+    num_needed = options.min_num_inliers
+    assert a.flat is not None
+    assert b.flat is not None
+    flat_a, flat_b = a.flat.take(matches[:, 0], axis=1), b.flat.take(matches[:, 1], axis=1)
+    # Some pixels of a wide lens have no ray in front of the camera.
+    order = order[np.isfinite(flat_a[0, order] + flat_b[0, order])]
+    flat = spread_points(flat_a, flat_b, order)
+    E = find_pose(flat, search, (a.focal, b.focal))
+
+    # F cannot have more inliers than there are matches: where E comes that close, the pair
+    # is calibrated whatever F says.
+    F = None
+    num_F = 0
+    if E.count < num_needed or E.count <= options.min_e_f_inlier_ratio * len(matches):
+        F = find_fundamental(spread_points(*_pixels(a, b, matches), order), search)
+        num_F = F.count
+
+    calibrated = E.count >= num_needed and E.count > options.min_e_f_inlier_ratio * num_F
+    rival = E if calibrated or F is None or num_F < num_needed else F
+    # A plane maps to a plane without distortion only.
+    H = find_homography(flat, search, rival.count)
+    if calibrated:
+        config = TwoViewConfig.CALIBRATED
+        chosen = F if F is not None and num_F > E.count else E
+    elif F is not None and num_F >= num_needed:
+        config = TwoViewConfig.UNCALIBRATED
+        chosen = F
+    elif H.count >= num_needed:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        chosen = H
+    else:
+        return _degenerate()
+    if H.count > planar_share(options) * rival.count:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        if H.count > chosen.count:
+            chosen = H
+
+    # A pose means nothing where a homography explains the matches as well.
+    qvec = tvec = None
+    if config == TwoViewConfig.CALIBRATED:
+        qvec = np.asarray(E.pose.q, dtype=np.float64).reshape(4)
+        # PoseLib's steps along the sphere of directions leave it a little.
+        tvec = _unit(np.asarray(E.pose.t, dtype=np.float64).reshape(3))
+    return TwoViewGeometry(
+        config=config,
+        inlier_matches=_inliers(matches, chosen),
+        E=None if E.matrix is None else _on_rays(E.matrix, a, b),
+        F=None if F is None else F.matrix,
+        H=None if H.matrix is None else _unit(np.linalg.inv(b.to_flat) @ H.matrix @ a.to_flat),
+        qvec=qvec,
+        tvec=tvec,
+    )
+
+
+def _inliers(matches: NDArray[np.uint32], model: Model) -> NDArray[np.uint32]:
+    """The matches that agree with a model; the same object where all do."""
+    chosen = matches if model.count == len(matches) else matches.compress(model.inliers, axis=0)
+    return chosen.astype(np.uint32, copy=False)
+
+
+def _pixels(a: _View, b: _View, matches: NDArray[np.uint32]) -> tuple[_Floats, _Floats]:
+    """The matched keypoints of both images, float64 [2, n] each."""
+    xa, xb = a.xy.take(matches[:, 0], axis=0), b.xy.take(matches[:, 1], axis=0)
+    return np.ascontiguousarray(xa.T, np.float64), np.ascontiguousarray(xb.T, np.float64)
+
+
+def _verify_uncalibrated(
+    a: _View, b: _View, matches: NDArray[np.uint32], order: NDArray[np.int64], search: Search
+) -> TwoViewGeometry:
+    """The geometry of a pair without known focal lengths.
+
+    Where both images have the same camera, COLMAP 4.2 looks for a relative pose with a shared
+    focal length. F has one degree of freedom more and is found in less time; what agrees with
+    one agrees with the other.
+    """
+    options = search.options
+    pixels = spread_points(*_pixels(a, b, matches), order)
+    F = find_fundamental(pixels, search)
+    shared = a.camera is b.camera
+    H = find_homography(pixels, search, F.count)
+    if max(F.count, H.count) < options.min_num_inliers:
+        return _degenerate()
+    config, chosen = TwoViewConfig.UNCALIBRATED, F
+    if F.count < options.min_num_inliers or H.count > planar_share(options) * F.count:
+        config = TwoViewConfig.PLANAR_OR_PANORAMIC
+        if shared or H.count >= F.count:
+            chosen = H
+    return TwoViewGeometry(
+        config=config,
+        inlier_matches=_inliers(matches, chosen),
+        F=F.matrix,
+        H=H.matrix,
+    )
+
+
+def _on_rays(E: _Floats, a: _View, b: _View) -> _Floats:
+    """The essential matrix of normalised coordinates from `find_pose`'s."""
+    return _unit(E * np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0]))
+
+
+def _unit(matrix: _Floats) -> _Floats:
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def _num_cpus() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _check_options(options: VerifyOptions) -> None:
+    if not 0 < options.max_error < math.inf:
+        raise OptionError(f"max_error is {options.max_error}: give a number of pixels above 0")
+    if options.min_num_inliers < 1:
+        raise OptionError(f"min_num_inliers is {options.min_num_inliers}: give 1 or more")
+    for name in ("min_e_f_inlier_ratio", "max_h_inlier_ratio", "confidence"):
+        value = getattr(options, name)
+        if not 0 <= value <= 1:
+            raise OptionError(f"{name} is {value}: give a share from 0 to 1")
+    for name, least in (("max_samples", MIN_MATCHES), ("max_iterations", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value < least:
+            raise OptionError(f"{name} is {value}: give {least} or more")
+    if options.num_threads is not None and options.num_threads < 1:
+        raise OptionError(f"num_threads is {options.num_threads}: give 1 or more, or None")

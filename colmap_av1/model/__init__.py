@@ -1,0 +1,1 @@
+"""Poses by COLMAP's mappers, points triangulated on them, models for trainers."""

@@ -1,0 +1,116 @@
+"""All tracks triangulated on poses that are known, with colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.model.colmap_model import ModelPoints
+from colmap_av1.model.triangulate import Points, Sightings, Views, triangulate
+from colmap_av1.options import MatchOptions, TriangulateOptions
+from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.util.progress import Progress
+
+_Image = NDArray[np.uint8]
+
+# Share of the tracks that agree with the poses of a model of the same video, at least.
+LEAST_AGREEING = 0.5
+# Shown frames that a track is seen in at least which a point may come from: where rays meet at an
+# angle, points of three frames are as true as those of four and five.
+_TRACK_LENGTH = 3
+# Width in pixels of the squares that hold one track each: tracks that come near each other show
+# two points as long as they do not come nearer than this.
+_CELL = 2
+
+
+def chaining_for_points(options: MatchOptions, triangulate: TriangulateOptions) -> MatchOptions:
+    """The options with more tracks, for points: short ones, and those that lie near another."""
+    tracks = options.tracks
+    if tracks.min_length is None:
+        min_length = min(_TRACK_LENGTH, triangulate.min_observations)
+        tracks = replace(tracks, min_length=min_length)
+    if tracks.cell is None:
+        tracks = replace(tracks, cell=min(_CELL, tracks.seeding))
+    return replace(options, tracks=tracks)
+
+
+def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:
+    """The tracks in some frames only, and the index into `frames` of each observation."""
+    place = np.full(tracks.num_frames, -1, dtype=np.int64)
+    place[frames] = np.arange(len(frames))
+    seen = keep_frames(tracks, frames)
+    return seen, place[seen.frame]
+
+
+def triangulate_tracks(
+    tracks: Tracks,
+    view: NDArray[np.int64],
+    cameras: Sequence[Any],
+    poses: Sequence[NDArray[np.float64]],
+    pinhole: Any | None,
+    *,
+    options: TriangulateOptions,
+    num_threads: int | None,
+    progress: Progress,
+) -> Points:
+    """Triangulate all tracks; errors are in pixels of `pinhole`, else of each image's camera."""
+    rays = np.full((len(view), 2), np.nan)
+    camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
+    for camera in {int(camera.camera_id): camera for camera in cameras}.values():
+        own = camera_of_view[view] == int(camera.camera_id)
+        rays[own] = np.asarray(camera.cam_from_img(tracks.xy[own].astype(np.float64)))
+    shown = [pinhole if pinhole is not None else camera for camera in cameras]
+    focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
+    num_tracks = len(tracks.offsets) - 1
+    return triangulate(
+        Sightings(tracks.offsets, view, rays, tracks.sigma),
+        Views(np.stack(poses), focal),
+        options,
+        num_threads=num_threads,
+        progress=lambda done: progress("points", done, num_tracks),
+    )
+
+
+class Colours:
+    """Mean colour of points over the pictures that see them, picture by picture."""
+
+    def __init__(
+        self, tracks: Tracks, view: NDArray[np.int64], points: Points, num_images: int
+    ) -> None:
+        self._size = np.array([tracks.width, tracks.height])
+        self._sum = np.zeros((len(points.xyz), 3))
+        self._count = np.zeros(len(points.xyz))
+        image = view[points.observation]
+        point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+        order = np.argsort(image, kind="stable")
+        self._bounds = np.searchsorted(image[order], np.arange(num_images + 1))
+        self._point = point[order]
+        self._xy = tracks.xy[points.observation[order]]
+
+    def add(self, image: int, picture: _Image) -> None:
+        """Look at the picture (BGR, of any scale) of an image."""
+        own = slice(self._bounds[image], self._bounds[image + 1])
+        size = np.array(picture.shape[1::-1])
+        x, y = np.clip((self._xy[own] * size / self._size).astype(np.int64), 0, size - 1).T
+        # A point is seen in an image once, or twice where two of its tracks' parts meet.
+        np.add.at(self._sum, self._point[own], picture[y, x, ::-1])
+        np.add.at(self._count, self._point[own], 1.0)
+
+    def mean(self) -> _Image:
+        """Colours uint8 [num_points, 3], red first."""
+        mean = self._sum / np.maximum(self._count, 1.0)[:, None]
+        return np.round(mean).astype(np.uint8)
+
+
+def model_points(
+    points: Points,
+    rgb: _Image,
+    view: NDArray[np.int64],
+    xy: NDArray[np.float64],
+) -> ModelPoints:
+    """The points as a model holds them; `xy` are the pixels of their observations."""
+    return ModelPoints(points.xyz, rgb, points.error, points.offsets, view[points.observation], xy)

@@ -1,0 +1,1 @@
+"""Motion of every coded frame, read from the bitstream."""

@@ -1,0 +1,109 @@
+"""Block data of one coded frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """Block data of one coded frame (never of a repeated showing).
+
+    Arrays named after the AV1 specification hold one entry per 4x4 luma unit,
+    shape [mi_rows, mi_cols]. Units may lie beyond the picture edge (MiRows and
+    MiCols are even).
+
+    Attributes:
+        decode_index: number of the frame among the events (decoded frames and
+            show_existing_frame headers) of the stream, from 0, in bitstream order.
+        display_index: number of the frame among the shown frames, in output order,
+            from 0; -1 for a frame that is never shown.
+        width: width in pixels of the picture after super-resolution (UpscaledWidth).
+        height: height in pixels (FrameHeight).
+        header: the frame header's values under the specification's names in
+            snake_case, as Python ints or int32 arrays.
+        ref_decode_index: [8] decode_index of the frame behind RefFrame 0..7
+            (entry 0, INTRA_FRAME, and absent references: -1).
+        ref_display_index: [8] display_index of the same frames, -1 where never shown.
+        ref_size: [8, 2] (width, height) in pixels of the same frames, 0 where absent.
+        slot_decode_index: [8] decode_index of the frame in each reference slot after
+            this frame's reference frame update process; -1 for an empty slot.
+        ref_frame: int8 [mi_rows, mi_cols, 2] RefFrame: 0 INTRA, 1..7 LAST..ALTREF, -1 none.
+        mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list][0 = row, 1 = column] in 1/8 px.
+        mi_size: uint8 MiSize (BLOCK_4X4 = 0 .. BLOCK_64X16 = 21).
+        y_mode: uint8 YMode (DC_PRED = 0 .. NEW_NEWMV = 24).
+        is_inter: uint8; 1 also with use_intrabc.
+        skip: uint8; 1: no residual is coded.
+        skip_mode: uint8.
+        segment_id: uint8.
+        motion_mode: uint8; 0 SIMPLE, 1 OBMC, 2 LOCALWARP.
+        compound_type: uint8; 255 for intra.
+        interintra: uint8.
+        use_intrabc: uint8.
+        warp_index: int32; row of local_warp_params of the unit's block, -1 without
+            a valid local warp.
+        local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
+    """
+
+    decode_index: int
+    display_index: int
+    width: int
+    height: int
+    header: dict[str, Any]
+    ref_decode_index: NDArray[np.int32]
+    ref_display_index: NDArray[np.int32]
+    ref_size: NDArray[np.int32]
+    slot_decode_index: NDArray[np.int32]
+    ref_frame: NDArray[np.int8]
+    mv: NDArray[np.int16]
+    mi_size: NDArray[np.uint8]
+    y_mode: NDArray[np.uint8]
+    is_inter: NDArray[np.uint8]
+    skip: NDArray[np.uint8]
+    skip_mode: NDArray[np.uint8]
+    segment_id: NDArray[np.uint8]
+    motion_mode: NDArray[np.uint8]
+    compound_type: NDArray[np.uint8]
+    interintra: NDArray[np.uint8]
+    use_intrabc: NDArray[np.uint8]
+    warp_index: NDArray[np.int32]
+    local_warp_params: NDArray[np.int32]
+
+    def displacement(self, list_index: int) -> NDArray[np.float32]:
+        """Displacement of every unit's centre into the frame its list references.
+
+        Args:
+            list_index: 0 or 1, the reference list.
+
+        Returns:
+            float32 [mi_rows, mi_cols, 2], (x, y) in pixels of the coded frame (before
+            super-resolution), local and
+            global warp applied; NaN where the unit has no reference in this list.
+        """
+        return np.asarray(
+            _core.displacement(
+                list_index,
+                self.mv,
+                self.ref_frame,
+                self.is_inter,
+                self.use_intrabc,
+                self.motion_mode,
+                self.interintra,
+                self.mi_size,
+                self.warp_index,
+                self.local_warp_params,
+                self.header["gm_type"],
+                self.header["gm_params"],
+                self.y_mode,
+                self.ref_size,
+                self.header["frame_width"],
+                self.height,
+                bool(self.header["force_integer_mv"]),
+            )
+        )

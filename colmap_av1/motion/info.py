@@ -1,0 +1,253 @@
+"""What a stream is made of, and whether its motion is worth matching."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
+from colmap_av1.video.container import VideoStream, open_stream
+from colmap_av1.video.display import Display
+from colmap_av1.video.facts import presented_frames, read_display
+
+_KEY_FRAME, _INTRA_ONLY_FRAME = 0, 2
+
+# Below these a stream gives few or poor tracks. Measured streams: 85 % inter units for
+# ordinary motion, about 50 % at 28 px a frame; 0.8 bits a pixel at crf 20, 0.3 at crf 35.
+_LEAST_INTER_SHARE = 0.35
+_LEAST_BITS_PER_PIXEL = 0.03
+_LEAST_KEY_FRAME_DISTANCE = 12
+_LEAST_MOTION = 0.1
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """Facts about an AV1 stream.
+
+    Attributes:
+        path: the file.
+        container: FFmpeg's name of the container.
+        width: picture width in pixels as stored.
+        height: picture height in pixels.
+        display: how players show the pictures.
+        frame_rate: frames per second; None where unknown.
+        num_coded: frames with block data.
+        num_shown: frames that the bitstream shows.
+        num_cut: those of them that an edit list hides.
+        num_hidden: coded frames that are never shown.
+        num_key_frames: key frames and intra-only frames among the coded ones.
+        inter_share: share of inter units in all frames but the first.
+        reference_distances: share of references by signed display distance, counted in
+            units; negative is the past.
+        hidden_reference_share: share of references to frames that are never shown.
+        median_motion: median length of the units' displacements in pixels per shown frame.
+        bytes_per_frame: size of the stream per shown frame.
+        bits_per_pixel: the same in bits per pixel.
+        reasons: why the stream is poor for matching; empty where it is good.
+    """
+
+    path: Path
+    container: str
+    width: int
+    height: int
+    display: Display
+    frame_rate: float | None
+    num_coded: int
+    num_shown: int
+    num_cut: int
+    num_hidden: int
+    num_key_frames: int
+    inter_share: float
+    reference_distances: dict[int, float]
+    hidden_reference_share: float
+    median_motion: float
+    bytes_per_frame: float
+    bits_per_pixel: float
+    reasons: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether the stream is any good for matching."""
+        return not self.reasons
+
+
+def inspect(
+    video: str | os.PathLike[str],
+    options: ReadOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> StreamReport:
+    """Read a whole stream and judge how well its motion serves for matching.
+
+    Args:
+        video: the video file.
+        options: how the bitstream is read.
+        progress: called with the number of coded frames so far.
+
+    Raises:
+        VideoError: the video cannot be read or holds no frame.
+        BitstreamError: the stream is damaged and `options.strict` is set.
+    """
+    counts = _count(read_motion(video, options), progress)
+    structure = counts.structure
+    if structure.num_shown == 0:
+        raise VideoError(f"{video}: shows no frame: give a video with pictures")
+    presented = presented_frames(video)
+    num_presented = (
+        structure.num_shown if presented is None else int((presented < structure.num_shown).sum())
+    )
+    with open_stream(video) as stream:
+        bytes_per_frame = _num_bytes(stream) / structure.num_shown
+        bits_per_pixel = 8 * bytes_per_frame / max(1, stream.width * stream.height)
+        references = sum(counts.references.values()) + counts.hidden_references
+        median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
+        reasons = structure.reasons(bits_per_pixel)
+        if median_motion < _LEAST_MOTION:
+            reasons += (
+                f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
+                "there is no parallax",
+            )
+        return StreamReport(
+            path=Path(video),
+            container=stream.container,
+            width=stream.width,
+            height=stream.height,
+            display=read_display(video),
+            frame_rate=stream.frame_rate,
+            num_coded=structure.num_coded,
+            num_shown=structure.num_shown,
+            num_cut=structure.num_shown - num_presented,
+            num_hidden=counts.num_hidden,
+            num_key_frames=structure.num_key_frames,
+            inter_share=structure.inter_share,
+            reference_distances={
+                distance: units / references
+                for distance, units in sorted(counts.references.items())
+            },
+            hidden_reference_share=counts.hidden_references / references if references else 0.0,
+            median_motion=median_motion,
+            bytes_per_frame=bytes_per_frame,
+            bits_per_pixel=bits_per_pixel,
+            reasons=reasons,
+        )
+
+
+@dataclass
+class Structure:
+    """Counts that tell how a stream is coded, as far as matching cares.
+
+    Attributes:
+        num_coded: frames with block data.
+        num_shown: frames that the bitstream shows.
+        num_key_frames: key frames and intra-only frames among the coded ones.
+        later_units: units of all frames but the first.
+        inter_units: those of them that are inter coded.
+    """
+
+    num_coded: int = 0
+    num_shown: int = 0
+    num_key_frames: int = 0
+    later_units: int = 0
+    inter_units: int = 0
+
+    @property
+    def inter_share(self) -> float:
+        """Share of inter units in all frames but the first."""
+        return self.inter_units / self.later_units if self.later_units else 0.0
+
+    def add(self, frame: FrameMotion) -> None:
+        """Count a frame; frames come in bitstream order."""
+        self.num_coded += 1
+        self.num_shown = max(self.num_shown, frame.display_index + 1)
+        self.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
+        if self.num_coded > 1:
+            self.later_units += frame.is_inter.size
+            inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
+            self.inter_units += int(np.count_nonzero(inter))
+
+    def reasons(self, bits_per_pixel: float) -> tuple[str, ...]:
+        """Why streams of such a structure and rate are poor for matching; empty if they are not."""
+        if self.num_shown < 3:
+            return (f"only {self.num_shown} frames are shown: a track needs more",)
+        if self.inter_units == 0:
+            return ("every frame is intra coded, so there is no motion: encode it with -g 9999",)
+        reasons = []
+        if self.inter_share < _LEAST_INTER_SHARE:
+            reasons.append(
+                f"only {self.inter_share:.0%} of the units after the first frame are inter coded: "
+                "the camera moves too far between frames, or the scene itself moves"
+            )
+        if self.num_shown < _LEAST_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
+            reasons.append(
+                f"a key frame every {self.num_coded / self.num_key_frames:.1f} frames cuts "
+                "every track: encode it with -g 9999"
+            )
+        if bits_per_pixel < _LEAST_BITS_PER_PIXEL:
+            reasons.append(
+                f"{bits_per_pixel:.3f} bits per pixel is a low rate, vectors are coarse: encode "
+                "the source with a lower -crf"
+            )
+        return tuple(reasons)
+
+
+@dataclass
+class _Counts:
+    structure: Structure = field(default_factory=Structure)
+    num_hidden: int = 0
+    references: Counter[int] = field(default_factory=Counter)
+    hidden_references: int = 0
+    motion: list[float] = field(default_factory=list)
+
+
+def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None) -> _Counts:
+    counts = _Counts()
+    for frame in motion:
+        counts.structure.add(frame)
+        counts.num_hidden += frame.display_index < 0
+        _count_references(frame, counts)
+        if progress is not None:
+            progress(counts.structure.num_coded)
+    return counts
+
+
+def _count_references(frame: FrameMotion, counts: _Counts) -> None:
+    if frame.display_index < 0:
+        return
+    inter = frame.use_intrabc == 0
+    for list_index in (0, 1):
+        reference = frame.ref_frame[..., list_index]
+        used = (reference > 0) & inter
+        if not used.any():
+            continue
+        units = np.bincount(reference[used], minlength=8)
+        for name in np.flatnonzero(units):
+            shown = int(frame.ref_display_index[name])
+            if shown < 0:
+                counts.hidden_references += int(units[name])
+            else:
+                counts.references[shown - frame.display_index] += int(units[name])
+        displacement = frame.displacement(list_index)[used]
+        distance = np.abs(frame.ref_display_index[reference[used]] - frame.display_index)
+        length = np.hypot(displacement[:, 0], displacement[:, 1])
+        valid = (frame.ref_display_index[reference[used]] >= 0) & (distance > 0)
+        valid &= np.isfinite(length)
+        if valid.any():
+            counts.motion.append(float(np.median(length[valid] / distance[valid])))
+
+
+def _num_bytes(stream: VideoStream) -> int:
+    """Size of the stream up to its end or the first damage, which reading has reported."""
+    total = 0
+    with contextlib.suppress(BitstreamError):
+        for packet in stream.packets():
+            total += len(packet.data)
+    return total

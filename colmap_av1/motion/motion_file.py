@@ -1,0 +1,113 @@
+"""Files that hold the motion of a video."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import OptionError, VideoError, cannot_write
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
+from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.hdf5 import new_hdf5
+
+# Zip members carry a date; a fixed one keeps the bytes the same.
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def export_motion(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    options: ReadOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write the motion of every coded frame to a .npz or .h5 file.
+
+    Coded frame i (in bitstream order, from 0) has its arrays under '%06d/' % i, named after
+    the fields of `FrameMotion`, with its header values under '%06d/header/'. Frames are
+    written one by one, so memory does not grow with the video. The file appears under its
+    name only when complete.
+
+    Args:
+        video: the video file.
+        output: the file; its extension .npz, .h5 or .hdf5 says the format.
+        options: how the bitstream is read.
+        progress: called with the number of frames written so far.
+
+    Returns:
+        The number of coded frames.
+
+    Raises:
+        OptionError: another extension, or the file cannot be written.
+        VideoError: the video cannot be read or holds no frame.
+        BitstreamError: the stream is damaged and `options.strict` is set.
+    """
+    path = Path(output)
+    writers: dict[str, _Opener] = {".npz": _open_npz, ".h5": _open_h5, ".hdf5": _open_h5}
+    if path.suffix.lower() not in writers:
+        raise OptionError(f"{path}: give an output file that ends in .npz or .h5")
+    count = 0
+    try:
+        remove_leftovers(path.parent, path.name)
+        with whole_file(path) as partial:
+            with writers[path.suffix.lower()](partial) as write:
+                for frame in read_motion(video, options):
+                    for name, array in _arrays(frame):
+                        write(f"{count:06d}/{name}", array)
+                    count += 1
+                    if progress is not None:
+                        progress(count)
+            if count == 0:
+                raise VideoError(f"{video}: holds no frame: give a video with pictures")
+    except OSError as error:
+        raise OptionError(cannot_write(path, error)) from error
+    return count
+
+
+class _Opener(Protocol):
+    def __call__(
+        self, path: Path
+    ) -> AbstractContextManager[Callable[[str, NDArray[Any]], None]]: ...
+
+
+@contextmanager
+def _open_npz(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+
+        def write(name: str, array: NDArray[Any]) -> None:
+            info = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+
+        yield write
+
+
+@contextmanager
+def _open_h5(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
+    with new_hdf5(path) as write_dataset:
+
+        def write(name: str, array: NDArray[Any]) -> None:
+            how = {"compression": "gzip", "compression_opts": 1} if array.size > 1 else {}
+            write_dataset(name, array, **how)
+
+        yield write
+
+
+def _arrays(frame: FrameMotion) -> Iterator[tuple[str, NDArray[Any]]]:
+    for field in dataclasses.fields(frame):
+        value = getattr(frame, field.name)
+        if field.name == "header":
+            for key, entry in value.items():
+                yield f"header/{key}", np.asarray(entry)
+        else:
+            yield field.name, np.asarray(value)

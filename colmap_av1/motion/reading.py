@@ -1,0 +1,312 @@
+"""Motion of a video, read from the AV1 bitstream without decoding pixels."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import warnings
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import BitstreamError, LimitError, OptionError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.options import ReadOptions
+from colmap_av1.video.container import open_stream
+
+# Bytes of block data that threads may read ahead of their use, all together.
+_READ_AHEAD = 1 << 28
+_BYTES_PER_UNIT = 24
+_SMALL_AHEAD = 4  # frames
+_NUM_OPERATING_POINTS = 32  # that a sequence header has room for (5.5.1)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Packets from a shown key frame on, which refer to none before: threads read them alone.
+
+    Attributes:
+        first_packet: index of the first packet.
+        start: where the parser stood before it; None at the start of the stream.
+    """
+
+    first_packet: int
+    start: _core.RestartPoint | None
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What the headers say.
+
+    Attributes:
+        shown: for each shown frame, in output order, the event that decoded it.
+        groups: the groups.
+        num_units: units of the largest frame.
+    """
+
+    shown: list[int]
+    groups: list[_Group]
+    num_units: int
+
+
+def read_motion(
+    video: str | PathLike[str], options: ReadOptions | None = None
+) -> Iterator[FrameMotion]:
+    """Read the motion of every coded frame of an AV1 video, in bitstream order.
+
+    No pixel is decoded. The headers are read once before, for the display order: which
+    picture a hidden frame becomes is said by a later header. Memory does not grow with the
+    length of the video, but for a few bytes a frame.
+
+    Args:
+        video: a file that `colmap_av1.video.open_stream` takes.
+        options: how to read.
+
+    Yields:
+        One FrameMotion per coded frame. A damaged stream yields the frames before the
+        damage, and a warning names the damage; see Raises.
+
+    Raises:
+        BitstreamError: the stream is damaged before its first frame is complete, or anywhere
+            with `options.strict`.
+        LimitError: a frame is larger than `options.max_frame_size`.
+        OptionError: an option has a value that cannot work.
+        VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
+    """
+    options = options if options is not None else ReadOptions()
+    check_read_options(options)
+    index = _read_index(video, options)
+    display_index: dict[int, int] = {}
+    for number, decode_index in enumerate(index.shown):
+        display_index.setdefault(decode_index, number)
+    count = 0
+    try:
+        for event in _read_events(video, options, index):
+            if event.is_repeated:
+                continue
+            yield _frame_motion(event, display_index)
+            count += 1
+    except BitstreamError as error:
+        if options.strict or count == 0:
+            raise
+        warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
+
+
+def check_read_options(options: ReadOptions) -> None:
+    """Refuse options that cannot work.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+    """
+    last = _NUM_OPERATING_POINTS - 1
+    if not 0 <= options.operating_point <= last:
+        raise OptionError(f"operating_point is {options.operating_point}: give 0 to {last}")
+    if options.num_threads is not None and options.num_threads < 1:
+        raise OptionError(f"num_threads is {options.num_threads}: give 1 or more, or None")
+    if options.max_frame_size < 1:
+        raise OptionError(f"max_frame_size is {options.max_frame_size}: give samples above 0")
+
+
+def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
+    """Read the headers of a video up to the first damage.
+
+    Of a temporal unit with several spatial layers the highest is output (7.18.1).
+    """
+    shown: list[int] = []
+    groups = [_Group(0, None)]
+    num_units = 0
+    last_unit = -1
+    parser = _core.Parser(
+        operating_point=options.operating_point,
+        headers_only=True,
+        max_frame_size=options.max_frame_size,
+    )
+    try:
+        with open_stream(video) as stream:
+            if stream.configuration:
+                list(_parse(parser, stream.configuration, video, options))
+            for packet in stream.packets():
+                start = _restart_point(parser)
+                for i, event in enumerate(_parse(parser, packet.data, video, options)):
+                    if i == 0 and event.is_shown_key_frame and start and packet.index > 0:
+                        groups.append(_Group(packet.index, start))
+                    if not event.is_repeated:
+                        num_units = max(num_units, event.num_units)
+                    if not event.is_shown:
+                        continue
+                    decoded = event.shown_decode_index if event.is_repeated else event.decode_index
+                    if event.temporal_unit == last_unit and shown:
+                        shown.pop()
+                    last_unit = event.temporal_unit
+                    shown.append(decoded)
+    except BitstreamError:
+        pass
+    return _Index(shown, groups, num_units)
+
+
+def _restart_point(parser: _core.Parser) -> _core.RestartPoint | None:
+    try:
+        return parser.restart_point()
+    except _core.BitstreamError:  # inside a frame
+        return None
+
+
+def _parse(
+    parser: _core.Parser,
+    data: bytes | memoryview,
+    video: str | PathLike[str],
+    options: ReadOptions,
+) -> Iterator[_core.Event]:
+    """Parse a packet; the events before an error come first."""
+    try:
+        parser.parse(data)
+    except _core.BitstreamError as error:
+        yield from parser.take_events()
+        raise BitstreamError(f"{video}: {error}") from error
+    except _core.LimitError as error:
+        yield from parser.take_events()
+        raise LimitError(
+            f"{video}: {error} of {options.max_frame_size} samples: allow more with max_frame_size"
+        ) from error
+    yield from parser.take_events()
+
+
+def _read_events(
+    video: str | PathLike[str], options: ReadOptions, index: _Index
+) -> Generator[_core.Event, None, None]:
+    """Events of the parser in bitstream order; those before an error come first."""
+    num_threads = options.num_threads or os.cpu_count() or 1
+    if num_threads == 1:
+        for _, event in _read_groups(video, options, index.groups, num_threads=num_threads):
+            if event is not None:
+                yield event
+        return
+    num_readers = min(num_threads, len(index.groups))
+    depth = _SMALL_AHEAD  # one reader: enough to work while the frames are used
+    if num_readers > 1:
+        depth = max(2, _READ_AHEAD // (num_readers * _BYTES_PER_UNIT * max(1, index.num_units)))
+    stop = threading.Event()
+    ahead: list[queue.Queue[tuple[int, Any]]] = [queue.Queue(depth) for _ in range(num_readers)]
+
+    def work(reader: int) -> None:
+        items = _read_groups(
+            video,
+            options,
+            index.groups,
+            reader=reader,
+            num_readers=num_readers,
+            num_threads=num_threads // num_readers,
+        )
+        try:
+            for item in items:
+                ahead[reader].put(item)
+                if stop.is_set():
+                    return
+        except Exception as error:  # raised again where the frames are used
+            ahead[reader].put((-1, error))
+        finally:
+            items.close()
+
+    readers = [threading.Thread(target=work, args=(i,), daemon=True) for i in range(num_readers)]
+    for thread in readers:
+        thread.start()
+    try:
+        for group in range(len(index.groups)):
+            while True:
+                number, item = ahead[group % num_readers].get()
+                if number != group:
+                    try:
+                        raise item
+                    finally:
+                        del item  # it refers to this frame
+                if item is None:
+                    break
+                yield item
+    finally:
+        stop.set()
+        for thread, waiting in zip(readers, ahead, strict=True):
+            while thread.is_alive():
+                while not waiting.empty():
+                    waiting.get_nowait()
+                thread.join(0.01)
+
+
+def _read_groups(
+    video: str | PathLike[str],
+    options: ReadOptions,
+    groups: list[_Group],
+    *,
+    reader: int = 0,
+    num_readers: int = 1,
+    num_threads: int,
+) -> Generator[tuple[int, _core.Event | None], None, None]:
+    """Read every `num_readers`-th group from number `reader` on.
+
+    Each reader demuxes the whole file, which costs about a hundredth of parsing it.
+
+    Yields:
+        (number of the group, event), and None for the event at the group's end.
+    """
+    parser = _core.Parser(
+        operating_point=options.operating_point,
+        num_threads=num_threads,
+        max_frame_size=options.max_frame_size,
+    )
+    first_packets = [group.first_packet for group in groups]
+    group = 0
+    try:
+        with open_stream(video) as stream:
+            if reader == 0 and stream.configuration:
+                for event in _parse(parser, stream.configuration, video, options):
+                    yield 0, event
+            for packet in stream.packets():
+                if group + 1 < len(groups) and packet.index == first_packets[group + 1]:
+                    if group % num_readers == reader:
+                        yield group, None
+                    group += 1
+                    start = groups[group].start
+                    if num_readers > 1 and start is not None:
+                        parser.restart(start)
+                if group % num_readers == reader:
+                    for event in _parse(parser, packet.data, video, options):
+                        yield group, event
+                elif group + (reader - group) % num_readers >= len(groups):
+                    return  # this reader's last group is over
+    except BitstreamError:
+        # What damages a group that another reader has is that reader's to report.
+        if group % num_readers == reader:
+            raise
+        return
+    if group % num_readers != reader:
+        return
+    try:
+        parser.finish()
+    except _core.BitstreamError as error:
+        raise BitstreamError(f"{video}: {error}") from error
+    yield group, None
+
+
+def _frame_motion(event: _core.Event, display_index: dict[int, int]) -> FrameMotion:
+    def displayed(indices: NDArray[np.int32]) -> NDArray[np.int32]:
+        return np.array([display_index.get(int(i), -1) for i in indices], dtype=np.int32)
+
+    header = event.header()
+    ref_decode_index = event.ref_decode_index()
+    return FrameMotion(
+        decode_index=event.decode_index,
+        display_index=display_index.get(event.decode_index, -1),
+        width=header["upscaled_width"],
+        height=header["frame_height"],
+        header=header,
+        ref_decode_index=ref_decode_index,
+        ref_display_index=displayed(ref_decode_index),
+        ref_size=event.ref_size(),
+        slot_decode_index=event.slot_decode_index(),
+        **event.take_units(),
+    )

@@ -1,0 +1,1 @@
+"""Motion chained into tracks, corrected and chosen."""

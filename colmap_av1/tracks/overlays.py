@@ -1,0 +1,68 @@
+"""Tracks of what does not belong to the scene but lies over the picture: logos, dashboards."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
+
+# Pixels that nothing over the picture moves by: the finest step of a motion vector.
+_STILL = 0.125
+# Pixels that the picture moves by along a track, before standing still tells anything. Far points
+# stand still for a while before a camera that moves sideways.
+_MOVED = 4.0
+# Steps to a frame that their median is taken of, on average, where there are more.
+_NUM_STEPS = 1000
+
+
+def remove_overlays(tracks: Tracks) -> Tracks:
+    """Leave out the tracks that stand still while the picture moves.
+
+    A picture moves by the median step of its tracks, of a thousand or more where there are so many,
+    from frame to frame. Where the camera rests nothing is left out.
+
+    Args:
+        tracks: any tracks.
+
+    Returns:
+        The other tracks in their former order; the same object where nothing is left out.
+    """
+    if len(tracks.offsets) == 1:
+        return tracks
+    first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
+    travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(tracks))])
+    moved = travelled[tracks.frame[last] + 1] - travelled[tracks.frame[first] + 1]
+    # Few tracks end where they began, and only these can have stood still.
+    ends_still = _length(tracks.xy[last] - tracks.xy[first]) <= _STILL
+    over_picture = ends_still & (moved >= _MOVED)
+    for index in np.flatnonzero(over_picture):
+        xy = tracks.xy[first[index] : last[index] + 1]
+        over_picture[index] = _length(xy - xy[0]).max() <= _STILL
+    return keep_observations(tracks, np.repeat(~over_picture, np.diff(tracks.offsets)))
+
+
+def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
+    """Median step in pixels that leads to each frame: float64 [num_frames], 0 where none does."""
+    starts = np.zeros(len(tracks.frame), dtype=np.bool_)
+    starts[tracks.offsets[:-1]] = True
+    # Every n-th: steps of a track follow each other, so all tracks have their part.
+    stride = max(1, len(tracks.frame) // (_NUM_STEPS * tracks.num_frames))
+    to = np.arange(0, len(tracks.frame), stride)
+    to = to[~starts[to]]
+    step = _length(tracks.xy[to] - tracks.xy[to - 1])
+    frame = tracks.frame[to]
+    step /= frame - tracks.frame[to - 1]
+    count = np.bincount(frame, minlength=tracks.num_frames)
+    by_frame = np.split(step[order_by_frame(frame, tracks.num_frames)], np.cumsum(count)[:-1])
+    motion = np.zeros(tracks.num_frames)
+    for index in np.flatnonzero(count):
+        middle = len(by_frame[index]) // 2
+        motion[index] = np.partition(by_frame[index], middle)[middle]
+    return motion
+
+
+def _length(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Length of each of [n, 2] vectors; NumPy's own norm takes many times as long for two."""
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.sqrt(x * x + y * y)

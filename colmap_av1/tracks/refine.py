@@ -1,0 +1,438 @@
+"""Sub-pixel correction of tracks on decoded pictures; needs pixels, unlike all before it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.options import RefineOptions
+from colmap_av1.tracks.tracks import Tracks, order_by_frame
+
+# Pixels around a template's window: one for its gradients, two for the way back.
+_MARGIN = 3
+_LARGEST_WINDOW = 101  # a template of each track is kept in memory
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.01)
+# Frames without a confirmation after which a track is given a new template.
+_MAX_MISSES = 3
+# Grey levels by which windows that match differ, beside the share of their contrast.
+_GREY_TOLERANCE = 2.0
+# Pixels by which the way there and back may miss its start.
+_MAX_RETURN = 0.25
+# Flatter windows confirm nothing: a grey level of noise moves them by more.
+_MAX_SOFTNESS = 0.15
+# Logarithm of a match's variance in px^2: constant, slope with the logarithm of the error that the
+# windows' difference lets expect, slope with that of the variance of the bitstream's motion since
+# the template; fitted by examples/benchmarks/fit_trust.py.
+_MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.49, 1.17, 0.80
+# Standard deviation in pixels that is added where there is texture but nothing like the template:
+# hidden, or followed wrongly.
+_REFUSED_SIGMA = 0.7
+
+
+def refine_tracks(
+    tracks: Tracks,
+    frames: Iterable[tuple[int, NDArray[np.uint8]]],
+    options: RefineOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Tracks:
+    """Correct track positions by Lucas-Kanade on the decoded pictures.
+
+    Every track carries the picture around an earlier observation, its template. An observation
+    is looked for from where the bitstream's step leads, first by the template, which does not
+    drift, then by the observation before; found by the latter only, it becomes the new
+    template. What neither finds keeps the bitstream's step and its larger expected error, and
+    is not marked as confirmed: nothing is left out.
+
+    Frames are consumed one by one; memory holds two pictures and one template for each
+    track of a frame, besides the tracks.
+
+    Args:
+        tracks: tracks of the whole video.
+        frames: (display index, picture) of the frames in display order, uint8 BGR
+            [height, width, 3] or grey [height, width]. Observations in frames that are
+            missing keep the bitstream's step.
+        options: how to refine; the defaults of RefineOptions if None.
+        progress: called after each frame with the number of frames so far.
+
+    Returns:
+        The same tracks and observations with corrected positions, their expected errors and
+        which of them are confirmed; the same object with `refine` "none", without reading
+        frames.
+
+    Raises:
+        ImageError: a picture differs in size from the tracks' frames, or comes out of order.
+        OptionError: an option has a value that cannot work.
+    """
+    options = options if options is not None else RefineOptions()
+    _check_options(options)
+    if options.refine == "none":
+        return tracks
+    state = match_tracks(tracks, frames, options, progress)
+    return replace(
+        tracks,
+        xy=state.xy,
+        sigma=np.sqrt(state.variance).astype(np.float32),
+        confirmed=state.confirmed,
+    )
+
+
+def match_tracks(
+    tracks: Tracks,
+    frames: Iterable[tuple[int, NDArray[np.uint8]]],
+    options: RefineOptions,
+    progress: Callable[[int], None] | None = None,
+) -> RefinedTracks:
+    """Do the work of `refine_tracks`, and tell how every observation was found.
+
+    Args and errors are those of `refine_tracks`.
+    """
+    state = RefinedTracks.start(tracks, options)
+    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
+    bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
+    next_frame = 0
+    for count, (index, image) in enumerate(frames, start=1):
+        if index < next_frame or index >= tracks.num_frames:
+            raise ImageError(f"frame {index} comes out of order: give frames in display order")
+        if image.shape[:2] != (tracks.height, tracks.width):
+            raise ImageError(
+                f"frame {index} is {image.shape[1]}x{image.shape[0]}, the tracks are of "
+                f"{tracks.width}x{tracks.height}: re-encode the video at one size"
+            )
+        for missing in range(next_frame, index):
+            state.skip(by_frame[bounds[missing] : bounds[missing + 1]])
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        state.refine(by_frame[bounds[index] : bounds[index + 1]], grey)
+        next_frame = index + 1
+        if progress is not None:
+            progress(count)
+    for missing in range(next_frame, tracks.num_frames):
+        state.skip(by_frame[bounds[missing] : bounds[missing + 1]])
+    return state
+
+
+@dataclass
+class RefinedTracks:
+    """What is known of every track after some of the frames.
+
+    Attributes:
+        xy: float32 [num_observations, 2] corrected positions in pixels.
+        variance: float64 [num_observations] their expected variance in px^2.
+        confirmed: bool [num_observations].
+        source: int64 [num_observations] the observation whose picture each was found by; -1 for
+            those that are not confirmed.
+        noise: float32 [num_observations] error in pixels that the difference of the matched
+            pictures would make if it were noise; 0 for those that are not confirmed.
+        bitstream_variance: float64 [num_observations] variance before refinement.
+    """
+
+    tracks: Tracks
+    options: RefineOptions
+    track: NDArray[np.int64]  # of each observation
+    is_first: NDArray[np.bool_]
+    is_last: NDArray[np.bool_]
+    step: NDArray[np.float32]  # by which the bitstream led to each observation
+    step_variance: NDArray[np.float64]
+    bitstream_variance: NDArray[np.float64]
+    xy: NDArray[np.float32]
+    variance: NDArray[np.float64]
+    confirmed: NDArray[np.bool_]
+    source: NDArray[np.int64]
+    noise: NDArray[np.float32]
+    templates: _Templates
+    last_image: NDArray[np.uint8] | None = None
+    last_frame: int = -1
+
+    @classmethod
+    def start(cls, tracks: Tracks, options: RefineOptions) -> RefinedTracks:
+        """What is known before the first frame."""
+        num_observations = len(tracks.frame)
+        num_tracks = len(tracks.offsets) - 1
+        is_first = np.zeros(num_observations, dtype=np.bool_)
+        is_first[tracks.offsets[:-1]] = True
+        is_last = np.zeros(num_observations, dtype=np.bool_)
+        is_last[tracks.offsets[1:] - 1] = True
+        variance = tracks.sigma.astype(np.float64) ** 2
+        # Hidden frames may leave a step without a growth of the error.
+        step_variance = np.maximum(np.diff(variance, prepend=0.0), 0.0)
+        alive = np.bincount(tracks.frame[is_first], minlength=tracks.num_frames + 1)
+        alive[1:] -= np.bincount(tracks.frame[is_last], minlength=tracks.num_frames + 1)[:-1]
+        return cls(
+            tracks=tracks,
+            options=options,
+            track=np.repeat(np.arange(num_tracks), np.diff(tracks.offsets)),
+            is_first=is_first,
+            is_last=is_last,
+            step=np.diff(tracks.xy, axis=0, prepend=np.zeros((1, 2), np.float32)),
+            step_variance=step_variance,
+            bitstream_variance=variance,
+            xy=tracks.xy.copy(),
+            variance=variance.copy(),
+            confirmed=np.zeros(num_observations, dtype=np.bool_),
+            source=np.full(num_observations, -1),
+            noise=np.zeros(num_observations, dtype=np.float32),
+            templates=_Templates.empty(tracks, options, int(np.cumsum(alive).max(initial=0))),
+        )
+
+    def skip(self, seen: NDArray[np.int64]) -> None:
+        """Carry the observations of a frame without a picture on by the bitstream's steps."""
+        later = seen[~self.is_first[seen]]
+        self._follow(later)
+        self.templates.drop(self.track[seen[self.is_last[seen]]])
+
+    def refine(self, seen: NDArray[np.int64], image: NDArray[np.uint8]) -> None:
+        """Correct the observations of the frame whose picture is `image`."""
+        frame = int(self.tracks.frame[seen[0]]) if len(seen) else -1
+        self.templates.drop(self.track[seen[self.is_last[seen] & self.is_first[seen]]])
+        later = seen[~self.is_first[seen]]
+        self._follow(later)
+        templates = self.templates
+        canvas = templates.canvas(image)
+
+        # By the template.
+        tracked = later[templates.slot[self.track[later]] >= 0]
+        track = self.track[tracked]
+        found = _match(
+            templates.atlas, canvas, templates.point[track], self.xy[tracked], self.options
+        )
+        sure = self._accept(tracked, found, templates.source[track])
+        templates.misses[track[sure]] = 0
+        templates.misses[track[~sure]] += 1
+
+        # By the observation before, which then becomes the template.
+        lost = tracked[~sure]
+        fresh = np.empty(0, dtype=np.int64)
+        if self.last_image is not None:
+            lost = lost[self.tracks.frame[lost - 1] == self.last_frame]
+            track = self.track[lost]
+            found = _match(
+                self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
+            )
+            sure = self._accept(lost, found, lost - 1)
+            fresh = lost[sure]
+            self.variance[lost[~sure]] += _REFUSED_SIGMA**2
+
+        given_up = tracked[templates.misses[self.track[tracked]] > _MAX_MISSES]
+        renewed = np.concatenate([seen[self.is_first[seen]], np.union1d(fresh, given_up)])
+        renewed = renewed[~self.is_last[renewed]]
+        templates.drop(self.track[seen[self.is_last[seen]]])
+        templates.take(image, self.track[renewed], self.xy[renewed])
+        templates.source[self.track[renewed]] = renewed
+        self.last_image, self.last_frame = image, frame
+
+    def _follow(self, later: NDArray[np.int64]) -> None:
+        """Carry observations on from those before by the bitstream's steps."""
+        limits = np.array([self.tracks.width, self.tracks.height], np.float32)
+        self.xy[later] = np.clip(self.xy[later - 1] + self.step[later], 0, limits)
+        self.variance[later] = self.variance[later - 1] + self.step_variance[later]
+
+    def _accept(
+        self,
+        observations: NDArray[np.int64],
+        found: _Matches,
+        source: NDArray[np.int64],
+    ) -> NDArray[np.bool_]:
+        """Take over the matches that are good enough; tells which are.
+
+        Args:
+            observations: int64 [n].
+            found: their matches.
+            source: int64 [n] the observations whose pictures were looked for.
+        """
+        track = self.track[observations]
+        contrast = self.templates.contrast[track]
+        tolerance = _GREY_TOLERANCE + self.options.refine_difference * contrast
+        sure = found.ok & (found.difference <= tolerance)
+        taken = observations[sure]
+        noise = found.difference[sure] * self.templates.softness[track[sure]]
+        self.xy[taken] = found.position[sure]
+        since = self.bitstream_variance[taken] - self.bitstream_variance[source[sure]]
+        self.variance[taken] = self.variance[source[sure]] + _match_variance(noise, since)
+        self.confirmed[taken] = True
+        self.source[taken] = source[sure]
+        self.noise[taken] = noise
+        return sure
+
+
+@dataclass
+class _Templates:
+    """The pictures around one earlier observation of each live track, as tiles of one picture.
+
+    One picture lets Lucas-Kanade look for all tracks at once, whichever frames their templates
+    are from.
+    """
+
+    tile: int  # width of a tile in pixels
+    columns: int
+    atlas: NDArray[np.uint8]
+    free: NDArray[np.int64]  # slots, the last to be given out first
+    num_free: int
+    slot: NDArray[np.int64]  # of each track, -1: none
+    point: NDArray[np.float32]  # of each track in the atlas, first pixel's centre (0, 0)
+    source: NDArray[np.int64]  # observation of each track that its template shows
+    contrast: NDArray[np.float32]  # mean absolute deviation, in grey levels
+    softness: NDArray[np.float32]  # pixels of matching error for a grey level of noise
+    misses: NDArray[np.int32]  # frames without a confirmation
+
+    @classmethod
+    def empty(cls, tracks: Tracks, options: RefineOptions, capacity: int) -> _Templates:
+        tile = options.refine_window + 2 * _MARGIN
+        columns = max(1, tracks.width // tile)
+        height = max(tracks.height, tile * math.ceil(max(capacity, 1) / columns))
+        num_tracks = len(tracks.offsets) - 1
+        return cls(
+            tile=tile,
+            columns=columns,
+            atlas=np.zeros((height, max(tracks.width, tile)), dtype=np.uint8),
+            free=np.arange(capacity)[::-1].copy(),
+            num_free=capacity,
+            slot=np.full(num_tracks, -1),
+            point=np.zeros((num_tracks, 2), dtype=np.float32),
+            source=np.full(num_tracks, -1),
+            contrast=np.zeros(num_tracks, dtype=np.float32),
+            softness=np.zeros(num_tracks, dtype=np.float32),
+            misses=np.zeros(num_tracks, dtype=np.int32),
+        )
+
+    def canvas(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The picture, enlarged to the atlas's size: Lucas-Kanade wants two of one size."""
+        bottom = self.atlas.shape[0] - image.shape[0]
+        right = self.atlas.shape[1] - image.shape[1]
+        framed = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        return np.asarray(framed, dtype=np.uint8)
+
+    def drop(self, track: NDArray[np.int64]) -> None:
+        """Let go of the tracks' templates."""
+        track = track[self.slot[track] >= 0]
+        self.free[self.num_free : self.num_free + len(track)] = self.slot[track]
+        self.num_free += len(track)
+        self.slot[track] = -1
+
+    def take(
+        self,
+        image: NDArray[np.uint8],
+        track: NDArray[np.int64],
+        xy: NDArray[np.float32],
+    ) -> None:
+        """Make the picture around positions the tracks' templates, where there is texture."""
+        self.drop(track)
+        half = self.tile // 2
+        corner = np.floor(xy).astype(np.int64) - half
+        last = np.array(image.shape[::-1]) - self.tile
+        softness, contrast = _texture(image, self.tile - 2 * _MARGIN)
+        centre = np.clip(corner + half, 0, np.array(image.shape[::-1]) - 1)
+        soft = softness[centre[:, 1], centre[:, 0]]
+        usable = ((corner >= 0) & (corner <= last)).all(axis=1) & (soft <= _MAX_SOFTNESS)
+        track, xy, corner, centre = track[usable], xy[usable], corner[usable], centre[usable]
+        self.num_free -= len(track)
+        slot = self.free[self.num_free : self.num_free + len(track)]
+        left = self.tile * (slot % self.columns)
+        top = self.tile * (slot // self.columns)
+        offset = np.arange(self.tile)
+        self.atlas[(top[:, None] + offset)[:, :, None], (left[:, None] + offset)[:, None, :]] = (
+            image[(corner[:, 1:] + offset)[:, :, None], (corner[:, :1] + offset)[:, None, :]]
+        )
+        self.slot[track] = slot
+        self.point[track] = np.stack([left, top], axis=1) + (xy - corner) - 0.5
+        self.softness[track] = softness[centre[:, 1], centre[:, 0]]
+        self.contrast[track] = contrast[centre[:, 1], centre[:, 0]]
+        self.misses[track] = 0
+
+
+def _texture(
+    image: NDArray[np.uint8], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What the window around every pixel holds for matching.
+
+    Returns:
+        float32 [height, width] standard deviation in pixels of a match in the worst direction
+        where every pixel has a noise of one grey level, and mean deviation in grey levels.
+    """
+    grey = image.astype(np.float32)
+    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    size = (window, window)
+    xx, xy, yy = (
+        cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)
+        for product in (dx * dx, dx * dy, dy * dy)
+    )
+    smallest = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy * xy))
+    softness = 1 / np.sqrt(np.maximum(smallest, 1e-6))
+    mean = cv2.boxFilter(grey, cv2.CV_32F, size)
+    contrast = cv2.boxFilter(np.abs(grey - mean), cv2.CV_32F, size)
+    return np.asarray(softness, np.float32), np.asarray(contrast, np.float32)
+
+
+@dataclass(frozen=True)
+class _Matches:
+    ok: NDArray[np.bool_]
+    position: NDArray[np.float32]  # [n, 2], corner origin
+    difference: NDArray[np.float32]  # [n] mean absolute difference, in grey levels
+
+
+def _match(
+    source: NDArray[np.uint8],
+    target: NDArray[np.uint8],
+    point: NDArray[np.float32],
+    expected: NDArray[np.float32],
+    options: RefineOptions,
+) -> _Matches:
+    """Look for what `source` shows at some points near expected positions in `target`.
+
+    Args:
+        source: picture with the points.
+        target: picture of the same size.
+        point: float32 [n, 2] in source, first pixel's centre (0, 0).
+        expected: float32 [n, 2] in target, corner origin.
+        options: how.
+    """
+    if len(point) == 0:
+        none = np.empty(0, np.float32)
+        return _Matches(none.astype(np.bool_), none.reshape(0, 2), none)
+    how: dict[str, Any] = {
+        "winSize": (options.refine_window, options.refine_window),
+        "maxLevel": 0,
+        "criteria": _CRITERIA,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "minEigThreshold": 1e-6,
+    }
+    start = expected - np.float32(0.5)
+    found, seen, difference = cv2.calcOpticalFlowPyrLK(source, target, point, start.copy(), **how)
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(target, source, found, point.copy(), **how)
+    ok = (seen.ravel() == 1) & (seen_back.ravel() == 1)
+    ok &= np.abs(back - point).max(axis=1) <= _MAX_RETURN
+    ok &= np.abs(found - start).max(axis=1) <= options.refine_move
+    ok &= ((found >= 0) & (found < target.shape[::-1])).all(axis=1)
+    return _Matches(ok, found + np.float32(0.5), np.where(ok, difference.ravel(), np.inf))
+
+
+def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected variance in px^2 of matches.
+
+    Args:
+        noise: error in pixels that the difference of the windows would make if it were noise.
+        prior: variance in px^2 of the bitstream's motion over the same frames.
+    """
+    exponent = _MATCH_CONSTANT + _MATCH_NOISE * np.log(0.02 + noise)
+    exponent += _MATCH_PRIOR * np.log(0.01 + np.maximum(prior, 0.0))
+    return np.asarray(np.exp(exponent), np.float64)
+
+
+def _check_options(options: RefineOptions) -> None:
+    if options.refine not in ("none", "lk"):
+        raise OptionError(f"refine is {options.refine!r}: give 'none' or 'lk'")
+    if not 5 <= options.refine_window <= _LARGEST_WINDOW or options.refine_window % 2 == 0:
+        raise OptionError(
+            f"refine_window is {options.refine_window}: give an odd number from 5 to "
+            f"{_LARGEST_WINDOW}"
+        )
+    for name in ("refine_move", "refine_difference"):
+        value = getattr(options, name)
+        if not 0 < value < math.inf:
+            raise OptionError(f"{name} is {value}: give more than 0")

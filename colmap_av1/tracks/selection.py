@@ -1,0 +1,159 @@
+"""Which tracks are used: few and sure ones for poses, more for maps, all for dense clouds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import OptionError
+from colmap_av1.options import DensityOptions
+from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
+
+# Error in pixels that an observation has however sure its motion is; keeps one sure
+# observation from outweighing many good ones.
+_SIGMA_FLOOR = 0.3
+# What an observation tells of the cameras is its motion beside its error: one that moved far may
+# be less sure, up to this share of the way.
+_MAX_ERROR_SHARE = 1 / 30
+# An observation is wide that moved at least this share of what those that moved farthest did.
+_WIDE = 0.8
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """The limits in force; 0 is none."""
+
+    max_tracks_per_image: int
+    spacing: float
+    min_length: int
+    max_sigma: float
+    wide_tracks: int
+
+
+# max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
+# as errors grow from step to step.
+_PRESETS = {
+    # Poses need views from far apart; points do not, and long tracks take a mapper's time.
+    "sparse": _Limits(1500, spacing=12.0, min_length=3, max_sigma=0.8, wide_tracks=1000),
+    "default": _Limits(2500, spacing=9.0, min_length=3, max_sigma=0.8, wide_tracks=300),
+    "dense": _Limits(0, spacing=0.0, min_length=1, max_sigma=0.0, wide_tracks=0),
+}
+
+
+def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
+    """Choose tracks that are long, sure and spread over every image.
+
+    Observations less sure than `max_sigma`, against the first one of their track, are left out
+    but for those of wide views: of each image, so many as `wide_tracks` that moved nearly as far
+    from there as any of its do, the surest beside their way, and all that are as sure; where the
+    error is a thirtieth of the way or less. Then tracks are taken best
+    first, the weight of an observation being its inverse expected variance. One is used where at
+    least half of its observations lie in images that are not full, and there in cells, `spacing`
+    wide, that no better track lies in; it loses the observations in full images.
+
+    Args:
+        tracks: tracks of the whole video.
+        options: how many to use; the defaults of DensityOptions if None.
+
+    Returns:
+        The chosen tracks in their former order, each with `min_length` observations or more.
+        The same object where nothing is left out.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+    """
+    options = options if options is not None else DensityOptions()
+    limits = _limits(options)
+    if limits.min_length <= 1 and not (
+        limits.max_sigma or limits.spacing or limits.max_tracks_per_image
+    ):
+        return tracks
+    variance = _variance_since_first(tracks)
+    if limits.max_sigma > 0:
+        max_variance = limits.max_sigma**2
+        if options.max_sigma is None:
+            max_variance *= _frames_between_images(tracks)
+        way = _way_since_first(tracks)
+        share = _error_shares(tracks, np.sqrt(variance), way, limits.wide_tracks)
+        # In place, here and below: these arrays are the largest of a whole run.
+        way *= share[tracks.frame]
+        way *= way
+        sure = variance <= np.maximum(np.float32(max_variance), way, out=way)
+        del way
+        tracks, variance = keep_observations(tracks, sure), variance[sure]
+    variance += _SIGMA_FLOOR**2
+    weight = np.reciprocal(variance, out=variance)
+    score = np.add.reduceat(weight, tracks.offsets[:-1])
+    kept = _core.select_spread(
+        num_frames=tracks.num_frames,
+        offsets=tracks.offsets,
+        frame=tracks.frame,
+        xy=tracks.xy,
+        order=np.argsort(-score, kind="stable"),
+        spacing=limits.spacing,
+        max_tracks_per_image=limits.max_tracks_per_image,
+        min_length=limits.min_length,
+    )
+    return keep_observations(tracks, kept.view(np.bool_))
+
+
+def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
+    """Variance of each observation against the first of its track that is left, in px^2."""
+    variance = tracks.sigma * tracks.sigma
+    variance -= np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
+    np.maximum(variance, 0, out=variance)
+    return variance
+
+
+def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
+    """Distance of each observation to the first of its track that is left, in px."""
+    squared = np.zeros(len(tracks.xy), dtype=np.float32)
+    for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
+        step = np.repeat(along[tracks.offsets[:-1]], np.diff(tracks.offsets))
+        np.subtract(along, step, out=step)
+        squared += np.multiply(step, step, out=step)
+    np.sqrt(squared, out=squared)
+    return squared
+
+
+def _error_shares(
+    tracks: Tracks, error: NDArray[np.float32], way: NDArray[np.float32], wide_tracks: int
+) -> NDArray[np.float32]:
+    """Error allowed in each frame as a share of the way, [num_frames]: what its wide views need."""
+    if wide_tracks == 0:
+        return np.zeros(tracks.num_frames, dtype=np.float32)
+    shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)
+    usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * way)
+    usable = usable[order_by_frame(tracks.frame[usable], tracks.num_frames)]
+    bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))
+    for frame, (start, stop) in enumerate(pairwise(bounds)):
+        own = usable[start:stop]
+        if len(own) <= wide_tracks:
+            continue
+        farthest = np.partition(way[own], -wide_tracks)[-wide_tracks]
+        wide = own[(way[own] >= _WIDE * farthest) & (way[own] > 0)]
+        if len(wide) > wide_tracks:
+            share = error[wide] / way[wide]
+            shares[frame] = np.partition(share, wide_tracks - 1)[wide_tracks - 1]
+    return shares
+
+
+def _frames_between_images(tracks: Tracks) -> float:
+    frames = np.flatnonzero(np.bincount(tracks.frame))
+    return float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
+
+
+def _limits(options: DensityOptions) -> _Limits:
+    if options.preset not in _PRESETS:
+        raise OptionError(f"preset is {options.preset!r}: give 'sparse', 'default' or 'dense'")
+    names = [field.name for field in fields(_Limits)]
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    for name, value in given.items():
+        if not 0 <= value < math.inf:
+            raise OptionError(f"{name} is {value}: give 0 (no limit) or more")
+    return replace(_PRESETS[options.preset], **given)

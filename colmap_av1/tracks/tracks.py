@@ -1,0 +1,276 @@
+"""Tracks: chains of block displacements through the frames of a video."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.options import TrackOptions
+from colmap_av1.video.display import Display, shown_points, shown_size
+
+# Width in pixels of the squares that motion is coded for.
+_UNIT = 4
+_MIN_LENGTH = 4
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Point tracks through a whole video, in compressed sparse row form.
+
+    Track t has the observations offsets[t] : offsets[t + 1], sorted by frame.
+
+    Attributes:
+        num_frames: number of shown frames of the video.
+        width: picture width in pixels, after super-resolution.
+        height: picture height in pixels.
+        offsets: int64 [num_tracks + 1].
+        frame: int32 [num_observations] display index of the observing frame.
+        xy: float32 [num_observations, 2] position in pixels, (x right, y down), origin at
+            the top-left corner of the image: the first pixel's centre is (0.5, 0.5).
+        sigma: float32 [num_observations] expected standard deviation of the position along
+            either axis, in pixels, against the track's first observation.
+        confirmed: bool [num_observations] whether decoded pixels confirmed the position;
+            without refinement none is.
+    """
+
+    num_frames: int
+    width: int
+    height: int
+    offsets: NDArray[np.int64]
+    frame: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    confirmed: NDArray[np.bool_]
+
+
+def build_tracks(
+    motion: Iterable[FrameMotion],
+    options: TrackOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Tracks:
+    """Chain the motion of a video into point tracks.
+
+    The motion of a block holds for each of its 4x4 units. A unit carries on the track
+    found where its displacement lands in the referenced frame, to the sub-pixel place
+    that moves exactly onto it, and a track moves with its unit into a reference shown
+    later. Where two tracks want one cell, a unit unless `options.cell` cuts it into parts, the
+    longer goes on. Frames are chained in display order
+    and links to the nearest frame come first, so a frame that was coded far ahead is reached by
+    the short steps between; frames that are never shown are chained through last. A unit without
+    motion of its own moves as those on either side of it do, where these agree. A unit without a
+    track starts one at its centre. No cell holds two tracks, no frame sees a track twice. Frames
+    are consumed one by one; beyond a few frames of motion, memory grows with the observations
+    only.
+
+    Args:
+        motion: the coded frames of one video, in bitstream order.
+        options: how to chain; the defaults of TrackOptions if None.
+        progress: called after each coded frame with the number of frames so far.
+
+    Returns:
+        Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their seeds
+        (display order of the frame, then raster order). Where frames differ in size,
+        positions are in pixels of the first shown frame's size.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+        VideoError: no frame is shown.
+        ValueError: the frames are not in bitstream order, or their arrays contradict
+            each other.
+    """
+    options = options if options is not None else TrackOptions()
+    _check_options(options)
+    cell = options.cell or _UNIT
+    builder = _core.TrackBuilder(
+        min_length=least_length(options),
+        cosine=-2.0 if options.cosine is None else options.cosine,
+        cosine_relative_to_dominant=options.cosine_relative_to == "dominant",
+        cosine_scale=options.cosine_scale,
+        max_interval=_or_off(options.max_interval),
+        max_block_area=_or_off(options.max_block_area),
+        max_uncoded_block_area=_or_off(options.max_uncoded_block_area),
+        smoothness=_or_off(options.smoothness),
+        border=_or_off(options.border),
+        interpolation=_or_off(options.interpolation),
+        bridge=_or_off(options.bridge),
+        cells=_UNIT // cell,
+        seeding=options.seeding // cell,
+    )
+    for count, frame in enumerate(motion, start=1):
+        builder.add(
+            decode_index=frame.decode_index,
+            display_index=frame.display_index,
+            show_frame=bool(frame.header["show_frame"]),
+            width=frame.width,
+            height=frame.height,
+            coded_width=int(frame.header["frame_width"]),
+            ref_decode_index=frame.ref_decode_index,
+            ref_display_index=frame.ref_display_index,
+            slot_decode_index=frame.slot_decode_index,
+            mv=frame.mv,
+            ref_frame=frame.ref_frame,
+            is_inter=frame.is_inter,
+            use_intrabc=frame.use_intrabc,
+            motion_mode=frame.motion_mode,
+            interintra=frame.interintra,
+            mi_size=frame.mi_size,
+            skip=frame.skip,
+            warp_index=frame.warp_index,
+            local_warp_params=frame.local_warp_params,
+            gm_type=frame.header["gm_type"],
+            gm_params=frame.header["gm_params"],
+            y_mode=frame.y_mode,
+            ref_size=frame.ref_size,
+            force_integer_mv=bool(frame.header["force_integer_mv"]),
+        )
+        if progress is not None:
+            progress(count)
+    num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
+    if num_frames == 0:
+        raise VideoError("the video shows no frame: give a video with at least one picture")
+    confirmed = np.zeros(len(frame_index), dtype=np.bool_)
+    return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
+
+
+def show_tracks(
+    tracks: Tracks, display: Display, presented: NDArray[np.int32] | None = None
+) -> Tracks:
+    """The tracks in the pictures that players show, in place of those that are stored.
+
+    Args:
+        tracks: tracks through all shown frames of a bitstream.
+        display: how its pictures are cut and turned.
+        presented: indices of the frames that players show, ascending; None: all.
+
+    Returns:
+        The observations within what is shown; frames are numbered anew where some are left out.
+    """
+    size = shown_size((tracks.width, tracks.height), display)
+    xy = shown_points(tracks.xy, (tracks.width, tracks.height), display)
+    shown = replace(tracks, width=size[0], height=size[1], xy=xy)
+    # By columns: NumPy's loops over rows of two take several times as long, here and below.
+    x, y = xy[:, 0], xy[:, 1]
+    kept = (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
+    if presented is not None:
+        presented = presented[presented < tracks.num_frames]
+        number = np.full(tracks.num_frames, -1, dtype=np.int32)
+        number[presented] = np.arange(len(presented), dtype=np.int32)
+        shown = replace(shown, num_frames=len(presented), frame=number[tracks.frame])
+        kept &= shown.frame >= 0
+    return keep_observations(shown, kept)
+
+
+def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
+    """The tracks with some of their observations only.
+
+    Args:
+        tracks: any tracks.
+        kept: bool [num_observations].
+
+    Returns:
+        Tracks in their former order, without those that keep nothing.
+    """
+    if kept.all():
+        return tracks
+    so_far = np.zeros(len(kept) + 1, dtype=np.min_scalar_type(len(kept)))
+    np.cumsum(kept, out=so_far[1:])
+    lengths = np.diff(so_far[tracks.offsets].astype(np.int64))
+    return replace(
+        tracks,
+        offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),
+        frame=tracks.frame[kept],
+        xy=_rows(tracks.xy, kept),
+        sigma=tracks.sigma[kept],
+        confirmed=tracks.confirmed[kept],
+    )
+
+
+def _rows(xy: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Some rows of a [n, 2] array: as numbers of eight bytes, which takes no indices."""
+    rows = np.ascontiguousarray(xy).view(np.uint64)[:, 0]
+    return rows[kept].view(np.float32).reshape(-1, 2)
+
+
+def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
+    """The tracks with the observations in these frames only, as `keep_observations`."""
+    wanted = np.zeros(tracks.num_frames, dtype=np.bool_)
+    wanted[frames] = True
+    return keep_observations(tracks, wanted[tracks.frame])
+
+
+def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
+    """The tracks that are seen in `min_length` frames or more, in their former order."""
+    lengths = np.diff(tracks.offsets)
+    return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
+
+
+def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
+    """Indices of observations by their frames, those of a frame in their former order."""
+    # A type of two bytes is sorted by radix, in a quarter of the time.
+    return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")
+
+
+def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
+    """The tracks in pictures that are scaled to another (width, height) in pixels."""
+    if size == (tracks.width, tracks.height):
+        return tracks
+    factor = np.array([size[0] / tracks.width, size[1] / tracks.height])
+    return replace(
+        tracks,
+        width=size[0],
+        height=size[1],
+        xy=(tracks.xy * factor).astype(np.float32),
+        sigma=(tracks.sigma * math.sqrt(float(factor.prod()))).astype(np.float32),
+    )
+
+
+def least_length(options: TrackOptions) -> int:
+    """Shown frames that a track is seen in at least."""
+    return _MIN_LENGTH if options.min_length is None else options.min_length
+
+
+_Limit = TypeVar("_Limit", int, float)
+
+
+def _or_off(limit: _Limit | None) -> _Limit | int:
+    """The core's spelling of a limit that is switched off."""
+    return -1 if limit is None else limit
+
+
+def _check_options(options: TrackOptions) -> None:
+    if options.min_length is not None and options.min_length < 1:
+        raise OptionError(f"min_length is {options.min_length}: give 1 or more")
+    widths = (1, 2, _UNIT)
+    if options.cell not in (None, *widths) or options.seeding not in widths:
+        raise OptionError(
+            f"cell is {options.cell}, seeding {options.seeding}: give widths of 1, 2 or 4 pixels"
+        )
+    if options.seeding < (options.cell or _UNIT):
+        raise OptionError(
+            f"seeding is {options.seeding}, below cell {options.cell or _UNIT}: squares that "
+            "tracks start in cannot be smaller than those that hold one, give a smaller --cell"
+        )
+    if options.cosine is not None and not -1.0 <= options.cosine <= 1.0:
+        raise OptionError(f"cosine is {options.cosine}: give a value from -1 to 1, or None")
+    if options.cosine_relative_to not in ("dominant", "none"):
+        raise OptionError(
+            f"cosine_relative_to is {options.cosine_relative_to!r}: give 'dominant' or 'none'"
+        )
+    if not (0.0 <= options.cosine_scale < math.inf):
+        raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
+    limits = (
+        *("max_interval", "max_block_area", "max_uncoded_block_area"),
+        *("smoothness", "border", "interpolation", "bridge"),
+    )
+    for name in limits:
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise OptionError(f"{name} is {value}: give 0 or more, or None")

@@ -1,0 +1,231 @@
+"""From a video to its tracks: the AV1 stream found or made, its motion chained and refined."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import BitstreamError, ImageError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.info import Structure, inspect
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.overlays import remove_overlays
+from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.video.container import is_av1, open_stream
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.display import Display
+from colmap_av1.video.encode import stream_of
+from colmap_av1.video.facts import frame_times, presented_frames, read_display
+
+_Image = NDArray[np.uint8]
+
+# Of the tracks; fewer over the picture are left out without a word.
+_NOTABLE_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class VideoSource:
+    """Where the motion and the pictures of a video come from.
+
+    Attributes:
+        stream: the AV1 file whose motion is read.
+        pictures: the file whose pictures become images.
+        display: how players show the stream's pictures.
+        presented: indices of the stream's frames that players show, where they hide some.
+        num_packets: number of packets of the stream; None where unknown.
+    """
+
+    stream: Path
+    pictures: Path
+    display: Display
+    presented: NDArray[np.int32] | None
+    num_packets: int | None
+
+
+@dataclass(frozen=True)
+class TrackedVideo:
+    """The tracks of a video, and what was noticed while they were made.
+
+    Attributes:
+        tracks: tracks through all shown frames.
+        num_coded_frames: frames with block data, hidden ones included.
+        warnings: what the user should know, such as damage of the stream.
+    """
+
+    tracks: Tracks
+    num_coded_frames: int
+    warnings: tuple[str, ...]
+
+
+def open_source(
+    video: Path, options: MatchOptions, *, clock: Clock, progress: Progress
+) -> VideoSource:
+    """Find the AV1 stream of a video, or make it: its motion is read, not its pictures.
+
+    Args:
+        video: a video of any codec.
+        options: those of encoding and reading are used.
+        clock: gets the stage "encoding" where a stream is made.
+        progress: told about the stage "encoding".
+
+    Raises:
+        VideoError: the file is missing or no video that can be read.
+        EncodeError: no AV1 encoder works, or the stream cannot be written.
+        OptionError: an option has a value that cannot work.
+    """
+    stream = video
+    if not is_av1(video) or (options.reencode and inspect(video, options.read).reasons):
+        with clock.measure("encoding"):
+            encoded = stream_of(
+                video,
+                strict=options.read.strict,
+                options=options.encode,
+                keep_stream=options.keep_stream,
+                progress=progress,
+            )
+        stream = encoded.output
+    with open_stream(stream) as opened:
+        num_packets = opened.num_frames
+    # A stream made of a video holds the frames that its edit list hides, too.
+    return VideoSource(stream, video, read_display(stream), presented_frames(video), num_packets)
+
+
+def track_video(
+    source: VideoSource,
+    options: MatchOptions,
+    *,
+    one_size: bool,
+    clock: Clock,
+    progress: Progress,
+) -> TrackedVideo:
+    """Chain the motion of a video into tracks as it is read, and refine them.
+
+    Args:
+        source: the video.
+        options: those of reading, chaining and refinement are used.
+        one_size: refuse shown frames of several sizes, as refinement does.
+        clock: gets the stages "motion" and "tracks", with refinement "decoding" and
+            "refinement".
+        progress: told about the stages "motion" and "refinement".
+
+    Raises:
+        VideoError: the video shows no frame.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: the frames change their size and must not.
+    """
+    motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
+    if one_size or options.refine.refine != "none":
+        motion = _of_one_size(motion)
+    structure = Structure()
+    motion = _counted(clock.iterate("motion", motion), structure)
+
+    def count(done: int) -> None:
+        progress("motion", done, source.num_packets)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with clock.measure("tracks"):
+            tracks = build_tracks(motion, options.tracks, count)
+            num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
+            tracks = remove_overlays(tracks)
+            share_over_picture = 1 - len(tracks.offsets) / num_tracks
+            tracks = show_tracks(tracks, source.display, source.presented)
+        # Reading happened inside the chaining.
+        clock.seconds["tracks"] -= clock.seconds["motion"]
+        if options.refine.refine != "none":
+            with clock.measure("refinement"):
+                pictures = clock.iterate(
+                    "decoding", decodable_frames(source.pictures, tracks.num_frames, options)
+                )
+                tracks = refine_tracks(
+                    tracks,
+                    pictures,
+                    options.refine,
+                    lambda done: progress("refinement", done, tracks.num_frames),
+                )
+            clock.seconds["refinement"] -= clock.seconds["decoding"]
+    notes = [str(w.message) for w in caught]
+    if share_over_picture >= _NOTABLE_SHARE:
+        notes.append(
+            f"{share_over_picture:.0%} of the tracks stand still while the picture moves, as "
+            "logos and dashboards do: they are left out"
+        )
+    # Of the whole file, so a rate that is found low is even lower.
+    bits = 8 * source.stream.stat().st_size
+    reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
+    if reasons and source.stream == source.pictures:
+        notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
+    return TrackedVideo(tracks, structure.num_coded, tuple(notes))
+
+
+def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
+    """Times of the frames that players show; None where they are unknown."""
+    times = frame_times(source.stream)
+    if times is not None and source.presented is not None:
+        times = times[source.presented[source.presented < len(times)]]
+    return None if times is None or len(times) < num_frames else times[:num_frames]
+
+
+def decoded_pictures(source: VideoSource, options: MatchOptions) -> Iterator[tuple[int, _Image]]:
+    """Index and picture (BGR) of every shown frame."""
+    return decode_frames(
+        source.pictures,
+        operating_point=options.read.operating_point,
+        num_threads=options.verify.num_threads,
+    )
+
+
+def decodable_frames(
+    video: Path, num_frames: int, options: MatchOptions, display: Display | None = None
+) -> Iterator[tuple[int, _Image]]:
+    """The pictures of the frames that have tracks; those before a damage, with a warning."""
+    decoded = decode_frames(
+        video,
+        operating_point=options.read.operating_point,
+        num_threads=options.verify.num_threads,
+        display=display,
+    )
+    count = 0
+    try:
+        for index, image in decoded:
+            if index < num_frames:
+                yield index, image
+                count += 1
+            if index + 1 >= num_frames:  # what is damaged beyond does no harm
+                return
+    except BitstreamError as error:
+        if options.read.strict:
+            raise
+        warnings.warn(f"{error}; tracks are refined in {count} frames only", stacklevel=2)
+    finally:
+        decoded.close()
+
+
+def _counted(motion: Iterable[FrameMotion], structure: Structure) -> Iterator[FrameMotion]:
+    """The same frames; counts them."""
+    for frame in motion:
+        structure.add(frame)
+        yield frame
+
+
+def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
+    """The same frames; refuses shown frames of several sizes, which share no camera."""
+    size: tuple[int, int] | None = None
+    for frame in motion:
+        if frame.display_index >= 0:
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                raise ImageError(
+                    f"the video changes its size from {size[0]}x{size[1]} to "
+                    f"{frame.width}x{frame.height}, so its frames cannot be images of one camera: "
+                    "leave out the image folder and --refine, or re-encode the video at one size"
+                )
+        yield frame

@@ -1,0 +1,1 @@
+"""The video file: container, pictures, how players show it, conversion to AV1."""

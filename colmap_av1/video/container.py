@@ -1,0 +1,316 @@
+"""Packets of an AV1 video; FFmpeg (through PyAV) demuxes."""
+
+from __future__ import annotations
+
+import io
+import os
+import shlex
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import av
+import av.error
+import av.logging
+from av.stream import Disposition
+
+from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+
+# Edit lists drop or hide samples, but a later frame may reference them: read them all.
+_CONTAINER_OPTIONS = {"ignore_editlist": "1"}
+_IVF_FRAME_HEADER_SIZE = 12
+_IVF_RATE_OFFSET = 16  # rate and scale, 32 bits each
+_IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
+_AV1C_HEADER_SIZE = 4
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One unit of the container, usually a temporal unit.
+
+    Attributes:
+        data: OBUs in low-overhead format (AV1 specification, section 5), whatever the
+            container; the last one may lack its obu_size. A view of the demuxer's memory.
+        pts: presentation time in seconds; None where the container gives none.
+        index: number of the packet in the stream, from 0.
+    """
+
+    data: memoryview
+    pts: float | None
+    index: int
+
+
+class VideoStream:
+    """The AV1 stream of an open video file; a context manager that closes it.
+
+    Attributes:
+        path: the file.
+        container: FFmpeg's name of the container format.
+        codec: always "av1".
+        width: picture width in pixels as the container says, unrotated.
+        height: picture height likewise.
+        frame_rate: average frames per second; None where unknown.
+        duration: length in seconds; None where unknown.
+        num_frames: number of packets as the container says; None where it does not.
+        configuration: OBUs that precede the first packet: the configOBUs of the container's
+            av1C box, empty where the stream carries its sequence header itself.
+    """
+
+    def __init__(self, video: str | os.PathLike[str]) -> None:
+        self.path = Path(video)
+        self._opened = ExitStack()
+        self._container = self._opened.enter_context(open_container(self.path))
+        try:
+            self._stream = _find_av1_stream(self._container, self.path)
+            context = self._stream.codec_context
+            self.container: str = self._container.format.name
+            self.codec = "av1"
+            self.width: int = context.width
+            self.height: int = context.height
+            rate = self._stream.average_rate or self._stream.guessed_rate
+            self._is_timed = not _is_ivf_without_rate(self.path)
+            self.frame_rate = float(rate) if rate and self._is_timed else None
+            self.duration = (
+                _stream_duration(self._container, self._stream) if self._is_timed else None
+            )
+            self.num_frames = self._stream.frames or self._estimate_num_frames()
+            self.configuration = _configuration_obus(context.extradata)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> VideoStream:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._opened.close()
+
+    def packets(self) -> Iterator[Packet]:
+        """Read the packets in bitstream order. Works once per opened stream.
+
+        Raises:
+            BitstreamError: the file is damaged or cut off; every packet before the damage
+                has been given.
+            VideoError: there is no packet at all.
+        """
+        index = 0
+        last: Any = None
+        demuxed = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(demuxed, None)
+            except (av.error.FFmpegError, OSError) as error:
+                raise BitstreamError(
+                    f"{self.path}: damaged after packet {index}: {reason_of(error)}"
+                ) from error
+            if packet is None:
+                break
+            if packet.size == 0:  # PyAV's end-of-stream marker
+                continue
+            if packet.is_corrupt:
+                raise BitstreamError(f"{self.path}: cut off inside packet {index + 1}")
+            is_timed = self._is_timed and packet.pts is not None
+            pts = float(packet.pts * packet.time_base) if is_timed else None
+            last = packet
+            yield Packet(memoryview(packet).toreadonly(), pts, index)
+            index += 1
+        damage = self._missing_end(index, last)
+        if damage:
+            raise BitstreamError(f"{self.path}: {damage}")
+        if index == 0:
+            raise VideoError(f"{self.path}: holds no frame: give a video with pictures")
+
+    def _estimate_num_frames(self) -> int | None:
+        if self.duration is None or self.frame_rate is None:
+            return None
+        return round(self.duration * self.frame_rate) or None
+
+    def _missing_end(self, count: int, last: Any) -> str | None:
+        """What shows that the file is cut off, where demuxers end as if it were whole."""
+        if 0 < count < self._stream.frames and "mp4" in self.container:
+            return f"cut off: {count} of {self._stream.frames} packets are there"
+        if count == 0:
+            # Tables that point nowhere, or a cut inside the first packet.
+            if self._stream.frames or (self.duration and "matroska" in self.container):
+                return "damaged or cut off before the end of the first packet"
+            return None
+        size = self._container.size
+        if last.pos is not None and last.pos >= 0 and size > 0:
+            end = last.pos + last.size
+            if self.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
+                return f"cut off after packet {count}"
+            if self.container == "obu" and end != size:
+                return f"cut off after packet {count}"
+        if "matroska" in self.container and self.duration and last.pts is not None:
+            step = 1 / self.frame_rate if self.frame_rate else 0.0
+            length = float((last.duration or 0) * last.time_base)
+            end_time = float(last.pts * last.time_base) + max(length, step)
+            if end_time + 1.5 * step < self.duration:
+                return f"cut off: {end_time:.2f} of {self.duration:.2f} seconds are there"
+        return None
+
+
+def open_stream(video: str | os.PathLike[str]) -> VideoStream:
+    """Open the AV1 stream of a video file.
+
+    Reads every container FFmpeg demuxes, among them MP4, Matroska, WebM, IVF and bare OBU
+    files (Section 5 and Annex B).
+
+    Raises:
+        NotAv1Error: the video is coded otherwise; the message says how to convert it.
+        VideoError: the file is missing, empty, not a video, or holds no video stream.
+    """
+    return VideoStream(video)
+
+
+def packets(video: str | os.PathLike[str]) -> Iterator[Packet]:
+    """Read the packets of a video file: `VideoStream.packets` of a file opened for it."""
+    with open_stream(video) as stream:
+        yield from stream.packets()
+
+
+def is_av1(video: str | os.PathLike[str]) -> bool:
+    """Whether a video has an AV1 stream.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    path = Path(video)
+    with open_container(path) as container:
+        return _codec_name(find_video_stream(container, path)) == "av1"
+
+
+class _IvfWithRate(io.FileIO):
+    """An IVF file read as if its header gave a frame rate; FFmpeg refuses one that is 0."""
+
+    def readinto(self, buffer: Any) -> int:
+        start = self.tell()
+        count = super().readinto(buffer) or 0
+        view = memoryview(buffer).cast("B")
+        for i, byte in enumerate(_IVF_ONE_TO_ONE, start=_IVF_RATE_OFFSET - start):
+            if 0 <= i < count:
+                view[i] = byte
+        return count
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is None or size < 0:
+            size = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        buffer = bytearray(size)
+        return bytes(buffer[: self.readinto(buffer)])
+
+
+def _is_ivf_without_rate(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        header = file.read(_IVF_RATE_OFFSET + len(_IVF_ONE_TO_ONE))
+    rate = header[_IVF_RATE_OFFSET:]
+    return header.startswith(b"DKIF") and b"\0" * 4 in (rate[:4], rate[4:])
+
+
+@contextmanager
+def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
+    """Open a file of any container, with words for what can go wrong."""
+    file: _IvfWithRate | None = None
+    try:
+        if not path.exists():
+            raise VideoError(f"{path}: no such file: give the path of a video")
+        if path.is_dir():
+            raise VideoError(f"{path}: is a folder: give a video file")
+        if path.is_file() and path.stat().st_size == 0:
+            raise VideoError(f"{path}: is an empty file: give the path of a video")
+        if _is_ivf_without_rate(path):
+            file = _IvfWithRate(path)
+        # An absolute path: FFmpeg would take 'name:...' for a protocol.
+        container = av.open(
+            file or os.path.abspath(path),
+            container_options={} if apply_edits else _CONTAINER_OPTIONS,
+        )
+    except (PermissionError, av.error.FFmpegError, OSError, ValueError) as error:
+        if file is not None:
+            file.close()
+        if isinstance(error, PermissionError):
+            raise VideoError(
+                f"{path}: no permission to read it: change that, or give another"
+            ) from error
+        raise VideoError(
+            f"{path}: not a video, or damaged before its first frame ({reason_of(error)}): give "
+            "another"
+        ) from error
+    try:
+        yield container
+    finally:
+        container.close()
+        if file is not None:
+            file.close()
+
+
+def _find_av1_stream(container: Any, path: Path) -> Any:
+    stream = find_video_stream(container, path)
+    if _codec_name(stream) == "av1":
+        return stream
+    target = path.with_name(f"{path.stem}_av1.mp4").name
+    raise NotAv1Error(
+        f"{path}: is {_codec_name(stream)}, not AV1; convert it: colmap-av1 encode --video "
+        f"{shlex.quote(str(path))} --output {shlex.quote(target)}"
+    )
+
+
+def find_video_stream(container: Any, path: Path) -> Any:
+    """The AV1 stream, in a file without one the first that is no cover picture."""
+    streams = container.streams.video
+    if not streams:
+        kinds = sorted({stream.type for stream in container.streams})
+        found = f"only {', '.join(kinds)}" if kinds else "nothing"
+        raise VideoError(f"{path}: holds no video stream, {found}: give a video")
+    moving = [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
+    return next((s for s in moving if _codec_name(s) == "av1"), moving[0])
+
+
+def _codec_name(stream: Any) -> str:
+    if stream.codec_context is None:  # no decoder for it
+        return "of an unknown codec"
+    return str(stream.codec_context.codec.canonical_name)
+
+
+def _configuration_obus(extradata: bytes | None) -> bytes:
+    """The configOBUs of an av1C box (AV1 in ISOBMFF, section 2.3), or bare OBUs as they are."""
+    if not extradata:
+        return b""
+    if extradata[0] == 0x81:  # marker and version; no OBU header starts so
+        return bytes(extradata[_AV1C_HEADER_SIZE:])
+    return bytes(extradata)
+
+
+def _stream_duration(container: Any, stream: Any) -> float | None:
+    if stream.duration is not None and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    tag = stream.metadata.get("DURATION")  # Matroska, as muxers write it: 00:00:01.234
+    if tag:
+        try:
+            hours, minutes, seconds = tag.split(":")
+            return float(hours) * 3600 + float(minutes) * 60 + float(seconds)
+        except ValueError:
+            pass
+    if container.duration is not None and len(container.streams) == 1:
+        return float(Fraction(container.duration, av.time_base))
+    return None
+
+
+def reason_of(error: BaseException) -> str:
+    """FFmpeg's words for an error, without its number and the file's name."""
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(reason).split())

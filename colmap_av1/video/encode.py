@@ -1,0 +1,349 @@
+"""Conversion of any video to an AV1 stream whose motion is worth reading; ffmpeg does it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import av.error
+
+from colmap_av1.errors import (
+    BitstreamError,
+    EncodeError,
+    NotAv1Error,
+    OptionError,
+    VideoError,
+    cannot_write,
+)
+from colmap_av1.options import EncodeOptions
+from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.processes import bound
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.video.container import open_stream
+from colmap_av1.video.encoders import (
+    ENCODERS,
+    KEY_FRAME_DISTANCE,
+    TALK,
+    find_encoder,
+    reason_of,
+    settings,
+)
+from colmap_av1.video.facts import VideoFacts, video_facts
+from colmap_av1.video.stored_frames import count_frames
+from colmap_av1.video.unchanged import unchanged
+
+_FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
+# Marks a stream with what it was made of and with, so that it is not taken for another.
+_MARK = "colmap-av1"
+# These hold the mark.
+_KEPT_FORMATS = (".mp4", ".mkv", ".webm")
+_NEW_SIZE = re.compile(r"Reconfiguring filter graph.* changed to .*, (\d+)x(\d+)")
+
+
+@dataclass(frozen=True)
+class EncodeReport:
+    """A conversion.
+
+    Attributes:
+        output: the AV1 stream.
+        encoder: ffmpeg's name of the encoder.
+        num_frames: frames of the stream, as many as the video has.
+        reused: the stream was there already.
+    """
+
+    output: Path
+    encoder: str
+    num_frames: int
+    reused: bool = False
+
+
+def encode(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    strict: bool = False,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+) -> EncodeReport:
+    """Convert a video to AV1 with backward references only, and one intra frame.
+
+    Every frame of the video becomes one of the stream, none is dropped or doubled, and time
+    stamps are kept. Pictures are turned as players turn them; sound is left out. The stream
+    appears under its name only when whole. Of a damaged video the frames before the damage are
+    converted, with a warning.
+
+    Args:
+        video: a video that ffmpeg decodes.
+        output: the stream; its extension .mp4, .mkv, .webm or .ivf says the container.
+        overwrite: replace an output that exists.
+        strict: refuse a damaged video.
+        options: which encoder and how.
+        progress: called with the stage "encoding", the frames done, and of how many where known.
+
+    Raises:
+        VideoError: the video is missing or cannot be decoded.
+        BitstreamError: the video is damaged, and must not be.
+        EncodeError: no encoder works, or the output cannot be written.
+        OptionError: an option has a value that cannot work, or the output exists.
+    """
+    options = options if options is not None else EncodeOptions()
+    progress = progress if progress is not None else no_progress
+    video, output = Path(video), Path(output)
+    if output.suffix.lower() not in _FORMATS:
+        raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
+    if output.exists():
+        if video.exists() and output.samefile(video):
+            raise OptionError(f"{output}: is the video itself: give another output")
+        if not overwrite:
+            raise OptionError(f"{output}: exists: give another output, or --overwrite")
+    if not output.parent.is_dir():
+        raise EncodeError(f"{output}: the folder does not exist: make it first")
+    if not os.access(output.parent, os.W_OK | os.X_OK):
+        raise EncodeError(f"{output.parent}: no permission to write there: give another output")
+    remove_leftovers(output.parent, output.name)
+    facts = video_facts(video)
+    name, ffmpeg = find_encoder(options)
+    encoder = ENCODERS[name]
+    quality, speed = settings(encoder, options)
+    before = [ffmpeg, *TALK, "-nostdin", "-y", *encoder.before_input]
+    if "mov" in facts.container:
+        # Frames that an edit list hides are frames all the same, and good ones.
+        before += ["-ignore_editlist", "1"]
+    how = [
+        *("-i", f"file:{video}", "-map", f"0:{facts.index}", "-vf", encoder.upload),
+        *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
+        *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
+        *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
+    ]
+    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(video)}
+
+    def convert(partial: Path, num_frames: int | None = None) -> int:
+        total = num_frames or facts.num_packets
+        progress("encoding", 0, total)
+        command = [*before, *how]
+        if num_frames is not None:
+            command += ["-frames:v", str(num_frames)]
+        words = _mark(mark if num_frames is None else {**mark, "readable": num_frames})
+        command += ["-metadata", f"comment={words}", f"file:{partial}"]
+        count = _run(command, video, facts.size, lambda done: progress("encoding", done, total))
+        if count == 0:
+            raise VideoError(
+                f"{video}: no frame can be decoded, it is damaged: give another copy of it"
+            )
+        _check_stream(partial, count)
+        return count
+
+    try:
+        with whole_file(output) as partial, unchanged(video):
+            count = convert(partial)
+            readable = _readable_frames(video, facts, count, strict)
+            if readable < count:
+                count = convert(partial, readable)
+    except OSError as error:
+        raise EncodeError(cannot_write(output, error)) from error
+    return EncodeReport(output, encoder.ffmpeg_name, count)
+
+
+def stream_of(
+    video: str | os.PathLike[str],
+    *,
+    strict: bool = False,
+    options: EncodeOptions | None = None,
+    keep_stream: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> EncodeReport:
+    """The AV1 stream of a video that is not AV1: the one kept from before, or a new one.
+
+    It is kept beside the video, as 'phone.av1.mp4' for 'phone.mov', or where `keep_stream`
+    says, and used again while it is newer than the video, whole, and made of a file of the
+    video's size with the settings that `options` ask for.
+
+    Args:
+        video: a video that ffmpeg decodes.
+        strict: refuse a damaged video.
+        options: which encoder and how.
+        keep_stream: where the stream is kept; its extension says the container.
+        progress: as in `encode`.
+
+    Raises:
+        VideoError: the video is missing or cannot be decoded.
+        BitstreamError: the video is damaged, and must not be.
+        EncodeError: no encoder works, or the stream cannot be written.
+        OptionError: an option has a value that cannot work, or `keep_stream` names a file
+            that is no kept stream.
+    """
+    options = options if options is not None else EncodeOptions()
+    video = Path(video)
+    output = Path(keep_stream) if keep_stream is not None else video.with_suffix(".av1.mp4")
+    if output.suffix.lower() not in _KEPT_FORMATS:
+        raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
+    facts = video_facts(video)
+    if output.exists():
+        mark = _mark_of(output)
+        if mark is None:
+            raise OptionError(
+                f"{output}: exists and is no stream that was kept of {video.name}: give another "
+                "--keep_stream, or remove it"
+            )
+        if _fits(mark, video, options) and output.stat().st_mtime_ns >= video.stat().st_mtime_ns:
+            kept = _count_packets(output)
+            readable = int(mark.get("readable", 0))
+            if kept and not (strict and readable):
+                if readable:
+                    _warn_of_damage(video, readable, facts, f"{output} was made of what is before")
+                return EncodeReport(output, ENCODERS[mark["encoder"]].ffmpeg_name, kept, True)
+    if not os.access(output.resolve().parent, os.W_OK | os.X_OK):
+        raise EncodeError(
+            f"{output.resolve().parent}: the AV1 stream of {video.name} cannot be written there: "
+            "say where with --keep_stream"
+        )
+    return encode(video, output, overwrite=True, strict=strict, options=options, progress=progress)
+
+
+def _run(
+    command: Sequence[str], video: Path, size: tuple[int, int], report: Callable[[int], None]
+) -> int:
+    """Run ffmpeg on a video of a size and return the number of frames it wrote."""
+    count = dropped = doubled = 0
+    with tempfile.TemporaryFile() as words, _process(command, words) as process:
+        for line in process.stdout or ():
+            key, _, value = line.strip().partition("=")
+            if key == "frame":
+                count = int(value)
+                report(count)
+            elif key == "drop_frames":
+                dropped = int(value)
+            elif key == "dup_frames":
+                doubled = int(value)
+        status = process.wait()
+        words.seek(0)
+        said = words.read().decode(errors="replace")
+    if status != 0:
+        reason = reason_of(said)
+        if "No space left" in said:
+            raise EncodeError(
+                f"{video}: the disk is full: free some space, or say where the stream goes"
+            )
+        if count == 0 and ("Invalid data" in said or "does not contain any stream" in said):
+            raise VideoError(f"{video}: cannot be decoded: {reason}: give another copy of it")
+        raise EncodeError(
+            f"{video}: the encoder failed after {count} frames ({reason}): try another --encoder"
+        )
+    sizes = {(int(width), int(height)) for width, height in _NEW_SIZE.findall(said)} - {size}
+    if sizes:
+        raise VideoError(
+            f"{video}: its pictures change their size from {size[0]}x{size[1]} to "
+            f"{' and '.join(f'{w}x{h}' for w, h in sorted(sizes))}: convert it to one size first"
+        )
+    if dropped or doubled:
+        raise EncodeError(
+            f"{video}: ffmpeg dropped {dropped} and doubled {doubled} frames, so frames of the "
+            "stream would not be those of the video: convert it with another program first"
+        )
+    return count
+
+
+@contextmanager
+def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen[str]]:
+    """A running ffmpeg that does not outlive what waits for it."""
+    process = subprocess.Popen(
+        bound(command),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=words,  # type: ignore[call-overload]
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _readable_frames(video: Path, facts: VideoFacts, count: int, strict: bool) -> int:
+    """How many frames are the same to ffmpeg, which wrote `count`, and to who reads pictures.
+
+    ffmpeg goes on after damage, and the frames it leaves out shift those that follow.
+    """
+    if count == facts.num_packets:
+        return count
+    readable, damage = count_frames(video)
+    if damage is None and readable == count:
+        return count
+    if damage is None or readable > count:
+        raise EncodeError(
+            f"{video}: ffmpeg decodes {count} frames of it, PyAV {readable}: frames of the stream "
+            "would not be those of the video: convert it with another program first"
+        )
+    if readable == 0:
+        raise VideoError(f"{video}: no frame can be decoded: {damage}: give another copy of it")
+    if strict:
+        raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
+    _warn_of_damage(video, readable, facts, damage)
+    return readable
+
+
+def _warn_of_damage(video: Path, readable: int, facts: VideoFacts, reason: str) -> None:
+    warnings.warn(
+        f"{video}: damaged after {readable} of {facts.num_packets} frames, which are used: "
+        f"{reason}",
+        stacklevel=3,
+    )
+
+
+def _check_stream(stream: Path, count: int) -> None:
+    """Refuse a stream that has not as many frames as ffmpeg says it wrote."""
+    found = _count_packets(stream)
+    if found != count:
+        raise EncodeError(f"the encoder wrote {found} of {count} frames: give another --encoder")
+
+
+def _count_packets(stream: Path) -> int:
+    """Frames of a stream that was made here; 0 where it is damaged or no AV1."""
+    try:
+        with open_stream(stream) as opened:
+            return sum(1 for _ in opened.packets())
+    except (VideoError, NotAv1Error, BitstreamError):
+        return 0
+
+
+def _size(video: Path) -> int:
+    return video.stat().st_size
+
+
+def _mark(facts: Mapping[str, object]) -> str:
+    return " ".join([_MARK, *(f"{key}={value}" for key, value in facts.items())])
+
+
+def _mark_of(stream: Path) -> dict[str, str] | None:
+    """What a kept stream was made with; None where it is none."""
+    try:
+        with av.open(os.path.abspath(stream)) as opened:
+            tags = {key.lower(): value for key, value in opened.metadata.items()}
+    except (av.error.FFmpegError, OSError, ValueError):
+        return None
+    name, *words = tags.get("comment", "").split(" ")
+    if name != _MARK:
+        return None
+    return dict(word.split("=", 1) for word in words)
+
+
+def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
+    """Whether a kept stream was made of the video with what is asked for now."""
+    if mark.get("encoder") not in ENCODERS or mark.get("source") != str(_size(video)):
+        return False
+    encoder = None if options.encoder == "auto" else options.encoder
+    wanted = {"encoder": encoder, "quality": options.quality, "speed": options.speed}
+    return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)

@@ -1,0 +1,8 @@
+"""Pictures of what the package sees: motion and tracks over frames, matches, models."""
+
+from colmap_av1.view.matches import view_database
+from colmap_av1.view.model import serve_model, view_model
+from colmap_av1.view.pictures import write_picture
+from colmap_av1.view.video import view_video
+
+__all__ = ["serve_model", "view_database", "view_model", "view_video", "write_picture"]

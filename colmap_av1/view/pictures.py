@@ -1,0 +1,110 @@
+"""Pictures and videos that are drawn, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.util.files import remove_leftovers, whole_file
+
+Image = NDArray[np.uint8]
+# Set, because x264's output depends on their number.
+_ENCODER_THREADS = 4
+
+
+def write_picture(picture: Image, output: str | os.PathLike[str]) -> None:
+    """Write a picture as PNG or JPEG, by the extension; whole or not at all.
+
+    Raises:
+        OptionError: another extension, or the file cannot be written.
+    """
+    path = Path(output)
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise OptionError(f"{path}: give an output that ends in .png or .jpg")
+    _, encoded = cv2.imencode(path.suffix.lower(), picture)
+    with _output(path) as partial:
+        partial.write_bytes(encoded.tobytes())
+
+
+def side_by_side(panels: Sequence[Image]) -> Image:
+    """Pictures of one size beside each other, wide ones above each other."""
+    wide = panels[0].shape[1] > panels[0].shape[0]
+    return np.asarray(np.concatenate(panels, axis=0 if wide else 1), dtype=np.uint8)
+
+
+def bgr(
+    hue: NDArray[np.floating[Any]],
+    saturation: NDArray[np.floating[Any]],
+    value: NDArray[np.floating[Any]],
+) -> NDArray[np.uint8]:
+    """BGR colours [n, 3] of OpenCV's hue (0 to 180), saturation and value (0 to 255)."""
+    hsv = np.stack([hue, saturation, value], axis=-1).astype(np.uint8)
+    if len(hsv) == 0:  # OpenCV refuses empty arrays
+        return hsv
+    return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0], dtype=np.uint8)
+
+
+@contextmanager
+def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], None]]:
+    """Write pictures to an .mp4 file, or numbered to a folder."""
+    if path.suffix.lower() != ".mp4":
+        count = 0
+
+        def write_file(picture: Image) -> None:
+            nonlocal count
+            write_picture(picture, path / f"frame_{count:06d}.png")
+            count += 1
+
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OptionError(
+                f"{path}: cannot be made: {error.strerror}: mend that, or give another path"
+            ) from error
+        yield write_file
+        return
+    with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
+        rate = Fraction(frame_rate).limit_denominator(1001)
+        stream: Any = container.add_stream("libx264", rate, options={"crf": "18"})
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.thread_count = _ENCODER_THREADS
+        size: tuple[int, int] | None = None
+
+        def write_frame(picture: Image) -> None:
+            nonlocal size
+            # 4:2:0 has no odd sizes; a video has one size.
+            if size is None:
+                size = (picture.shape[1] + 1 & ~1, picture.shape[0] + 1 & ~1)
+                stream.width, stream.height = size
+            fitted = cv2.copyMakeBorder(
+                picture[: size[1], : size[0]],
+                *(0, max(0, size[1] - picture.shape[0]), 0, max(0, size[0] - picture.shape[1])),
+                cv2.BORDER_CONSTANT,
+            )
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(fitted, format="bgr24")))
+
+        yield write_frame
+        if size is not None:
+            container.mux(stream.encode(None))
+
+
+@contextmanager
+def _output(path: Path) -> Iterator[Path]:
+    """A `whole_file`, whose errors become ours."""
+    try:
+        remove_leftovers(path.parent, path.name)
+        with whole_file(path) as partial:
+            yield partial
+    except (OSError, av.error.FFmpegError) as error:
+        raise OptionError(cannot_write(path, error)) from error

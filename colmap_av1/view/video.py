@@ -1,0 +1,244 @@
+"""Motion and tracks, drawn over the frames of a video."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import OptionError
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
+from colmap_av1.tracks.tracks import Tracks, build_tracks, order_by_frame, show_tracks
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.video.container import open_stream
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.facts import presented_frames, read_display
+from colmap_av1.video.unchanged import unchanged
+from colmap_av1.view.pictures import Image, bgr, open_pictures, side_by_side
+
+# Tracks are one to a unit of 4x4 pixels at most.
+_UNIT = 4
+_GREY = 128
+# Quantile of the motion that is drawn in full colour: the few fastest would pale the rest.
+_FULL_COLOUR_QUANTILE = 0.95
+_DEFAULT_FRAME_RATE = 25.0
+# Fractional bits of the coordinates that OpenCV draws at.
+SHIFT = 4
+_WHEEL_SIZE = 48
+# Motion below this many pixels a frame is never drawn in full colour.
+_LEAST_FULL_SPEED = 0.25
+# Frames within which one track is drawn for each cell.
+_FRAMES_PER_CHOICE = 8
+# Frames after which a track is drawn in the colour of an old one.
+_OLD_AGE = 32
+
+
+def view_video(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    options: ViewOptions | None = None,
+    tracks: TrackOptions | None = None,
+    read: ReadOptions | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Draw motion and tracks over the frames of a video.
+
+    Motion: each 4x4 unit that a track runs through is coloured by the direction in which it
+    moves, deeper where it moves faster; the wheel in the corner is the key. Units whose motion
+    is not trusted, and so carries no track, are grey. Tracks: a dot where each is, and a tail to
+    where it was in the frames before, blue for a young track, red for an old one.
+
+    Args:
+        video: an AV1 video.
+        output: an .mp4 file, or a folder that gets a PNG for each frame.
+        options: what is drawn.
+        tracks: how the motion is chained.
+        read: how the bitstream is read.
+        progress: called with a stage's name, what is done, and of how much where known.
+
+    Returns:
+        The number of frames drawn.
+
+    Raises:
+        OptionError: an option has a value that cannot work, or the output cannot be written.
+        VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
+        BitstreamError: the stream is damaged before its second frame, or with strict.
+    """
+    options = options if options is not None else ViewOptions()
+    _check_view_options(options)
+    report = progress if progress is not None else no_progress
+    path, operating_point = Path(output), read.operating_point if read is not None else 0
+    count = 0
+    with unchanged(Path(video)) as check_video:
+        with open_stream(video) as stream:
+            num_packets = stream.num_frames
+            frame_rate = stream.frame_rate or _DEFAULT_FRAME_RATE
+        if path.suffix and path.suffix.lower() != ".mp4" and not path.is_dir():
+            raise OptionError(
+                f"{path}: give an output that ends in .mp4, or a folder for PNG files"
+            )
+        chained = build_tracks(
+            read_motion(video, read), tracks, lambda done: report("tracks", done, num_packets)
+        )
+        chained = show_tracks(chained, read_display(video), presented_frames(video))
+        drawing = _prepare(chained, options)
+        draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
+        check_video()
+        with open_pictures(path, frame_rate) as write:
+            for index, picture in decode_frames(video, operating_point=operating_point):
+                if index >= chained.num_frames:
+                    break
+                write(side_by_side([panel(picture, drawing, index) for panel in draw]))
+                count += 1
+                report("pictures", count, chained.num_frames)
+            check_video()
+    return count
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Tracks as they are drawn.
+
+    Attributes:
+        tracks: all of them.
+        options: what is drawn.
+        by_frame: int64 [num_observations] observations sorted by frame.
+        bounds: int64 [num_frames + 1] bounds of the frames in `by_frame`.
+        age: int64 [num_observations] observations of the track before this one.
+        velocity: float32 [num_observations, 2] pixels per frame, from the observation before;
+            at a track's start to the next.
+        full_speed: pixels per frame that are drawn in full colour.
+        has_tail: bool [num_observations] of a track that is drawn as such.
+    """
+
+    tracks: Tracks
+    options: ViewOptions
+    by_frame: NDArray[np.int64]
+    bounds: NDArray[np.int64]
+    age: NDArray[np.int64]
+    velocity: NDArray[np.float32]
+    full_speed: float
+    has_tail: NDArray[np.bool_]
+
+    def seen_in(self, frame: int) -> NDArray[np.int64]:
+        """The observations in a frame."""
+        return self.by_frame[self.bounds[frame] : self.bounds[frame + 1]]
+
+
+def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
+    length = np.diff(tracks.offsets)
+    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
+    step = np.diff(tracks.xy, axis=0, prepend=tracks.xy[:1])
+    interval = np.diff(tracks.frame, prepend=tracks.frame[:1])
+    starts = tracks.offsets[:-1][length > 1]
+    step[starts], interval[starts] = step[starts + 1], interval[starts + 1]
+    velocity = (step / np.maximum(interval, 1)[:, None]).astype(np.float32)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    full_speed = float(np.quantile(speed, _FULL_COLOUR_QUANTILE)) if speed.size else 0.0
+    return _Drawing(
+        tracks=tracks,
+        options=options,
+        by_frame=by_frame,
+        bounds=np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1)),
+        age=np.arange(tracks.frame.size) - np.repeat(tracks.offsets[:-1], length),
+        velocity=velocity,
+        full_speed=max(full_speed, _LEAST_FULL_SPEED),
+        has_tail=np.repeat(_is_spread(tracks, options.spacing), length),
+    )
+
+
+def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
+    """Choose long tracks that start in different cells of `spacing` pixels: bool [num_tracks].
+
+    Of the tracks that start in a cell within as many frames as tails are long, the longest.
+    """
+    length = np.diff(tracks.offsets)
+    start = tracks.offsets[:-1]
+    cell = np.floor(tracks.xy[start] / max(spacing, 1)).astype(np.int64)
+    time = tracks.frame[start] // _FRAMES_PER_CHOICE
+    key = np.lexsort((-length, cell[:, 0], cell[:, 1], time))
+    place = np.column_stack([time, cell])[key]
+    first = np.ones(len(key), dtype=bool)
+    first[1:] = np.any(place[1:] != place[:-1], axis=1)
+    chosen = np.zeros(len(key), dtype=bool)
+    chosen[key[first]] = True
+    return chosen
+
+
+def _draw_motion(picture: Image, drawing: _Drawing, frame: int) -> Image:
+    """Colour every unit that a track runs through by the direction of its motion."""
+    height, width = picture.shape[:2]
+    rows, cols = -(-height // _UNIT), -(-width // _UNIT)
+    seen = drawing.seen_in(frame)
+    unit = np.floor(drawing.tracks.xy[seen] / _UNIT).astype(np.int64)
+    colours = np.full((rows, cols, 3), _GREY, dtype=np.uint8)
+    row, col = np.clip(unit[:, 1], 0, rows - 1), np.clip(unit[:, 0], 0, cols - 1)
+    colours[row, col] = _direction_colours(drawing.velocity[seen] / drawing.full_speed)
+    wheel = _direction_wheel(min(_WHEEL_SIZE, height // 4, width // 4))
+    overlay = colours.repeat(_UNIT, axis=0).repeat(_UNIT, axis=1)[:height, :width]
+    grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    opacity = drawing.options.opacity
+    drawn = np.asarray(cv2.addWeighted(grey, 1 - opacity, overlay, opacity, 0), dtype=np.uint8)
+    corner = drawn[: wheel.shape[0], : wheel.shape[1]]
+    corner[...] = np.where(wheel.any(axis=2, keepdims=True), wheel, corner)
+    return drawn
+
+
+def _draw_tracks(picture: Image, drawing: _Drawing, frame: int) -> Image:
+    """Draw a dot for each chosen track, and a tail to its places in the frames before."""
+    drawn = picture.copy()
+    seen = drawing.seen_in(frame)
+    seen = seen[drawing.has_tail[seen]]
+    tail = drawing.options.tail
+    shade = np.minimum(drawing.age[seen] * 255 // _OLD_AGE, 255).astype(np.uint8)
+    table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_TURBO))
+    steps = np.minimum(drawing.age[seen], tail)
+    points = fixed_point(drawing.tracks.xy)
+    for last, count, colour in zip(seen, steps, table[0, shade].tolist(), strict=True):
+        line = points[last - count : last + 1]
+        cv2.polylines(drawn, [line], False, colour, 1, cv2.LINE_AA, SHIFT)
+        cv2.circle(drawn, line[-1].tolist(), 1 << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+    return np.asarray(drawn)
+
+
+# What each value of ViewOptions.draw stands for; both for both.
+_NAMES = {_draw_motion: "motion", _draw_tracks: "tracks"}
+
+
+def fixed_point(xy: NDArray[np.float32]) -> NDArray[np.int32]:
+    """COLMAP's pixel coordinates as OpenCV draws them: pixel centres at whole numbers."""
+    return np.asarray(np.round((xy - 0.5) * (1 << SHIFT)), dtype=np.int32)
+
+
+def _direction_colours(velocity: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Colours [n, 3] of velocities [n, 2]: hue by direction, saturated at length 1."""
+    angle = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0])) % 360
+    saturation = 255 * np.minimum(np.hypot(velocity[:, 0], velocity[:, 1]), 1)
+    return bgr(angle / 2, saturation, np.full(len(angle), 255.0))
+
+
+def _direction_wheel(size: int) -> Image:
+    """The key to `_direction_colours`: [size, size, 3], black outside the wheel."""
+    y, x = np.mgrid[:size, :size]
+    offset = np.stack([x, y], axis=-1).reshape(-1, 2) * (2 / max(size - 1, 1)) - 1
+    colours = _direction_colours(offset)
+    colours[np.hypot(offset[:, 0], offset[:, 1]) > 1] = 0
+    return colours.reshape(size, size, 3)
+
+
+def _check_view_options(options: ViewOptions) -> None:
+    if options.draw not in ("motion", "tracks", "both"):
+        raise OptionError(f"draw is {options.draw!r}: give 'motion', 'tracks' or 'both'")
+    if not 0 <= options.opacity <= 1:
+        raise OptionError(f"opacity is {options.opacity}: give a share from 0 to 1")
+    if options.tail < 0:
+        raise OptionError(f"tail is {options.tail}: give 0 or more frames")
+    if options.spacing < 1:
+        raise OptionError(f"spacing is {options.spacing}: give 1 or more pixels")

@@ -1,0 +1,571 @@
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import PROJECT
+from half_way import kill, start_writing
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, alignment_error, make_scene, match_scene
+
+from colmap_av1.database.file import open_unaltered
+from colmap_av1.database.reading import (
+    MAX_NUM_IMAGES,
+    image_ids_from_pair_id,
+    pair_id_from_image_ids,
+    read_cameras,
+    read_images,
+)
+from colmap_av1.database.writing import write_matches
+from colmap_av1.errors import DatabaseError, OptionError
+from colmap_av1.images.camera import make_camera
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.verify import TwoViewConfig, TwoViewGeometry
+from colmap_av1.options import CameraOptions
+
+SCENE = make_scene()
+NAMES = [f"frame_{i:03d}.png" for i in range(SCENE.tracks.num_frames)]
+CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
+ROWS: dict[str, Any] = match_scene(SCENE, CAMERA)
+COLMAP = shutil.which("colmap")
+needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap command on PATH")
+
+
+def colmap(*arguments: object) -> None:
+    subprocess.run(
+        [str(COLMAP), *map(str, arguments)],
+        check=True,
+        capture_output=True,
+        env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+    )
+
+
+def query(database: Path, sql: str) -> list[tuple[Any, ...]]:
+    connection = sqlite3.connect(database)
+    try:
+        return connection.execute(sql).fetchall()
+    finally:
+        connection.close()
+
+
+def dump(database: Path) -> list[str]:
+    connection = sqlite3.connect(database)
+    try:
+        return list(connection.iterdump())
+    finally:
+        connection.close()
+
+
+def write_blank_images(folder: Path) -> Path:
+    folder.mkdir()
+    for name in NAMES:
+        cv2.imwrite(str(folder / name), np.full((HEIGHT, WIDTH), 128, np.uint8))
+    return folder
+
+
+def check_model(model: pycolmap.Reconstruction, min_images: int = len(NAMES)) -> None:
+    centers = {
+        image.name: image.projection_center() for image in model.images.values() if image.has_pose
+    }
+    assert len(centers) >= min_images
+    seen = sorted(centers)
+    truth = SCENE.center[[NAMES.index(name) for name in seen]]
+    assert alignment_error(np.array([centers[name] for name in seen]), truth) < 0.05
+    assert model.compute_mean_reprojection_error() < 0.6
+    assert model.num_points3D() > 800
+
+
+def check_maps(database: Path, folder: Path) -> None:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.random_seed = 0
+    models = pycolmap.incremental_mapping(database, folder, folder / "model", options)
+    check_model(max(models.values(), key=lambda m: m.num_reg_images()))
+
+
+def check_maps_with_command(database: Path, folder: Path) -> None:
+    (folder / "sparse").mkdir()
+    colmap(
+        "mapper",
+        *("--database_path", database, "--image_path", folder, "--output_path", folder / "sparse"),
+        *("--Mapper.extract_colors", 0),
+    )
+    models = [pycolmap.Reconstruction(path) for path in (folder / "sparse").iterdir()]
+    check_model(max(models, key=lambda m: m.num_reg_images()))
+
+
+def test_new_file_is_mapped(tmp_path: Path) -> None:
+    database = tmp_path / "new.db"
+    write_matches(database, NAMES, CAMERA, **ROWS)
+    assert [p.name for p in tmp_path.iterdir()] == ["new.db"]
+    check_maps(database, tmp_path)
+
+
+def test_new_file_is_mapped_globally(tmp_path: Path) -> None:
+    database = tmp_path / "new.db"
+    write_matches(database, NAMES, CAMERA, **ROWS)
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    models = pycolmap.global_mapping(database, tmp_path, tmp_path / "model", options)
+    check_model(max(models.values(), key=lambda m: m.num_reg_images()))
+
+
+@needs_colmap
+def test_new_file_is_mapped_by_the_command(tmp_path: Path) -> None:
+    write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+    check_maps_with_command(tmp_path / "new.db", tmp_path)
+
+
+@needs_colmap
+def test_new_file_has_the_layout_of_the_command(tmp_path: Path) -> None:
+    colmap("database_creator", "--database_path", tmp_path / "theirs.db")
+    write_matches(tmp_path / "ours.db", NAMES, CAMERA, **ROWS)
+    version = query(tmp_path / "theirs.db", "PRAGMA user_version")[0][0]
+    if version // 100 != 38:
+        pytest.skip(f"the colmap command is not 3.8 but {version}")
+    tables = [row[0] for row in query(tmp_path / "theirs.db", "SELECT name FROM sqlite_master")]
+    assert tables == [
+        row[0] for row in query(tmp_path / "ours.db", "SELECT name FROM sqlite_master")
+    ]
+    for sql in (
+        "PRAGMA user_version",
+        *(f"PRAGMA table_info({table})" for table in tables),
+        *(f"PRAGMA foreign_key_list({table})" for table in tables),
+    ):
+        assert query(tmp_path / "ours.db", sql) == query(tmp_path / "theirs.db", sql)
+
+
+def test_pycolmap_reads_what_was_written(tmp_path: Path) -> None:
+    write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+    with pycolmap.Database.open(tmp_path / "new.db") as database:
+        assert database.num_cameras() == 1
+        camera = database.read_camera(1)
+        assert camera.params.tolist() == CAMERA.params.tolist()
+        assert camera.has_prior_focal_length
+        for i, name in enumerate(NAMES):
+            image = database.read_image_with_name(name)
+            assert image.image_id == i + 1
+            keypoints = database.read_keypoints(image.image_id)
+            assert np.array_equal(np.asarray(keypoints)[:, :2], ROWS["keypoints"][i].xy)
+        for (i, j), matches, geometry in zip(
+            ROWS["pairs"], ROWS["matches"], ROWS["geometries"], strict=True
+        ):
+            assert np.array_equal(database.read_matches(i + 1, j + 1), matches)
+            stored = database.read_two_view_geometry(i + 1, j + 1)
+            assert int(stored.config) == geometry.config
+            assert np.array_equal(stored.inlier_matches, geometry.inlier_matches)
+            for model in ("E", "F", "H"):
+                given = getattr(geometry, model)
+                if given is None:
+                    assert getattr(stored, model) is None
+                else:
+                    assert np.array_equal(getattr(stored, model), given)
+            if geometry.tvec is not None:
+                pose = stored.cam2_from_cam1
+                assert np.allclose(pose.translation, geometry.tvec)
+                assert np.allclose(pose.rotation.quat, geometry.qvec[[1, 2, 3, 0]])
+
+
+def test_listed_images_keep_ids_that_do_not_follow_names(tmp_path: Path) -> None:
+    path = tmp_path / "listed.db"
+    with pycolmap.Database.open(path) as database:
+        camera_id = database.write_camera(CAMERA)
+        for name in reversed(NAMES):
+            database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+    before = query(path, "SELECT * FROM images")
+    write_matches(path, NAMES, None, **ROWS)
+    assert query(path, "SELECT * FROM images") == before
+    listed = {image.name: image for image in read_images(path)}
+    assert listed[NAMES[0]].image_id == len(NAMES)
+    assert listed[NAMES[0]].num_keypoints == len(ROWS["keypoints"][0].xy)
+    assert listed[NAMES[0]].num_matches == sum(
+        len(m) for m, (i, _) in zip(ROWS["matches"], ROWS["pairs"], strict=True) if i == 0
+    )
+    # COLMAP turns a geometry around when asked for it in the order of larger id first.
+    index = next(k for k, g in enumerate(ROWS["geometries"]) if g.qvec is not None)
+    i, j = ROWS["pairs"][index]
+    geometry = ROWS["geometries"][index]
+    with pycolmap.Database.open(path) as database:
+        a, b = listed[NAMES[i]].image_id, listed[NAMES[j]].image_id
+        assert a > b
+        stored = database.read_two_view_geometry(a, b)
+    assert np.array_equal(stored.inlier_matches, geometry.inlier_matches)
+    assert np.allclose(stored.E, geometry.E)
+    assert np.allclose(stored.H / np.linalg.norm(stored.H), geometry.H, atol=1e-6)
+    assert np.allclose(stored.cam2_from_cam1.translation, geometry.tvec)
+    assert np.allclose(stored.cam2_from_cam1.rotation.quat, geometry.qvec[[1, 2, 3, 0]])
+    check_maps(path, tmp_path)
+
+
+def test_imported_images_are_mapped(tmp_path: Path) -> None:
+    path = tmp_path / "imported.db"
+    images = write_blank_images(tmp_path / "images")
+    pycolmap.Database.open(path).close()
+    pycolmap.import_images(path, images, pycolmap.CameraMode.SINGLE)
+    assert len(read_images(path)) == len(NAMES)
+    rigs = query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")
+    write_matches(path, NAMES, None, **ROWS)
+    assert (query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")) == rigs
+    check_maps(path, tmp_path)
+
+
+def test_empty_database_of_pycolmap_is_mapped(tmp_path: Path) -> None:
+    path = tmp_path / "empty.db"
+    pycolmap.Database.open(path).close()
+    write_matches(path, NAMES, CAMERA, **ROWS)
+    assert query(path, "SELECT COUNT(*) FROM frames") == [(0,)]
+    check_maps(path, tmp_path)
+
+
+@pytest.mark.slow
+@needs_colmap
+def test_empty_rows_of_the_stock_matcher_are_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "stock.db"
+    images = write_blank_images(tmp_path / "images")
+    colmap(
+        "feature_extractor",
+        *("--database_path", path, "--image_path", images),
+        *("--ImageReader.single_camera", 1, "--SiftExtraction.use_gpu", 0),
+        *("--ImageReader.camera_params", CAMERA_PARAMS),
+    )
+    colmap("exhaustive_matcher", "--database_path", path, "--SiftMatching.use_gpu", 0)
+    assert query(path, "SELECT COUNT(*), MAX(rows) FROM matches")[0] == (120, 0)
+    assert {i.num_keypoints for i in read_images(path)} == {0}
+    write_matches(path, NAMES, None, **ROWS)
+    assert query(path, "SELECT COUNT(*) FROM matches") == [(120,)]
+    assert query(path, "PRAGMA user_version") == [(3800,)]
+    check_maps_with_command(path, tmp_path)
+
+
+def test_one_camera_for_each_image(tmp_path: Path) -> None:
+    cameras = [make_camera(CameraOptions(), WIDTH, HEIGHT + i) for i in range(len(NAMES))]
+    write_matches(tmp_path / "new.db", NAMES, cameras, **ROWS)
+    images = read_images(tmp_path / "new.db")
+    stored = read_cameras(tmp_path / "new.db")
+    assert [stored[image.camera_id].height for image in images] == [c.height for c in cameras]
+    assert [image.height for image in images] == [c.height for c in cameras]
+
+
+def test_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.db", "b.db"):
+        write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+    digests = {hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.iterdir()}
+    assert len(digests) == 1
+
+
+@given(st.integers(1, MAX_NUM_IMAGES - 1), st.integers(1, MAX_NUM_IMAGES - 1))
+def test_pair_ids(a: int, b: int) -> None:
+    pair_id = pair_id_from_image_ids(a, b)
+    assert image_ids_from_pair_id(pair_id) == (min(a, b), max(a, b))
+    assert pair_id == pycolmap.image_pair_to_pair_id(a, b)
+    assert pair_id < 2**63
+
+
+@given(st.permutations(range(4)), st.data())
+def test_matches_follow_the_smaller_id(order: list[int], data: st.DataObject) -> None:
+    pairs = np.array([[0, 1], [0, 3], [1, 2], [2, 3]], dtype=np.int32)
+    index = st.integers(0, 9)
+    matches = [
+        np.array(data.draw(st.lists(st.tuples(index, index), min_size=1)), dtype=np.uint32)
+        for _ in pairs
+    ]
+    F = np.arange(9.0).reshape(3, 3)
+    geometries = [TwoViewGeometry(TwoViewConfig.UNCALIBRATED, m[::2], F=F) for m in matches]
+    keypoints = [
+        ImageKeypoints(i, np.full((10, 2), i, np.float32), np.arange(10)) for i in range(4)
+    ]
+    names = [f"{i}.jpg" for i in range(4)]
+    # hypothesis runs many examples with one tmp_path.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "example.db"
+        write_matches(
+            path,
+            [names[i] for i in order],
+            CAMERA,
+            [ImageKeypoints(0, np.empty((0, 2), np.float32), np.empty(0))] * 4,
+            pairs=np.empty((0, 2), np.int32),
+            matches=[],
+            geometries=[],
+        )
+        write_matches(
+            path, names, None, keypoints, pairs=pairs, matches=matches, geometries=geometries
+        )
+        ids = {image.name: image.image_id for image in read_images(path)}
+        for (i, j), m in zip(pairs, matches, strict=True):
+            a, b = ids[names[i]], ids[names[j]]
+            pair_id = pair_id_from_image_ids(a, b)
+            expected = m if a < b else m[:, ::-1]
+            ((rows, blob),) = query(path, f"SELECT rows, data FROM matches WHERE pair_id={pair_id}")
+            assert np.array_equal(np.frombuffer(blob, np.uint32).reshape(rows, 2), expected)
+            ((blob, stored),) = query(
+                path, f"SELECT data, F FROM two_view_geometries WHERE pair_id={pair_id}"
+            )
+            assert np.array_equal(np.frombuffer(blob, np.uint32).reshape(-1, 2), expected[::2])
+            assert np.array_equal(np.frombuffer(stored).reshape(3, 3), F if a < b else F.T)
+
+
+def make_empty(path: Path) -> None:
+    """A database in COLMAP 3.8's layout that lists the images and nothing else."""
+    nothing = [ImageKeypoints(i, np.empty((0, 2), np.float32), np.empty(0)) for i in range(16)]
+    write_matches(
+        path,
+        NAMES,
+        CAMERA,
+        nothing,
+        pairs=np.empty((0, 2), np.int32),
+        matches=[],
+        geometries=[],
+    )
+
+
+def damage_text(path: Path) -> None:
+    path.write_text("not a database, but long enough to be taken for one\n" * 100)
+
+
+def other_database(path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE images (id INTEGER)")
+    connection.commit()
+    connection.close()
+
+
+def full_database(path: Path) -> None:
+    write_matches(path, NAMES, CAMERA, **ROWS)
+
+
+def other_images(path: Path) -> None:
+    write_matches(path, [f"x{name}" for name in NAMES], CAMERA, **ROWS)
+
+
+def rigs_without_images(path: Path) -> None:
+    pycolmap.Database.open(path).close()
+    connection = sqlite3.connect(path)
+    connection.execute("INSERT INTO rigs (ref_sensor_id, ref_sensor_type) VALUES (1, 0)")
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (damage_text, "not a COLMAP database"),
+        (other_database, "not a COLMAP database"),
+        (full_database, "already has keypoints of image 'frame_000.png'"),
+        (other_images, "lists 16 images, but not 'frame_000.png'"),
+        (rigs_without_images, "has rigs but no images"),
+        (Path.mkdir, "is a folder"),
+    ],
+)
+def test_refusals_change_nothing(
+    tmp_path: Path, prepare: Callable[[Path], None], message: str
+) -> None:
+    path = tmp_path / "given.db"
+    prepare(path)
+    before = path.read_bytes() if path.is_file() else None
+    with pytest.raises(DatabaseError, match=message) as caught:
+        write_matches(path, NAMES, CAMERA, **ROWS)
+    assert "\n" not in str(caught.value)
+    assert (path.read_bytes() if path.is_file() else None) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["given.db"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes and links of a Unix")
+def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
+    """A device as /dev/null is one for all: a file must not take its place."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "round").symlink_to("round")
+    for name, what in (("pipe", "is no plain file"), ("round", "is a link that leads nowhere")):
+        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+            write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+            open_unaltered(tmp_path / name)
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link").symlink_to("new.db")
+    write_matches(tmp_path / "link", NAMES, CAMERA, **ROWS)
+    assert (tmp_path / "link").is_symlink()
+    assert len(read_images(tmp_path / "new.db")) == len(NAMES)
+
+
+def test_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseError, match="folder does not exist"):
+        write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, **ROWS)
+
+
+def test_leftover_log_is_not_replayed_into_a_new_file(tmp_path: Path) -> None:
+    (tmp_path / "new.db-wal").write_bytes(b"old")
+    with pytest.raises(DatabaseError, match=r"new\.db-wal is left"):
+        write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+
+
+def test_matches_without_keypoints_are_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "given.db"
+    write_matches(path, NAMES, CAMERA, **ROWS)
+    connection = sqlite3.connect(path)
+    connection.execute("DELETE FROM keypoints")
+    connection.commit()
+    connection.close()
+    with pytest.raises(DatabaseError, match="already has matches of image"):
+        write_matches(path, NAMES, None, **ROWS)
+
+
+def test_absent_and_empty_files_list_nothing(tmp_path: Path) -> None:
+    assert read_images(tmp_path / "absent.db") == []
+    assert read_cameras(tmp_path / "absent.db") == {}
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty.db").touch()
+    assert read_images(tmp_path / "empty.db") == []
+    write_matches(tmp_path / "empty.db", NAMES, CAMERA, **ROWS)
+    assert len(read_images(tmp_path / "empty.db")) == len(NAMES)
+
+
+def test_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("colmap_av1.database.file._BUSY_TIMEOUT", 0.2)
+    path = tmp_path / "locked.db"
+    make_empty(path)
+    before = dump(path)
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(DatabaseError, match="in use by another process"):
+        write_matches(path, NAMES, None, **ROWS)
+    with pytest.raises(DatabaseError, match="in use by another process"):
+        read_images(path)
+    other.execute("ROLLBACK")
+    other.close()
+    assert dump(path) == before
+    write_matches(path, NAMES, None, **ROWS)
+
+
+class Interruption(BaseException):
+    """Stands for an interrupt from the keyboard."""
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_interruption_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> None:
+    path = tmp_path / "given.db"
+    if existing:
+        make_empty(path)
+    before = path.read_bytes() if existing else None
+
+    class Interrupting(list):  # type: ignore[type-arg]
+        def __getitem__(self, index: Any) -> Any:
+            if index == len(self) - 1:
+                raise Interruption
+            return super().__getitem__(index)
+
+    rows = {**ROWS, "geometries": Interrupting(ROWS["geometries"])}
+    with pytest.raises(Interruption):
+        write_matches(path, NAMES, CAMERA, **rows)
+    assert (path.read_bytes() if existing else None) == before
+    assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
+
+
+@pytest.mark.parametrize("journal", ["delete", "wal"])
+def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal: str) -> None:
+    path = tmp_path / "given.db"
+    make_empty(path)
+    query(path, f"PRAGMA journal_mode = {journal}")
+    before = dump(path)
+    kill(start_writing(path, "error", "test_database", "ROWS"))
+    assert dump(path) == before
+    write_matches(path, NAMES, None, **ROWS)
+    assert len(query(path, "SELECT * FROM matches")) == len(ROWS["pairs"])
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> None:
+    path = tmp_path / "given.db"
+    if existing:
+        make_empty(path)
+    before = path.read_bytes() if existing else None
+    script = """
+        import resource, signal, sys
+        sys.path.insert(0, sys.argv[2])
+        from test_database import CAMERA, NAMES, ROWS
+        from colmap_av1.database.writing import (write_matches)
+        from colmap_av1.errors import DatabaseError
+
+        # Writes beyond this size fail, as they do on a full disk.
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+        try:
+            write_matches(sys.argv[1], NAMES, CAMERA, **ROWS)
+        except DatabaseError as error:
+            print(error)
+    """
+    output = subprocess.check_output(
+        [sys.executable, "-c", textwrap.dedent(script), path, PROJECT / "tests"],
+        text=True,
+        cwd=tmp_path,  # else the checkout would hide the installed package
+    )
+    assert "disk" in output
+    assert output.count("\n") == 1
+    assert (path.read_bytes() if existing else None) == before
+    assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
+
+
+def test_default_camera_is_colmaps_guess() -> None:
+    camera = make_camera(CameraOptions(), 450, 800)
+    assert camera.model_name == "SIMPLE_RADIAL"
+    assert camera.params.tolist() == [960, 225, 400, 0]
+    assert not camera.has_prior_focal_length
+
+
+def test_told_focal_length_lets_two_parameters_be_found() -> None:
+    camera = make_camera(CameraOptions(), 450, 800, focal_length=500)
+    assert camera.model_name == "RADIAL"
+    assert camera.params.tolist() == [500, 225, 400, 0, 0]
+    assert camera.has_prior_focal_length
+    # Parameters alone are those of COLMAP's default model.
+    given = make_camera(CameraOptions(camera_params="480,225,400,0.1"), 450, 800, focal_length=500)
+    assert (given.model_name, given.params[0]) == ("SIMPLE_RADIAL", 480)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        name
+        for name in pycolmap.CameraModelId.__members__
+        if name not in ("INVALID", "EQUIRECTANGULAR")
+    ],
+)
+def test_every_model_survives_a_round_trip(tmp_path: Path, model: str) -> None:
+    guess = make_camera(CameraOptions(model), WIDTH, HEIGHT)
+    text = ",".join(str(p + 0.25) for p in guess.params)
+    camera = make_camera(CameraOptions(model, text), WIDTH, HEIGHT)
+    write_matches(tmp_path / "new.db", NAMES, camera, **ROWS)
+    stored = read_cameras(tmp_path / "new.db")[1]
+    assert stored.model_name == model
+    assert stored.params.tolist() == [p + 0.25 for p in guess.params]
+    assert stored.has_prior_focal_length
+    with pycolmap.Database.open(tmp_path / "new.db") as database:
+        assert database.read_camera(1).model_name == model
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (CameraOptions("PINHOL"), "unknown camera model 'PINHOL'"),
+        (CameraOptions("EQUIRECTANGULAR"), "no focal length"),
+        (CameraOptions("PINHOLE", "1,2,3"), "takes 4 numbers, fx, fy, cx, cy"),
+        (CameraOptions("PINHOLE", "1;2;3;4"), "cannot read"),
+        (CameraOptions("PINHOLE", "500,500,nan,240"), "do not fit"),
+        (CameraOptions("PINHOLE", "500,0,320,240"), "focal length of 0 or less"),
+    ],
+)
+def test_cameras_that_cannot_work(options: CameraOptions, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        make_camera(options, WIDTH, HEIGHT)

@@ -1,0 +1,279 @@
+"""Front-ends and mapper of the comparison, what they take, and what of it is kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import PROJECT
+
+from colmap_av1 import build_tracks, match, read_motion
+from colmap_av1.errors import DatabaseError, EvaluationError, OptionError, VideoError
+from colmap_av1.evaluate import (
+    MapperSettings,
+    database_tracks,
+    densify_model,
+    map_database,
+    model_figures,
+    model_poses,
+    pose_errors,
+    prepare_footage,
+    run_frontend,
+    run_measured,
+    track_statistics,
+)
+from colmap_av1.evaluate.resume import kept
+from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, TrackOptions
+
+EXAMPLES = PROJECT / "examples"
+
+
+# Run in processes of their own.
+
+
+def _work(megabytes, seconds):
+    block = np.ones(megabytes << 17)
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        block[0] += 1
+    print("worked")
+    return os.getpid()
+
+
+def _fail(error):
+    raise error
+
+
+def test_a_call_is_measured_in_its_own_process(tmp_path):
+    ballast = np.ones(300 << 17)  # must not count
+    small = run_measured(_work, 1, 0.3, log=tmp_path / "log")
+    large = run_measured(_work, 200, 0.3, log=tmp_path / "log")
+    assert small.result != os.getpid()
+    assert 0.28 <= small.cpu_seconds < 1.0
+    assert small.seconds >= 0.28
+    assert (tmp_path / "log").read_text() == "worked\nworked\n"
+    if small.peak_memory is not None:
+        assert 150 << 20 < large.peak_memory - small.peak_memory < 250 << 20
+        assert large.peak_memory < ballast.nbytes + (200 << 20)
+
+
+def test_a_failing_call_says_where_its_log_is(tmp_path):
+    log = tmp_path / "log"
+    with pytest.raises(VideoError, match=r"^no such video$"):
+        run_measured(_fail, VideoError("no such video"), log=log)
+    with pytest.raises(EvaluationError, match=rf"KeyError: 7: see {log}"):
+        run_measured(_fail, KeyError(7), log=log)
+    assert "Traceback" in log.read_text()
+    with pytest.raises(EvaluationError, match="its process ended with status 3"):
+        run_measured(os._exit, 3, log=log)
+
+
+def _start(path):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    path.write_text(str(child.pid))
+    child.wait()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
+def test_an_interrupt_ends_what_the_process_started(tmp_path):
+    path = tmp_path / "pid"
+
+    def interrupt():
+        while not (path.exists() and path.read_text()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    # What was started in the background of a shell ignores interrupts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_measured(_start, path, log=tmp_path / "log")
+    finally:
+        thread.join()
+        signal.signal(signal.SIGINT, before)
+    pid, end = int(path.read_text()), time.monotonic() + 10
+    while _is_alive(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not _is_alive(pid)
+
+
+def _is_alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # One that nobody waits for is a zombie.
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_results_are_kept_while_their_key_is_the_same(tmp_path):
+    folder = tmp_path / "kept"
+    calls = []
+
+    def work():
+        calls.append(list(folder.iterdir()))
+        (folder / "file").touch()
+        return {"call": len(calls)}
+
+    assert kept(folder, (1, "a"), work) == {"call": 1}
+    assert kept(folder, (1, "a"), work) == {"call": 1}
+    assert kept(folder, (1, "b"), work) == {"call": 2}
+    assert calls == [[], []]
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        kept(folder, "c", stop)
+    assert kept(folder, "c", work) == {"call": 3}
+
+
+def test_tracks_of_a_database_are_those_written(clip, tmp_path):
+    # Every pair of images is written, so nothing but verification takes tracks apart.
+    options = MatchOptions(
+        tracks=TrackOptions(min_length=3), density=DensityOptions(preset="dense")
+    )
+    match(tmp_path / "a.db", clip, options=options)
+    tracks = build_tracks(read_motion(clip), options.tracks)
+    before = (tmp_path / "a.db").read_bytes()
+    found = database_tracks(tmp_path / "a.db", 16)
+    assert (tmp_path / "a.db").read_bytes() == before
+    assert (found.num_frames, found.width, found.height) == (16, 192, 128)
+    assert found.offsets[0] == 0
+    assert np.diff(found.offsets).min() >= 2
+    assert found.offsets[-1] == len(found.frame) == len(found.xy)
+    written = {(f, *xy) for f, xy in zip(tracks.frame, tracks.xy.tolist(), strict=True)}
+    assert {(f, *xy) for f, xy in zip(found.frame, found.xy.tolist(), strict=True)} <= written
+    assert len(found.frame) > 0.7 * len(tracks.frame)
+    of = {}
+    for t in range(len(tracks.offsets) - 1):
+        for i in range(*tracks.offsets[t : t + 2]):
+            of[(tracks.frame[i], *tracks.xy[i].tolist())] = t
+    for start, end in zip(found.offsets[:-1], found.offsets[1:], strict=True):
+        frames = found.frame[start:end]
+        assert (np.diff(frames) > 0).all()
+        assert len({of[(found.frame[i], *found.xy[i].tolist())] for i in range(start, end)}) == 1
+
+
+def test_contradicting_matches_are_left_out(tmp_path):
+    # Keypoint 0 of image 1 is matched to 0 of image 2, that to 0 of image 3 and to 1 of image 4,
+    # and that of 3 to 0 of image 4: of image 4 nothing is sure.
+    path = tmp_path / "a.db"
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
+        camera_id = database.write_camera(camera)
+        for i in range(4):
+            image = pycolmap.Image(name=f"{i}.png", camera_id=camera_id)
+            image_id = database.write_image(image)
+            database.write_keypoints(image_id, np.float32([[i, 1], [i, 9]]))
+        for a, b, row in ((1, 2, [0, 0]), (2, 3, [0, 0]), (2, 4, [0, 1]), (3, 4, [0, 0])):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.uint32([row])
+            database.write_two_view_geometry(a, b, geometry)
+    tracks = database_tracks(path, 5)
+    assert tracks.offsets.tolist() == [0, 3]
+    assert tracks.frame.tolist() == [0, 1, 2]
+    assert tracks.xy.tolist() == [[0, 1], [1, 1], [2, 1]]
+
+    pycolmap.Database.open(tmp_path / "empty.db").close()
+    with pytest.raises(DatabaseError, match="0 sizes"):
+        database_tracks(tmp_path / "empty.db", 5)
+
+
+@pytest.fixture(scope="module")
+def scene_footage(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    camera = CameraOptions(camera_model="PINHOLE", camera_params="520,520,320,180")
+    return prepare_footage(
+        EXAMPLES / "scene.mp4", folder, num_frames=60, image_step=8, camera=camera
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["av1-dense", "sift-sequential"])
+def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
+    run = run_frontend(name, scene_footage, tmp_path / name)
+    again = run_frontend(name, scene_footage, tmp_path / name)
+    assert again == run  # to the last digit of its times: it was kept
+    assert run.cpu_seconds > 0.1
+    assert sum(run.seconds.values()) > 0.1
+    with pycolmap.Database.open(run.database) as database:
+        assert [i.name for i in database.read_all_images()] == scene_footage.names
+        assert database.num_cameras() == 1
+        (camera,) = database.read_all_cameras()
+    assert camera.params.tolist() == [520, 520, 320, 180]
+    statistics = track_statistics(database_tracks(run.database, 60), scene_footage.frames)
+    assert statistics.num_images == 8
+    assert statistics.num_tracks > 1000
+    assert statistics.coverage[0] > 0.5
+
+    settings = MapperSettings(fixed_intrinsics=True)
+    mapper = map_database(run.database, scene_footage.image_path, tmp_path / "model", settings)
+    assert (
+        map_database(run.database, scene_footage.image_path, tmp_path / "model", settings) == mapper
+    )
+    figures = model_figures(mapper.model)
+    assert figures.num_registered == 8
+    assert figures.num_points > 1000
+    assert figures.focal_length == 520
+    assert 0 < figures.median_error < figures.mean_error < 1
+    model = pycolmap.Reconstruction(mapper.model)
+    assert figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())
+    with np.load(EXAMPLES / "scene_truth.npz") as truth:
+        errors = pose_errors(model_poses(model, 60), truth["cam_from_world"])
+    assert errors.num_poses == 8
+    assert errors.ate < 0.01
+    assert errors.rotation < 0.2
+
+    dense = densify_model(mapper.model, scene_footage, tmp_path / "dense")
+    assert densify_model(mapper.model, scene_footage, tmp_path / "dense") == dense
+    again = pycolmap.Reconstruction(dense.model)
+    np.testing.assert_allclose(model_poses(again, 60), model_poses(model, 60), atol=1e-12)
+    assert model_figures(again).num_points > 3000
+    assert model_figures(again).mean_error < 1
+
+
+def test_a_database_that_makes_no_model(clip, tmp_path):
+    footage = prepare_footage(
+        clip, tmp_path / "footage", num_frames=16, image_step=8, camera=CameraOptions()
+    )
+    assert sorted(p.name for p in footage.image_path.iterdir()) == footage.names
+    run = run_frontend("sift-exhaustive", footage, tmp_path / "run")
+    with pycolmap.Database.open(run.database) as database:
+        database.clear_two_view_geometries()
+    mapper = map_database(run.database, footage.image_path, tmp_path / "model")
+    assert (mapper.model, mapper.num_models) == (None, 0)
+
+
+def test_unknown_frontend(clip, tmp_path):
+    footage = prepare_footage(
+        clip, tmp_path / "footage", num_frames=16, image_step=8, camera=CameraOptions()
+    )
+    with pytest.raises(OptionError, match="'surf': give one of av1,"):
+        run_frontend("surf", footage, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_benchmark_prints_its_tables(tmp_path):
+    script = EXAMPLES / "benchmarks" / "tracks.py"
+    words = ["--cache", tmp_path, "--sequences", "scene", "--frontends", "av1-sparse"]
+    done = subprocess.run(
+        [sys.executable, script, *words, "--no_mapping"], check=True, capture_output=True, text=True
+    )
+    header, _, row = done.stdout.strip().splitlines()[-3:]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert len(cells) == header.count("|") - 1
+    assert cells[0] == "av1-sparse"
+    tracks = int(cells[1].replace(",", ""))
+    assert sum(int(cell.replace(",", "")) for cell in cells[2:7]) == tracks > 1000
+    exact = [float(value) for value in cells[-2].split("/")]
+    assert all(0 < value < 0.5 for value in exact)

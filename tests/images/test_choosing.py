@@ -1,0 +1,364 @@
+from __future__ import annotations
+
+import os
+import re
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from conftest import Encode, Ffmpeg, make_frames
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.images.choosing import (
+    choose_frames,
+    choose_images,
+    parallax,
+    read_frame_list,
+    skip_blurred,
+)
+from colmap_av1.match import MatchReport, match
+from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.facts import frame_times
+
+# Every track is used, so one that an image sees does not depend on the other images.
+DENSE = MatchOptions(density=DensityOptions(preset="dense"))
+LOSSLESS = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "0", "-crf", "1"]
+
+
+def tracks_from(paths: np.ndarray, size: tuple[int, int] = (640, 480)) -> Tracks:
+    """Tracks seen in every frame: paths [num_tracks, num_frames, 2]."""
+    num_tracks, num_frames = paths.shape[:2]
+    count = num_tracks * num_frames
+    return Tracks(
+        num_frames=num_frames,
+        width=size[0],
+        height=size[1],
+        offsets=np.arange(0, count + 1, num_frames, dtype=np.int64),
+        frame=np.tile(np.arange(num_frames, dtype=np.int32), num_tracks),
+        xy=paths.reshape(-1, 2).astype(np.float32),
+        sigma=np.full(count, 0.5, np.float32),
+        confirmed=np.zeros(count, bool),
+    )
+
+
+def still(num_frames: int) -> Tracks:
+    return tracks_from(np.full((3, num_frames, 2), 100.0))
+
+
+def project(centres: np.ndarray, angles: np.ndarray) -> Tracks:
+    """Points at depths 4 to 20, seen from x = centre, turned about y by an angle."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-3, -2, 4], [3, 2, 20], (300, 3))
+    paths = []
+    for centre, angle in zip(centres, angles, strict=True):
+        x, y, z = (points - [centre, 0, 0]).T
+        c, s = np.cos(angle), np.sin(angle)
+        turned = np.stack([c * x - s * z, y, s * x + c * z])
+        paths.append(768 * turned[:2] / turned[2] + [[320], [240]])
+    return tracks_from(np.array(paths).transpose(2, 0, 1))
+
+
+@settings(deadline=None)
+@given(st.integers(2, 60), st.integers(2, 60), st.randoms(use_true_random=False))
+def test_any_number_of_images_is_spread(num_frames: int, wanted: int, random: object) -> None:
+    rng = np.random.default_rng(random.getrandbits(32))  # type: ignore[attr-defined]
+    times = np.cumsum(rng.exponential(1.0, num_frames) ** 3 + 1e-3)
+    options = ImageOptions(num_images=wanted)
+    if wanted > num_frames:
+        with pytest.raises(ImageError, match="give fewer"):
+            choose_frames(still(num_frames), options, times)
+        return
+    frames = choose_frames(still(num_frames), options, times)
+    assert len(frames) == wanted
+    assert np.all(np.diff(frames) > 0)
+    assert (frames[0], frames[-1]) == (0, num_frames - 1)
+
+
+def test_even_in_time_is_not_even_in_frames() -> None:
+    # The first second has 30 frames, the second one 10.
+    times = np.concatenate([np.arange(30) / 30, 1 + np.arange(11) / 10])
+    frames = choose_frames(still(41), ImageOptions(num_images=5), times)
+    assert frames.tolist() == [0, 15, 30, 35, 40]
+    assert choose_frames(still(41), ImageOptions(num_images=5)).tolist() == [0, 10, 20, 30, 40]
+    assert choose_frames(still(41), ImageOptions(every=20), times).tolist() == [0, 20, 40]
+    for fps in (100, 1e30):
+        assert len(choose_frames(still(41), ImageOptions(fps=fps), times)) == 41
+
+
+@pytest.mark.parametrize("fps", [2, 5, 7, 20])
+def test_fps_takes_the_frames_that_ffmpeg_takes(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, fps: int
+) -> None:
+    clip = encode(make_frames(25, 96, 64), tmp_path / "clip.mp4")
+    ffmpeg("-i", clip, "-vf", f"fps={fps}", tmp_path / "%04d.png")
+    frames = choose_frames(still(25), ImageOptions(fps=fps), frame_times(clip))
+    pictures = [picture for _, picture in decode_frames(clip)]
+    cut = [cv2.imread(str(path)) for path in sorted(tmp_path.glob("*.png"))]
+    shown = [int(np.argmin([np.abs(c.astype(int) - p).mean() for p in pictures])) for c in cut]
+    assert frames.tolist() == shown
+
+
+def test_parallax_sees_through_rotation() -> None:
+    turning = parallax(project(np.zeros(11), np.linspace(0, 0.2, 11)))
+    moving = parallax(project(np.linspace(0, 0.5, 11), np.zeros(11)))
+    both = parallax(project(np.linspace(0, 0.5, 11), np.linspace(0, 0.2, 11)))
+    # 15 px a frame by rotation, of which a tenth counts; the same parallax with it and without.
+    assert np.median(turning) < 2
+    assert np.median(moving) > 1.0
+    np.testing.assert_allclose(np.median(both) - np.median(turning), np.median(moving), atol=0.6)
+
+
+def test_images_at_equal_parallax() -> None:
+    # The camera stands still for a while, then moves.
+    centres = np.concatenate([np.zeros(20), np.linspace(0, 1, 21)])
+    options = ImageOptions(num_images=6, select="parallax")
+    frames = choose_frames(project(centres, np.zeros(41)), options)
+    assert frames[0] == 0
+    np.testing.assert_allclose(frames[1:], [24, 28, 32, 36, 40], atol=1)
+
+
+def test_blurred_frames_are_left_for_sharp_ones_that_see_the_same() -> None:
+    tracks = tracks_from(np.full((50, 41, 2), 10.0))
+    sharp = np.full(41, 10.0)
+    sharp[[10, 20, 21, 30]] = 1.0
+    sharp[22] = 12.0
+    asked: list[int] = []
+
+    def sharpness(frames: object) -> np.ndarray:
+        asked.extend(frames)  # type: ignore[call-overload]
+        return sharp[list(frames)]  # type: ignore[call-overload]
+
+    frames = np.array([0, 10, 20, 30, 40], dtype=np.int32)
+    assert skip_blurred(frames, tracks, sharpness).tolist() == [0, 8, 22, 28, 40]
+    assert asked == sorted(set(asked))
+    # A neighbour that has lost most tracks is no replacement.
+    lost = (tracks.frame == 22) & (np.repeat(np.arange(50), 41) > 5)
+    kept = ~lost
+    counts = np.bincount(np.repeat(np.arange(50), 41)[kept], minlength=50)
+    thinner = replace(
+        tracks,
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        frame=tracks.frame[kept],
+        xy=tracks.xy[kept],
+    )
+    assert skip_blurred(frames, thinner, sharpness).tolist() == [0, 8, 18, 28, 40]
+
+
+def test_frame_list(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text("# mine\n\n9 last one.png\n0\nimg_0005.jpg\n")
+    chosen = read_frame_list(path, 10, ImageOptions(first_number=1))
+    assert chosen.frames.tolist() == [0, 4, 9]
+    assert chosen.names == ["frame_000000.png", "img_0005.jpg", "last one.png"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0\n10\n", "line 2: there is no frame 10: the video has frames 0 to 9"),
+        ("0\n3\n3 b.png\n", "gives the frame 3 twice"),
+        ("0 a.png\n3 a.png\n", "gives the name a.png twice"),
+        ("first.png\n", "names no frame"),
+        ("5\n", "1 of 10 frames become images"),
+        ("", "0 of 10 frames become images"),
+        (b"\xff\xd8\xff\xe0", r"list\.txt: .*: it is no text: give a text file"),
+        (None, r"list\.txt: .*: No such file or directory: give a text file"),
+    ],
+)
+def test_bad_frame_lists(tmp_path: Path, text: str | bytes | None, message: str) -> None:
+    if text is not None:
+        (tmp_path / "list.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
+    options = ImageOptions(frame_list=str(tmp_path / "list.txt"))
+    with pytest.raises(ImageError, match=message):
+        choose_images(
+            still(10), options, existing=(), folder=None, times=lambda: None, decode=lambda: ()
+        )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (ImageOptions(every=2, fps=3), "every and fps both say"),
+        (ImageOptions(num_images=1), "num_images is 1"),
+        (ImageOptions(fps=-1), "fps is -1"),
+        (ImageOptions(fps=2), "no time stamps"),
+        (ImageOptions(select="parallax"), "give num_images"),
+    ],
+)
+def test_bad_options(options: ImageOptions, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        choose_frames(still(10), options)
+
+
+@pytest.fixture(scope="module")
+def cut(clip: Path) -> list[np.ndarray]:
+    return [picture for _, picture in decode_frames(clip)]
+
+
+def test_folder_of_others_is_used_as_it_is(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path
+) -> None:
+    # As a script writes every third frame, half as large, numbered from 1, as JPEG.
+    folder = tmp_path / "input"
+    folder.mkdir()
+    for number, picture in enumerate(cut[1::3], start=1):
+        half = cv2.resize(picture, (96, 64), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(folder / f"img {number}.jpg"), half, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    report = match(tmp_path / "a.db", clip, image_path=folder, options=DENSE)
+    assert report.num_images == 5
+    assert report.num_written_images == 0
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+    (tmp_path / "list.txt").write_text("".join(f"{frame}\n" for frame in range(1, 16, 3)))
+    listed = ImageOptions(frame_list=str(tmp_path / "list.txt"))
+    options = replace(DENSE, images=listed)
+    wanted = match(tmp_path / "b.db", clip, options=options)
+    assert report.num_matches == wanted.num_matches
+    ours, theirs = keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db")
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a * 2, b, atol=1e-4)
+
+
+def keypoints(database: Path) -> list[np.ndarray]:
+    with sqlite3.connect(database) as connection:
+        rows = connection.execute("SELECT data FROM keypoints ORDER BY image_id").fetchall()
+    return [np.frombuffer(data, "<f4").reshape(-1, 2) for (data,) in rows]
+
+
+def save(folder: Path, pictures: Sequence[np.ndarray], name: str = "x%d.png") -> Path:
+    folder.mkdir(exist_ok=True)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / (name % number)), picture)
+    return folder
+
+
+def test_images_that_look_like_no_frame_or_like_many_are_refused(
+    clip: Path, cut: list[np.ndarray], encode: Encode, tmp_path: Path
+) -> None:
+    folder = save(tmp_path / "others", [255 - cut[3 * number] for number in range(5)])
+    with pytest.raises(ImageError, match="shows no frame of the video"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    save(folder, [cut[0]] * 5)
+    with pytest.raises(ImageError, match=r"x0\.png and .* show the same frame, 0"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    twice = encode(np.concatenate([make_frames(8)] * 2), tmp_path / "twice.mp4", *LOSSLESS)
+    save(folder, [picture for _, picture in decode_frames(twice)][1:6])
+    with pytest.raises(ImageError, match=r"x0\.png: looks like frame 1 and like frame 9"):
+        match(tmp_path / "a.db", twice, image_path=folder)
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_images_named_as_ours_but_from_one_on(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """As ffmpeg numbers them: each is one frame earlier than its name would say."""
+    (tmp_path / "cut").mkdir()
+    ffmpeg("-i", clip, tmp_path / "cut" / "frame_%06d.png")
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut", options=DENSE)
+    assert (report.num_images, report.num_written_images) == (16, 0)
+    match(tmp_path / "b.db", clip, options=DENSE)
+    found, wanted = keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db")
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    # Two of them are missing: their content says which frames the others are.
+    for number in (3, 16):
+        (tmp_path / "cut" / f"frame_{number:06d}.png").unlink()
+    report = match(tmp_path / "c.db", clip, image_path=tmp_path / "cut", options=DENSE)
+    assert report.num_images == 14
+    kept = [k for i, k in enumerate(wanted) if i not in (2, 15)]
+    for ours, theirs in zip(keypoints(tmp_path / "c.db"), kept, strict=True):
+        assert set(map(tuple, ours)) <= set(map(tuple, theirs))
+
+
+def test_folder_of_all_frames_of_another_video(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path
+) -> None:
+    folder = save(tmp_path / "other", [picture[::-1] for picture in cut])
+    with pytest.raises(ImageError, match=r"x0\.png: should show frame 0 of the video but shows an"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    # Under our own names, too, be it of all frames or of some.
+    folder = save(tmp_path / "ours", [picture[::-1] for picture in cut[:3]], "frame_%06d.png")
+    with pytest.raises(ImageError, match=r"frame_000000\.png: should show frame 0"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    assert len(list(folder.iterdir())) == 3
+    # As many as frames, but one was lost and another one is there twice.
+    folder = save(tmp_path / "odd", [*cut[:4], *cut[5:], cut[2]])
+    with pytest.raises(ImageError, match=r"x15\.png: should show frame 15 of the video but"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+
+
+def test_images_of_a_folder_that_may_not_be_written(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = save(tmp_path / "cut", cut)
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != folder and access(path, mode))
+    assert match(tmp_path / "a.db", clip, image_path=folder).num_images == 16
+    empty = save(tmp_path / "empty", ())
+    monkeypatch.setattr(os, "access", lambda path, mode: path != empty and access(path, mode))
+    with pytest.raises(ImageError, match="no permission to write images there"):
+        match(tmp_path / "b.db", clip, image_path=empty)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("../a.png", ImageError), ("/a.png", ImageError), ("a.tif", OptionError)]
+)
+def test_names_that_cannot_be_written(
+    clip: Path, tmp_path: Path, name: str, error: type[Exception]
+) -> None:
+    (tmp_path / "list.txt").write_text(f"0 {name}\n3 b.png\n")
+    options = MatchOptions(images=ImageOptions(frame_list=str(tmp_path / "list.txt")))
+    with pytest.raises(error, match=re.escape(name)):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "images", options=options)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["list.txt"]
+
+
+def test_images_as_they_are_stored(
+    clip: Path, cut: list[np.ndarray], ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Programs that do not turn pictures: shape or content says so, keypoints follow."""
+    match(tmp_path / "plain.db", clip, options=DENSE)
+    expected = keypoints(tmp_path / "plain.db")
+    folder = save(tmp_path / "stored", cut)
+    for angle in (90, 180):
+        turned = ffmpeg(
+            *("-display_rotation", str(angle), "-i", clip, "-c", "copy"), tmp_path / f"{angle}.mp4"
+        )
+        database = tmp_path / f"{angle}.db"
+        assert match(database, turned, image_path=folder, options=DENSE).num_written_images == 0
+        for ours, theirs in zip(keypoints(database), expected, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    upright = save(tmp_path / "upright", [picture[::-1, ::-1] for picture in cut])
+    match(tmp_path / "upright.db", turned, image_path=upright, options=DENSE)
+    for ours, theirs in zip(keypoints(tmp_path / "upright.db"), expected, strict=True):
+        np.testing.assert_allclose(ours, [192, 128] - theirs, atol=1e-4)
+
+
+def test_every_with_existing_images(clip: Path, cut: list[np.ndarray], tmp_path: Path) -> None:
+    folder = save(tmp_path / "step", cut[::3])
+
+    def run(name: str, **images: Any) -> MatchReport:
+        options = replace(DENSE, images=ImageOptions(**images))
+        return match(tmp_path / name, clip, image_path=folder, options=options)
+
+    assert run("a.db", every=3).num_images == 6
+    # One was sorted out: the numbers say which, where they start.
+    (folder / "x2.png").unlink()
+    assert run("b.db", every=3, first_number=0).num_images == 5
+    kept = [k for i, k in enumerate(keypoints(tmp_path / "a.db")) if i != 2]
+    for ours, theirs in zip(keypoints(tmp_path / "b.db"), kept, strict=True):
+        assert set(map(tuple, ours)) <= set(map(tuple, theirs))
+    with pytest.raises(ImageError, match=r"x5\.png: should show frame 12 of the video but"):
+        run("c.db", every=3)
+    with pytest.raises(ImageError, match=r"x4\.png' would be frame 16 .* give another every"):
+        run("c.db", every=4, first_number=0)
+    with pytest.raises(OptionError, match="num_images chooses new images"):
+        run("c.db", num_images=3)
+    assert not (tmp_path / "c.db").exists()

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import Encode, make_frames
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.images.files import check_image_folder, size_of_images, write_images
+from colmap_av1.images.names import frames_of_images, image_names
+from colmap_av1.video.decoding import decode_frames
+
+SIZE = (192, 128)
+
+
+def test_image_names_count_from_zero() -> None:
+    assert image_names("frame_%06d.png", [0, 12]) == ["frame_000000.png", "frame_000012.png"]
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "frame.png",
+        "%d_%d.png",
+        "%s.png",
+        "a%%%d.png",
+        "%d.bmp",
+        "sub/%d.png",
+        "../%d.png",
+        ".%d.png",
+    ],
+)
+def test_patterns_that_cannot_work(pattern: str) -> None:
+    with pytest.raises(OptionError):
+        image_names(pattern, [0])
+
+
+@pytest.mark.parametrize(
+    ("names", "num_frames", "frames"),
+    [
+        (["b.png", "a.png"], 2, [1, 0]),
+        (["0001.jpg", "0002.jpg", "0003.jpg"], 3, [0, 1, 2]),
+        (["f10.png", "f9.png", "f11.png"], 3, [1, 0, 2]),
+        (["in/v2_0003.png", "in/v2_0001.png", "in/v2_0000.png"], 4, [3, 1, 0]),
+        (["f_0.png", "f_4.png"], 10, [0, 4]),
+        (["f_10.png", "f_4.png"], 10, [9, 3]),
+    ],
+)
+def test_frames_of_images(names: list[str], num_frames: int, frames: list[int]) -> None:
+    assert frames_of_images(names, num_frames).tolist() == frames
+
+
+@pytest.mark.parametrize(
+    ("names", "num_frames", "reason"),
+    [
+        (["1.png", "2.png", "3.png"], 10, "do not say which frames"),  # cut at a lower rate?
+        (["0.png", "1.png", "2.png"], 10, "do not say which frames"),
+        (["2.png", "4.png"], 10, "do not say which frames"),
+        (["0.png", "12.png"], 10, "do not say which frames"),
+        (["left.png", "right.png", "top.png"], 10, "'left.png' has no frame number"),
+        ([f"{i}.png" for i in range(11)], 10, "11 images, the video has 10 frames"),
+        (["a/0.png", "b/0.png", "b/5.png"], 10, "two images"),
+    ],
+)
+def test_images_that_do_not_fit(names: list[str], num_frames: int, reason: str) -> None:
+    with pytest.raises(ImageError, match=reason) as caught:
+        frames_of_images(names, num_frames)
+    assert "\n" not in str(caught.value)
+
+
+def test_first_number_settles_it() -> None:
+    assert frames_of_images(["2.png", "3.png"], 10, first_number=1).tolist() == [1, 2]
+    assert frames_of_images(["2.png", "3.png"], 2, first_number=2).tolist() == [0, 1]
+    with pytest.raises(ImageError, match="numbered 1 to 10"):
+        frames_of_images(["0.png", "3.png"], 10, first_number=1)
+
+
+def test_sizes() -> None:
+    assert size_of_images({}, SIZE) == SIZE
+    assert size_of_images({"a": SIZE}, SIZE) == SIZE
+    assert size_of_images({"a": (96, 64), "b": (96, 64)}, SIZE) == (96, 64)
+    assert size_of_images({"a": (683, 384)}, (1366, 769)) == (683, 384)
+    with pytest.raises(ImageError, match="image 'b' is 96x64, 'a' 192x128: images of one video"):
+        size_of_images({"a": SIZE, "b": (96, 64)}, SIZE)
+    with pytest.raises(ImageError, match="192x128 as players turn them"):
+        size_of_images({"a": (128, 192)}, SIZE)
+    with pytest.raises(ImageError, match="give the video that it comes from"):
+        size_of_images({"a": (192, 144)}, SIZE)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_written_images_are_the_frames(clip: Path, tmp_path: Path, ending: str) -> None:
+    frames = [0, 3, 15]
+    names = image_names(f"frame_%06d.{ending}", frames)
+    done: list[int] = []
+    assert write_images(clip, tmp_path / "a/b", names, frames, progress=done.append) == 3
+    assert sorted(p.name for p in (tmp_path / "a/b").iterdir()) == names
+    assert done == [0, 1, 2, 3]
+    decoded = dict(decode_frames(clip))
+    for frame, name in zip(frames, names, strict=True):
+        image, truth = cv2.imread(str(tmp_path / "a/b" / name)), decoded[frame]
+        if ending == "jpg":  # which blurs colour
+            image, truth = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in (image, truth))
+        assert cv2.absdiff(image, truth).mean() <= (0 if ending == "png" else 4)
+
+
+def test_existing_images_are_kept(clip: Path, tmp_path: Path) -> None:
+    names = ["sub/x.png", "y.png"]
+    mine = np.full((128, 192, 3), 77, np.uint8)
+    cv2.imwrite(str(tmp_path / "y.png"), mine)
+    check_image_folder(tmp_path, names, SIZE)
+    assert write_images(clip, tmp_path, names, [0, 1]) == 1
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "y.png")), mine)
+    assert (tmp_path / "sub/x.png").exists()
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_existing_images_of_another_size(tmp_path: Path, ending: str) -> None:
+    name = f"frame_000003.{ending}"
+    cv2.imwrite(str(tmp_path / name), np.zeros((64, 96, 3), np.uint8))
+    with pytest.raises(ImageError, match=f"{name}: is 96x64, the video 192x128"):
+        check_image_folder(tmp_path, f"frame_%06d.{ending}", SIZE)
+    with pytest.raises(ImageError, match=f"{name}: is 96x64"):
+        check_image_folder(tmp_path, [name], SIZE)
+    check_image_folder(tmp_path, f"other_%06d.{ending}", SIZE)
+
+
+def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("no image")
+    with pytest.raises(ImageError, match="is a file"):
+        check_image_folder(file, "%d.png", SIZE)
+    with pytest.raises(ImageError, match="outside"):
+        check_image_folder(tmp_path, ["../a.png"], SIZE)
+    shutil.copy(file, tmp_path / "a.png")
+    with pytest.raises(ImageError, match=r"a\.png: is not"):
+        check_image_folder(tmp_path, ["a.png"], SIZE)
+
+
+def test_frames_that_do_not_exist(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match="no frame 16"):
+        write_images(clip, tmp_path, ["a.png"], [16])
+
+
+@contextmanager
+def no_space() -> Iterator[None]:
+    """Lets no file grow beyond 10 kB, which fails where a full disk does."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_full_disk_leaves_no_partial_image(clip: Path, tmp_path: Path) -> None:
+    # Only around the call: the test's own output may go to a file, too.
+    with no_space(), pytest.raises(ImageError, match=r"a\.png: cannot be written"):
+        write_images(clip, tmp_path, ["a.png"], [0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_leftovers_of_killed_processes_are_removed(clip: Path, tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    others = [f".b.png.{os.getpid()}.partial", ".b.png.partial", ".b.png.x.partial", "b.partial"]
+    for name in [f".a.png.{ended.pid}.partial", f".b [1].png.{ended.pid}.partial", *others]:
+        (tmp_path / name).touch()
+    write_images(clip, tmp_path, ["a.png"], [0])
+    assert {p.name for p in tmp_path.iterdir()} == {"a.png", *others}
+
+
+def test_frames_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
+    parts = [
+        encode(make_frames(2, width, 128), tmp_path / f"{width}.obu").read_bytes()
+        for width in (192, 128)
+    ]
+    both = tmp_path / "both.obu"
+    both.write_bytes(b"".join(parts))
+    with pytest.raises(ImageError, match="frame 2 is 128x128, those before 192x128"):
+        write_images(both, tmp_path / "out", [f"{i}.png" for i in range(4)], range(4))

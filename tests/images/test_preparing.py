@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
+
+from colmap_av1.errors import ImageError, VideoError
+from colmap_av1.images.files import write_images
+from colmap_av1.images.names import image_names
+from colmap_av1.images.preparing import PreparedImages, prepare_images
+from colmap_av1.options import EncodeOptions, ImageOptions, MatchOptions, ReadOptions
+from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.encode import stream_of
+
+OPTIONS = MatchOptions()
+LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
+
+
+def prepared(
+    video: Path,
+    folder: Path | None = None,
+    options: MatchOptions = OPTIONS,
+    listed: Mapping[str, tuple[int, int]] | None = None,
+) -> PreparedImages:
+    return prepare_images(
+        video, folder, options, listed=listed or {}, clock=Clock(), progress=no_progress
+    )
+
+
+def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
+    clock, told = Clock(), set()
+    found = prepare_images(
+        clip,
+        None,
+        replace(OPTIONS, images=ImageOptions(num_images=5)),
+        listed={},
+        clock=clock,
+        progress=lambda stage, done, total: told.add(stage),
+    )
+    assert told == {"motion"}
+    assert list(clock.seconds) == ["motion", "tracks", "choice"]
+    assert found.chosen.names == image_names("frame_%06d.png", found.chosen.frames)
+    assert found.size == (192, 128)
+    assert found.pixel_aspect == 1.0
+    assert found.tracks is found.tracked.tracks
+
+
+def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> None:
+    """By different factors along x and y, as programs do that make sizes even."""
+    (tmp_path / "images").mkdir()
+    for index, picture in decode_frames(clip):
+        small = cv2.resize(picture, (96, 63), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / "images" / f"{index + 1}.png"), small)
+    found = prepared(clip, tmp_path / "images")
+    assert found.size == (found.tracks.width, found.tracks.height) == (96, 63)
+    assert found.chosen.names == [f"{i + 1}.png" for i in range(16)]
+    factor = np.array([96 / 192, 63 / 128])
+    np.testing.assert_allclose(found.tracks.xy, found.tracked.tracks.xy * factor, rtol=1e-6)
+    # A pixel of the images is 2 of the video wide and 128 / 63 high.
+    assert found.pixel_aspect == pytest.approx(2 / (128 / 63))
+    listed = {f"{i}.png": (96, 63) for i in range(16)}
+    assert prepared(clip, listed=listed).size == (96, 63)
+
+
+@pytest.mark.parametrize(("operating_point", "size"), [(0, (352, 288)), (1, (176, 144))])
+def test_layers_of_a_scalable_stream_have_their_own_size(
+    tmp_path: Path, operating_point: int, size: tuple[int, int]
+) -> None:
+    options = replace(OPTIONS, read=ReadOptions(operating_point=operating_point))
+    first = prepared(LAYERS, tmp_path, options)
+    assert first.size == (first.tracks.width, first.tracks.height) == size
+    names, frames = first.chosen.names, first.chosen.frames
+    write_images(LAYERS, tmp_path, names, frames.tolist(), operating_point=operating_point)
+    # They are what another run finds.
+    assert prepared(LAYERS, tmp_path, options).size == size
+
+
+def test_a_stream_of_another_size_than_its_video_is_refused(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """As an encoder makes it that wants sizes of its own."""
+    video = encode(make_frames(6), tmp_path / "v.mp4", "-c:v", "libx264")
+    options = replace(OPTIONS, encode=EncodeOptions(encoder="libaom"))
+    stream = stream_of(video, options=options.encode).output
+    with av.open(str(stream)) as opened:
+        mark = opened.metadata["comment"]
+    larger = encode(make_frames(6, 208, 144), tmp_path / "larger.mp4", *AV1)
+    ffmpeg("-i", larger, "-c", "copy", "-metadata", f"comment={mark}", stream)
+    os.utime(stream)
+    with pytest.raises(VideoError, match=r"are 208x144, those of .*v\.mp4 192x128: .* --encoder"):
+        prepared(video, options=options)
+
+
+def test_images_of_an_earlier_run_must_be_of_this_video(
+    clip: Path, encode: Encode, tmp_path: Path
+) -> None:
+    other = encode(np.ascontiguousarray(make_frames(16)[:, ::-1]), tmp_path / "other.mp4")
+    names = image_names("frame_%06d.png", range(16))
+    write_images(other, tmp_path / "images", names[:3], range(3))
+    with pytest.raises(ImageError, match=r"frame_000000\.png: should show frame 0 of the video"):
+        prepared(clip, tmp_path / "images")
+    write_images(clip, tmp_path / "own", names[:3], range(3))
+    assert prepared(clip, tmp_path / "own").chosen.names == names

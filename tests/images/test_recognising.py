@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import PROJECT, Ffmpeg
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from colmap_av1.errors import ImageError
+from colmap_av1.images.recognising import (
+    _ascending_assignment,
+    check_content,
+    frames_by_content,
+    is_turned_back,
+)
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.display import Display, shown_picture
+
+EXAMPLE = PROJECT / "examples" / "scene.mp4"
+
+
+def pan(num_frames: int, step: float, seed: int = 0) -> list[np.ndarray]:
+    """A smooth random scene, seen by a camera that moves by `step` px a frame."""
+    rng = np.random.default_rng(seed)
+    scene = rng.uniform(0, 255, (180, int(240 + step * num_frames) + 2, 3)).astype(np.float32)
+    scene = cv2.normalize(cv2.GaussianBlur(scene, (0, 0), 8), None, 0, 255, cv2.NORM_MINMAX)
+    shifts = [np.array([[1.0, 0, -step * i], [0, 1, 0]]) for i in range(num_frames)]
+    return [cv2.warpAffine(scene, shift, (240, 180)).astype(np.uint8) for shift in shifts]
+
+
+_PAN = pan(30, 2)
+
+
+def write(folder: Path, pictures: list[np.ndarray], ending: str = "png") -> list[Path]:
+    folder.mkdir(exist_ok=True)
+    paths = [folder / f"{number:03d}.{ending}" for number in range(len(pictures))]
+    for path, picture in zip(paths, pictures, strict=True):
+        how = [cv2.IMWRITE_JPEG_QUALITY, 60] if ending == "jpg" else []
+        cv2.imwrite(str(path), picture, how)
+    return paths
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_assignment_is_the_best_ascending_one(data: st.DataObject) -> None:
+    num_images = data.draw(st.integers(1, 4))
+    num_frames = data.draw(st.integers(num_images, 7))
+    values = st.lists(st.integers(0, 9), min_size=num_frames, max_size=num_frames)
+    rows = data.draw(st.lists(values, min_size=num_images, max_size=num_images))
+    likeness = np.array(rows, dtype=np.float32)
+    found = _ascending_assignment(likeness)
+    assert np.all(np.diff(found) > 0)
+    best = max(
+        likeness[np.arange(num_images), list(frames)].sum()
+        for frames in itertools.combinations(range(num_frames), num_images)
+    )
+    assert likeness[np.arange(num_images), found].sum() == best
+
+
+@settings(
+    max_examples=20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    frames=st.sets(st.integers(0, 29), min_size=1, max_size=12),
+    scale=st.sampled_from([0.25, 0.5, 1.0, 1.5]),
+    ending=st.sampled_from(["png", "jpg"]),
+    shuffled=st.booleans(),
+)
+def test_images_are_found_however_they_were_written(
+    tmp_path: Path, frames: set[int], scale: float, ending: str, shuffled: bool
+) -> None:
+    pictures = _PAN
+    order = sorted(frames)
+    if shuffled:
+        np.random.default_rng(len(order)).shuffle(order)
+    written = [
+        cv2.resize(pictures[f], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        for f in order
+    ]
+    files = write(tmp_path / "images", written, ending)
+    assert frames_by_content(files, enumerate(pictures)).tolist() == order
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        ["-vf", "fps=7"],
+        ["-vf", "fps=4,scale=320:-1", "-q:v", "2"],
+        ["-vf", "thumbnail=6,setpts=N/TB", "-fps_mode", "passthrough"],
+    ],
+    ids=["fps", "half", "thumbnail"],
+)
+def test_frames_that_ffmpeg_picked(ffmpeg: Ffmpeg, tmp_path: Path, how: list[str]) -> None:
+    (tmp_path / "cut").mkdir()
+    ffmpeg("-i", EXAMPLE, *how, tmp_path / "cut" / "%03d.jpg")
+    files = sorted((tmp_path / "cut").iterdir())
+    pictures = list(decode_frames(EXAMPLE))
+    found = frames_by_content(files, iter(pictures))
+    assert len(found) > 8
+    for path, frame in zip(files, found, strict=True):
+        cut = cv2.imread(str(path)).astype(int)
+        height, width = cut.shape[:2]
+        around = range(max(0, frame - 1), min(len(pictures), frame + 2))
+        difference = {
+            f: np.abs(cv2.resize(pictures[f][1], (width, height)).astype(int) - cut).mean()
+            for f in around
+        }
+        assert min(difference, key=lambda f: difference[f]) == frame
+
+
+def test_one_frame_twice(tmp_path: Path) -> None:
+    """As ffmpeg writes it where time stamps have a gap."""
+    pictures = pan(12, 2)
+    files = write(tmp_path / "images", [pictures[i] for i in (0, 4, 4, 8)])
+    with pytest.raises(ImageError, match=r"001\.png and 002\.png show the same frame, 4") as info:
+        frames_by_content(files, enumerate(pictures))
+    assert "\n" not in str(info.value)
+
+
+def test_camera_that_stands_still_for_a_while(tmp_path: Path) -> None:
+    moving = pan(10, 2)
+    pictures = [moving[0]] * 8 + moving
+    files = write(tmp_path / "images", [pictures[i] for i in (0, 5, 10, 15)])
+    found = frames_by_content(files, enumerate(pictures))
+    assert np.all(np.diff(found) > 0)
+    assert found[1] <= 8
+    assert found[2:].tolist() == [10, 15]
+
+
+def test_scene_that_comes_back(tmp_path: Path) -> None:
+    there = pan(8, 2)
+    files = write(tmp_path / "images", [there[i] for i in (1, 4)])
+    with pytest.raises(ImageError, match=r"looks like frame [14] and like frame (9|12)"):
+        frames_by_content(files, enumerate(there + there))
+
+
+def test_other_pictures(tmp_path: Path) -> None:
+    files = write(tmp_path / "images", pan(3, 2, seed=1))
+    with pytest.raises(ImageError, match="shows no frame of the video"):
+        frames_by_content(files, enumerate(pan(12, 2)))
+    with pytest.raises(ImageError, match="3 images, but the video has 2 frames"):
+        frames_by_content(files, enumerate(pan(2, 2)))
+    files[0].write_bytes(b"no image")
+    with pytest.raises(ImageError, match="is missing or no image"):
+        frames_by_content(files, enumerate(pan(12, 2)))
+
+
+def test_content_off_by_one(tmp_path: Path) -> None:
+    pictures = pan(12, 2)
+    files = write(tmp_path / "images", [pictures[3], pictures[9]], "jpg")
+    check_content(files, [3, 9], enumerate(pictures))
+    with pytest.raises(ImageError, match=r"000\.jpg: should show frame 2 .* but shows frame 3"):
+        check_content(files, [2, 9], enumerate(pictures))
+    with pytest.raises(ImageError, match=r"001\.jpg: should show frame 11 .* but shows frame 9"):
+        check_content(files, [3, 11], enumerate(pictures))
+    with pytest.raises(ImageError, match="but shows another"):
+        check_content(files, [3, 9], enumerate(pan(12, 2, seed=1)))
+
+
+@pytest.mark.parametrize("turn", [((-1, 0), (0, -1)), ((1, 0), (0, -1)), ((0, 1), (1, 0))])
+def test_how_images_are_turned(
+    tmp_path: Path, turn: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    display = Display(turn=turn)
+    stored = pan(12, 2)
+    shown = [shown_picture(picture, display) for picture in stored]
+    as_shown, as_stored = write(tmp_path / "images", [shown[7], stored[7]])
+    assert not is_turned_back(as_shown, enumerate(shown), display)
+    assert is_turned_back(as_stored, enumerate(shown), display)

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_scene import make_scene
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.options import PairOptions
+from colmap_av1.tracks.tracks import Tracks
+
+
+def tracks_from(spans: list[list[int]], num_frames: int = 10) -> Tracks:
+    """Track t is seen in the frames spans[t], at (100 t + frame, t)."""
+    frame = np.array([f for span in spans for f in span], dtype=np.int32)
+    track = np.repeat(np.arange(len(spans)), [len(s) for s in spans])
+    offsets = np.concatenate([[0], np.cumsum([len(s) for s in spans])]).astype(np.int64)
+    xy = np.stack([100 * track + frame, track], axis=1).astype(np.float32).reshape(-1, 2)
+    sigma = np.zeros(len(frame), np.float32)
+    confirmed = np.zeros(len(frame), bool)
+    return Tracks(num_frames, 640, 480, offsets, frame, xy, sigma, confirmed)
+
+
+def images_seeing(tracks_of_image: list[list[int]]) -> list[ImageKeypoints]:
+    return [
+        ImageKeypoints(i, np.zeros((len(t), 2), np.float32), np.array(sorted(t), np.int64))
+        for i, t in enumerate(tracks_of_image)
+    ]
+
+
+def test_keypoints_of_chosen_frames() -> None:
+    tracks = tracks_from([[0, 1, 2], [2, 3], [1, 3, 5], [4, 5, 6]])
+    images = image_keypoints(tracks, [0, 2, 5])
+    assert [k.frame for k in images] == [0, 2, 5]
+    # Tracks 1, 2 and 3 are seen in one of the frames only.
+    assert [k.track.tolist() for k in images] == [[0], [0], []]
+    assert images[1].xy.tolist() == [[2.0, 0.0]]
+    assert images[2].xy.shape == (0, 2)
+    assert images[0].xy.dtype == np.float32
+
+
+@given(
+    st.lists(st.sets(st.integers(0, 9), min_size=1), max_size=20),
+    st.sets(st.integers(0, 9)),
+)
+def test_keypoints_agree_with_a_plain_loop(spans: list[set[int]], chosen: set[int]) -> None:
+    tracks = tracks_from([sorted(s) for s in spans])
+    images = image_keypoints(tracks, sorted(chosen))
+    kept = [t for t, span in enumerate(spans) if len(span & chosen) >= 2]
+    for image, frame in zip(images, sorted(chosen), strict=True):
+        expected = [t for t in kept if frame in spans[t]]
+        assert image.track.tolist() == expected
+        assert image.xy.tolist() == [[100 * t + frame, t] for t in expected]
+
+
+@pytest.mark.parametrize("frames", [[0, 10], [-1, 3], [3, 3], [4, 2]])
+def test_frames_that_do_not_fit(frames: list[int]) -> None:
+    with pytest.raises(ImageError):
+        image_keypoints(tracks_from([[0, 1]]), frames)
+
+
+@given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
+def test_matches_join_keypoints_of_a_track(a: set[int], b: set[int]) -> None:
+    first, second = images_seeing([list(a), list(b)])
+    matches = pair_matches(first, second)
+    assert matches.dtype == np.uint32
+    assert first.track[matches[:, 0]].tolist() == sorted(a & b)
+    assert second.track[matches[:, 1]].tolist() == sorted(a & b)
+
+
+def test_schedule_reaches_the_longest_span() -> None:
+    # 20 tracks start at every image and are seen in 24 images.
+    images = images_seeing(
+        [[20 * s + k for s in range(max(0, i - 23), i + 1) for k in range(20)] for i in range(100)]
+    )
+    pairs = schedule_pairs(images)
+    spans = sorted(set((pairs[:, 1] - pairs[:, 0]).tolist()))
+    assert spans[:8] == [1, 2, 3, 4, 5, 6, 8, 10]
+    assert spans[-1] == 23
+    assert len(spans) <= 12
+    assert all((i, i + 1) in set(map(tuple, pairs.tolist())) for i in range(99))
+    assert pairs.tolist() == sorted(pairs.tolist())
+
+
+def test_schedule_stays_linear_where_tracks_never_end() -> None:
+    images = images_seeing([list(range(20))] * 1200)
+    half = len(schedule_pairs(images[:600]))
+    assert len(schedule_pairs(images)) < 2.15 * half
+    assert half < 18 * 600
+
+
+def test_schedule_keeps_pairs_with_enough_matches_only() -> None:
+    images = images_seeing([list(range(20)), list(range(5, 30)), list(range(6, 30)), []])
+    assert schedule_pairs(images).tolist() == [[0, 1], [1, 2]]
+    assert schedule_pairs(images, PairOptions(min_matches=14)).tolist() == [[0, 1], [0, 2], [1, 2]]
+    assert schedule_pairs(images, PairOptions(min_matches=14, max_span=1)).tolist() == [
+        [0, 1],
+        [1, 2],
+    ]
+    assert schedule_pairs([]).shape == (0, 2)
+
+
+def test_schedule_without_growth_takes_the_offsets() -> None:
+    images = images_seeing([list(range(20))] * 12)
+    pairs = schedule_pairs(images, PairOptions(offsets=(3, 1), growth=1.0))
+    expected = [(i, j) for i, j in combinations(range(12), 2) if j - i in (1, 3)]
+    assert pairs.tolist() == [list(p) for p in expected]
+
+
+def test_scene_pairs_share_tracks() -> None:
+    images = image_keypoints(make_scene().tracks, range(16))
+    for i, j in schedule_pairs(images):
+        assert len(pair_matches(images[i], images[j])) >= 15
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        PairOptions(offsets=()),
+        PairOptions(offsets=(0, 1)),
+        PairOptions(growth=0.5),
+        PairOptions(max_span=0),
+        PairOptions(min_matches=0),
+    ],
+)
+def test_options_that_cannot_work(options: PairOptions) -> None:
+    with pytest.raises(OptionError):
+        schedule_pairs([], options)

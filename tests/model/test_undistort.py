@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pycolmap
+
+from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
+
+
+def test_undistorted_picture_shows_the_same() -> None:
+    for k in (-0.12, 0.1):
+        camera = pycolmap.Camera(
+            camera_id=3, model="SIMPLE_RADIAL", width=320, height=240, params=[250, 160, 120, k]
+        )
+        pinhole = pinhole_camera(camera)
+        assert (pinhole.model_name, pinhole.width, pinhole.height) == ("PINHOLE", 320, 240)
+        undistort = undistortion(camera, pinhole)
+        assert undistort is not None
+        assert undistort(np.full((240, 320, 3), 200, np.uint8)).min() == 200
+        at = np.array([[60.5, 50.5], [250.5, 180.5]], np.float32)
+        picture = np.zeros((240, 320, 3), np.uint8)
+        for x, y in at:
+            cv2.circle(picture, (int(x), int(y)), 3, (255, 255, 255), -1)
+        flat = undistort(picture)[..., 0].astype(float)
+        for x, y in on_pinhole(camera, pinhole, at):
+            near = np.mgrid[int(y) - 8 : int(y) + 9, int(x) - 8 : int(x) + 9]
+            weight = flat[near[0], near[1]]
+            centre = [(weight * (n + 0.5)).sum() / weight.sum() for n in near[::-1]]
+            assert np.allclose(centre, [x, y], atol=0.3)
+        # As wide as can be: some edge pixel comes from the source's edge.
+        wider = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=pinhole.params * 1)
+        wider.params = [p * 0.98 for p in pinhole.params[:2]] + list(pinhole.params[2:])
+        undistort_wider = undistortion(camera, wider)
+        ramp = np.zeros((240, 320, 3), np.uint8)
+        ramp[2:-2, 2:-2] = 255
+        assert undistort_wider is not None
+        assert undistort_wider(ramp).min() == 0
+    plain = pycolmap.Camera(
+        camera_id=3, model="SIMPLE_PINHOLE", width=320, height=240, params=[250, 160, 120]
+    )
+    assert undistortion(plain, pinhole_camera(plain)) is None
+    assert list(pinhole_camera(plain).params) == [250, 250, 160, 120]

@@ -1,0 +1,454 @@
+"""Damaged and hostile streams: an error of this package or the frames before the damage."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import struct
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import PROJECT, SHARED
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import BitstreamError, ColmapAv1Error, LimitError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
+from colmap_av1.video.container import packets
+
+_DATA = PROJECT / "tests" / "data" / "conformance"
+_KIT = SHARED / "conformance"
+_UNIT_FIELDS = (
+    *("mv", "ref_frame", "mi_size", "y_mode", "is_inter", "skip", "skip_mode", "segment_id"),
+    *("motion_mode", "compound_type", "interintra", "use_intrabc"),
+)
+_TIMEOUT = 120  # seconds for all files of a test together; they take 2
+_MEGABYTE = 1 << 20
+
+# Files that give no frame. Where a demuxer gives up differs from one version of FFmpeg to
+# the next: before the first packet the file is no video, after it the stream is damaged.
+_NO_VIDEO = ("VideoError", "BitstreamError")
+_ERRORS = {
+    **dict.fromkeys(
+        (
+            *("empty.ivf", "ivf_header_only.ivf", "ivf_header_cut.ivf", "cut_in_key_frame.ivf"),
+            *("garbage.ivf", "garbage_after_header.ivf", "text.ivf", "obu_size_past_end.ivf"),
+            *("obu_size_leb128_overlong.ivf", "ivf_header_length_bad.ivf", "cut_half.mp4"),
+            *("moov_flips.mp4", "stsz_huge_size.mp4", "stco_past_end.mp4", "cut_half.mkv"),
+            *("ebml_size_bad.mkv", "starts_mid_obu.obu", "annexb_unit_size_bad.obu"),
+        ),
+        _NO_VIDEO,
+    ),
+    **dict.fromkeys(("wrong_fourcc.ivf", "h264.mp4", "h264.mkv"), ("NotAv1Error",)),
+    **dict.fromkeys(
+        (
+            *("flip_sequence_header_0.ivf", "flip_sequence_header_1.ivf"),
+            *("flip_frame_header_0.ivf", "flip_tile_data_3.ivf", "random_tile_data.ivf"),
+            *("no_key_frame.ivf", "no_sequence_header.ivf", "wide_dimensions.ivf"),
+            *("show_existing_empty_slot.ivf", "tile_size_past_end.ivf", "tile_size_tiny.ivf"),
+        ),
+        ("BitstreamError",),
+    ),
+    "huge_dimensions.ivf": ("LimitError",),
+}
+# Damage that the syntax does not show.
+_SILENT = ("flip_frame_header_2.ivf", "duplicated_tu.ivf", "reserved_obu_types.ivf")
+
+# Reads files in a process of its own: a crash or a hang must not take the tests with it.
+# One line of JSON a file, written before the next is touched.
+_WORKER = """
+import gc, json, resource, sys, time, warnings
+sys.path.insert(0, sys.argv[1])
+from test_damaged import digest
+from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.motion.reading import (read_motion)
+from colmap_av1.options import ReadOptions
+
+def peak():
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return used if sys.platform == "darwin" else 1024 * used
+
+for path in sys.argv[2:]:
+    outcome = {"file": path, "error": None, "strict_error": None, "digests": []}
+    before, start = peak(), time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            for frame in read_motion(path):
+                outcome["digests"].append([frame.decode_index, digest(vars(frame))])
+        except ColmapAv1Error as error:
+            outcome["error"] = type(error).__name__
+    outcome["warnings"] = [str(w.message) for w in caught]
+    gc.collect()  # what the error's traceback holds
+    try:
+        for frame in read_motion(path, ReadOptions(strict=True)):
+            pass
+    except ColmapAv1Error as error:
+        outcome["strict_error"] = type(error).__name__
+    outcome["grown"], outcome["seconds"] = peak() - before, time.perf_counter() - start
+    print(json.dumps(outcome), flush=True)
+"""
+
+
+def digest(fields: dict[str, NDArray[Any]]) -> str:
+    """Of a frame's unit arrays, whatever their shape and order in memory."""
+    state = hashlib.sha256()
+    for name in _UNIT_FIELDS:
+        state.update(np.ascontiguousarray(fields[name]).tobytes())
+    return state.hexdigest()
+
+
+def read_apart(paths: list[Path]) -> dict[str, dict[str, Any]]:
+    """What a process of its own makes of the files, by name; a crash or hang fails the test."""
+    command = [sys.executable, "-c", _WORKER, str(Path(__file__).parent), *map(str, paths)]
+    run = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=_TIMEOUT,
+        cwd=Path(__file__).parent,  # the checkout would hide the installed package
+    )
+    outcomes = [json.loads(line) for line in run.stdout.splitlines()]
+    if run.returncode != 0 or len(outcomes) != len(paths):
+        at = paths[len(outcomes)].name if len(outcomes) < len(paths) else "its end"
+        pytest.fail(f"status {run.returncode} at {at}: {run.stderr[-2000:]}")
+    return {Path(outcome["file"]).name: outcome for outcome in outcomes}
+
+
+def expected_digests(npz: Path) -> dict[int, tuple[int, str]]:
+    """Temporal unit and digest of every decoded frame of a stream, by decode_index."""
+    found = {}
+    with np.load(npz) as arrays:
+        want = dict(arrays)
+    for index in range(int(want["frames"])):
+        if want["h_show_existing_frame"][index] == 1:
+            continue
+        offset = int(want["h_unit_offset"][index])
+        count = int(want["h_mi_rows"][index] * want["h_mi_cols"][index])
+        units = {name: want[f"u_{name}"][offset : offset + count] for name in _UNIT_FIELDS}
+        if want["h_frame_type"][index] in (0, 2):  # as in conformance.py
+            units["skip_mode"] = np.zeros_like(units["skip_mode"])
+        found[index] = (int(want["h_temporal_unit"][index]), digest(units))
+    return found
+
+
+def packets_until_damage(path: Path) -> list[bytes]:
+    found: list[bytes] = []
+    with contextlib.suppress(ColmapAv1Error):
+        found.extend(packet.data for packet in packets(path))
+    return found
+
+
+def intact_units(damaged: Path, source: Path) -> int:
+    """Number of temporal units at the start that the damage left as they were."""
+    count = 0
+    for got, want in zip(packets_until_damage(damaged), packets_until_damage(source), strict=False):
+        if got != want:
+            break
+        count += 1
+    return count
+
+
+def bad_files() -> list[dict[str, Any]]:
+    manifest = _KIT / "bad" / "bad.json"
+    return list(json.loads(manifest.read_text())) if manifest.exists() else []
+
+
+@pytest.fixture(scope="module")
+def outcomes() -> dict[str, dict[str, Any]]:
+    return read_apart([_KIT / "bad" / bad["file"] for bad in bad_files()])
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("bad", bad_files(), ids=lambda bad: bad["file"])
+def test_damaged_file(bad: dict[str, Any], outcomes: dict[str, dict[str, Any]]) -> None:
+    name = bad["file"]
+    outcome = outcomes[name]
+    assert outcome["grown"] < 64 * _MEGABYTE
+    assert outcome["seconds"] < 20
+
+    if name in _ERRORS:
+        assert outcome["error"] in _ERRORS[name]
+        assert outcome["strict_error"] == outcome["error"]
+        assert outcome["digests"] == []
+        return
+    assert outcome["error"] is None
+    assert outcome["digests"] != []
+    if name in _SILENT:
+        assert (outcome["warnings"], outcome["strict_error"]) == ([], None)
+    else:
+        assert outcome["strict_error"] == "BitstreamError"
+        [warning] = outcome["warnings"]
+        assert f"the {len(outcome['digests'])} frames before the damage" in warning
+
+    source = Path(bad["derived_from"])
+    expected = expected_digests(_KIT / "expected" / f"{source.name.split('.')[0]}.npz")
+    if "same_result_as" in bad:
+        assert outcome["digests"] == [[i, value] for i, (_, value) in expected.items()]
+        return
+    intact = intact_units(_KIT / "bad" / name, _KIT / "streams" / source)
+    before = [[i, value] for i, (unit, value) in expected.items() if unit < intact]
+    assert before != []
+    assert outcome["digests"][: len(before)] == before
+
+
+def ivf(*units: bytes) -> bytes:
+    """An IVF file of the temporal units."""
+    header = struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"AV01", 64, 64, 25, 1, len(units), 0)
+    frames = (struct.pack("<IQ", len(unit), i) + unit for i, unit in enumerate(units))
+    return header + b"".join(frames)
+
+
+def obu(obu_type: int, payload: bytes) -> bytes:
+    assert len(payload) < 128
+    return bytes([obu_type << 3 | 2, len(payload)]) + payload
+
+
+def bits(*fields: tuple[int, int]) -> bytes:
+    """Fields (width, value) of a header, then a one and zeros to the next byte."""
+    text = "".join(f"{value:0{width}b}" for width, value in fields if width) + "1"
+    text += "0" * (-len(text) % 8)
+    return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
+
+
+def still_picture_sequence(width: int, height: int) -> bytes:
+    """A sequence header with still_picture and a reduced header (5.5.1)."""
+    return obu(
+        1,
+        bits(
+            *((3, 0), (1, 1), (1, 1), (5, 0)),  # profile, still_picture, reduced, level
+            *((4, 15), (4, 15), (16, width - 1), (16, height - 1)),
+            *((1, 0),) * 6,  # 64x64 superblocks, no optional tools
+            *((1, 0), (1, 0), (1, 0), (1, 0), (2, 0), (1, 0)),  # colors: 8 bit 4:2:0
+            (1, 0),  # no film grain
+        ),
+    )
+
+
+def still_picture(width: int, height: int, tile_data: bytes) -> bytes:
+    """A temporal unit with a still picture."""
+    # disable_cdf_update, allow_screen_content_tools, render_and_frame_size_different, then
+    # uniform tile spacing with no increment; zeros are a valid value for all that follows.
+    frame = bytes([0b00010000]) + bytes(11)
+    return obu(2, b"") + still_picture_sequence(width, height) + obu(6, frame + tile_data)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "error"),
+    [
+        (65536, 65536, "LimitError"),
+        (16385, 16384, "LimitError"),
+        (16384, 16384, "BitstreamError"),
+        (65536, 4096, "BitstreamError"),
+        (4096, 65536, "BitstreamError"),
+    ],
+)
+def test_declared_size_alone_costs_no_memory(
+    width: int, height: int, error: str, tmp_path: Path
+) -> None:
+    small, large = tmp_path / "small.ivf", tmp_path / "large.ivf"
+    small.write_bytes(ivf(still_picture(64, 64, b"\0")))
+    large.write_bytes(ivf(still_picture(width, height, b"\0" * 40)))
+    outcome = read_apart([small, large])["large.ivf"]
+    assert outcome["error"] == error
+    # The largest accepted size costs at most its unit grid, 8 bytes a unit.
+    limit = 32 if error == "LimitError" else 32 + width * height / 16 * 8 / _MEGABYTE
+    assert outcome["grown"] < limit * _MEGABYTE
+
+
+def test_limit_is_the_option_s() -> None:
+    stream = _DATA / "aq1.ivf"
+    first = next(read_motion(stream))
+    samples = first.width * first.height
+    next(read_motion(stream, ReadOptions(max_frame_size=samples)))
+    with pytest.raises(LimitError, match="allow more with max_frame_size"):
+        next(read_motion(stream, ReadOptions(max_frame_size=samples - 1)))
+
+
+def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
+    # Two tiles of one superblock; a header with uniform spacing, one increment, base_q_idx 255.
+    start = obu(2, b"") + still_picture_sequence(128, 64)
+    start += obu(3, bytes([0b00011000, 255, 0, 0, 0, 0x80]))
+    tile = b"\x07\x80"
+    first, damaged, second = (
+        obu(4, bytes([number]) + data)
+        for number, data in ((0b10000000, tile), (0b10000000, b"\x07\x81"), (0b11100000, tile))
+    )
+    parser = _core.Parser()
+    parser.parse(start + first + second)
+    assert len(parser.take_events()) == 1
+    with pytest.raises(_core.BitstreamError):
+        parser.parse(start + damaged)
+    with pytest.raises(_core.BitstreamError, match="tile group without a frame header"):
+        parser.parse(second)
+    assert parser.take_events() == []
+    parser.parse(start + first + second)
+    assert len(parser.take_events()) == 1
+
+
+# --- any damage to a small stream -------------------------------------------------------------
+
+_SMALL = [_DATA / name for name in ("svt4_p6.ivf", "gm_affine.ivf", "screen_444.ivf")]
+
+
+def frames_before_error(path: Path) -> Iterator[FrameMotion]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield from read_motion(path, ReadOptions(num_threads=1))
+    except ColmapAv1Error:
+        return
+
+
+def frame_digests(frames: Iterator[FrameMotion]) -> list[tuple[int, int, str]]:
+    return [(f.header["temporal_unit"], f.decode_index, digest(vars(f))) for f in frames]
+
+
+@pytest.fixture(scope="module")
+def undamaged() -> dict[Path, list[tuple[int, int, str]]]:
+    return {path: frame_digests(read_motion(path)) for path in _SMALL}
+
+
+@st.composite
+def damages(draw: st.DrawFn) -> tuple[Path, bytes, int]:
+    """A stream, its damaged file, and the number of its bytes before the damage."""
+    path = draw(st.sampled_from(_SMALL))
+    data = path.read_bytes()
+    start = draw(st.integers(0, len(data) - 1))
+    length = draw(st.integers(1, 200))
+    kind = draw(st.sampled_from(["flip", "cut", "drop", "repeat", "random"]))
+    if kind == "flip":
+        flipped = data[start] ^ (1 << draw(st.integers(0, 7)))
+        return path, data[:start] + bytes([flipped]) + data[start + 1 :], start
+    if kind == "cut":
+        return path, data[:start], start
+    if kind == "drop":
+        return path, data[:start] + data[start + length :], start
+    if kind == "repeat":
+        part = data[start : start + length]
+        return path, data[: start + length] + part + data[start + length :], start + len(part)
+    part = draw(st.binary(min_size=1, max_size=length))
+    return path, data[:start] + part + data[start + len(part) :], start
+
+
+def units_before(data: bytes, position: int) -> int:
+    """Number of temporal units of an IVF file that end at or before a position."""
+    count, at = 0, 32
+    while at + 12 <= len(data):
+        at += 12 + struct.unpack_from("<I", data, at)[0]
+        if at > position:
+            break
+        count += 1
+    return count
+
+
+_SETTINGS = settings(
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@_SETTINGS
+@given(damage=damages())
+def test_any_damage_leaves_the_frames_before_it(
+    damage: tuple[Path, bytes, int],
+    undamaged: dict[Path, list[tuple[int, int, str]]],
+    tmp_path: Path,
+) -> None:
+    source, data, position = damage
+    file = tmp_path / "damaged.ivf"
+    file.write_bytes(data)
+    found = frame_digests(frames_before_error(file))
+    if not found:
+        return  # the demuxer looks at some packets before it gives the first
+    intact = units_before(source.read_bytes(), position)
+    before = [frame for frame in undamaged[source] if frame[0] < intact]
+    assert found[: len(before)] == before
+
+
+@_SETTINGS
+@given(damage=damages())
+def test_parser_survives_any_damage_and_what_follows(
+    damage: tuple[Path, bytes, int], undamaged: dict[Path, list[tuple[int, int, str]]]
+) -> None:
+    source, data, position = damage
+    whole = source.read_bytes()
+    parser = _core.Parser()
+    found: list[tuple[int, str]] = []
+    failed_at = None
+    for index, unit in enumerate([*split_units(data), *split_units(whole)]):
+        try:
+            parser.parse(unit)
+        except (_core.BitstreamError, _core.LimitError):
+            failed_at = index if failed_at is None else failed_at
+        for event in parser.take_events():
+            if not event.header()["show_existing_frame"]:
+                found.append((index, digest(event.take_units())))
+    intact = units_before(whole, position)
+    assert failed_at is None or failed_at >= intact
+    expected = undamaged[source]
+    assert [f for f in found if f[0] < intact] == [(u, d) for u, _, d in expected if u < intact]
+    # The streams start with a key frame that forgets everything: the last reading is exact.
+    assert [d for _, d in found[-len(expected) :]] == [d for _, _, d in expected]
+
+
+def split_units(data: bytes) -> list[bytes]:
+    units, at = [], 32
+    while at + 12 <= len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        units.append(data[at + 12 : at + 12 + size])
+        at += 12 + size
+    return units
+
+
+def test_damage_before_the_first_frame_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "damaged.ivf"
+    file.write_bytes(ivf(obu(2, b"") + obu(6, b"\0" * 20)))
+    with pytest.raises((BitstreamError, ColmapAv1Error)):
+        list(read_motion(file))
+
+
+def unit_arrays(units: tuple[int, int]) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        name: np.zeros(units, dtype=np.uint8)
+        for name in ("is_inter", "use_intrabc", "motion_mode", "interintra", "mi_size", "y_mode")
+    }
+    arrays |= {
+        "mv": np.zeros((*units, 2, 2), dtype=np.int16),
+        "ref_frame": np.zeros((*units, 2), dtype=np.int8),
+        "warp_index": np.full(units, -1, dtype=np.int32),
+        "local_warp_params": np.zeros((0, 6), dtype=np.int32),
+        "gm_type": np.zeros(7, dtype=np.int32),
+        "gm_params": np.zeros((7, 6), dtype=np.int32),
+        "ref_size": np.zeros((8, 2), dtype=np.int32),
+    }
+    return arrays
+
+
+@pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537])
+def test_sizes_no_frame_has_are_refused(size: int) -> None:
+    arguments = unit_arrays((2, 2))
+    with pytest.raises(ValueError, match="1 to 65536"):
+        _core.displacement(0, **arguments, width=size, height=8)
+    with pytest.raises(ValueError, match="1 to 65536"):
+        _core.displacement(0, **arguments, width=8, height=size)
+
+
+@pytest.mark.parametrize("units", [(0, 0), (1, 2), (2, 1)])
+def test_a_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="larger than its 4x4 units"):
+        _core.displacement(0, **unit_arrays(units), width=8, height=8)

@@ -1,0 +1,68 @@
+import re
+from itertools import pairwise
+
+import pytest
+from conftest import PROJECT
+
+CORE = PROJECT / "colmap_av1" / "csrc" / "av1"
+DEFINITION = re.compile(r"^const (std::\w+) (\w+)((?:\[\d+\])+) = (\{.*?\});$", re.M | re.S)
+DECLARATION = re.compile(r"^extern const (std::\w+) (\w+)((?:\[\d+\])+);$", re.M)
+
+
+def read_tables(stem: str) -> dict[str, tuple[tuple[int, ...], list[int]]]:
+    text = (CORE / f"{stem}.cc").read_text(encoding="utf-8")
+    return {
+        name: (
+            tuple(int(dim) for dim in re.findall(r"\d+", dims)),
+            [int(value) for value in re.findall(r"-?\d+", body)],
+        )
+        for _, name, dims, body in DEFINITION.findall(text)
+    }
+
+
+def test_every_cdf_row_increases_to_one_and_ends_with_its_counter():
+    cdfs = read_tables("default_cdfs")
+    assert len(cdfs) == 96
+    for name, (dims, values) in cdfs.items():
+        for start in range(0, len(values), dims[-1]):
+            row = values[start : start + dims[-1]]
+            assert row[-2:] == [32768, 0], name
+            assert row[0] > 0, name
+            assert all(a < b for a, b in pairwise(row[:-1])), name
+
+
+@pytest.mark.parametrize("stem", ["default_cdfs", "spec_tables"])
+def test_declarations_match_definitions(stem):
+    source = (CORE / f"{stem}.cc").read_text(encoding="utf-8")
+    header = (CORE / f"{stem}.h").read_text(encoding="utf-8")
+    assert DECLARATION.findall(header) == [match[:3] for match in DEFINITION.findall(source)]
+
+
+@pytest.mark.parametrize("stem", ["default_cdfs", "spec_tables"])
+def test_arrays_hold_as_many_values_as_stated(stem):
+    for name, (dims, values) in read_tables(stem).items():
+        size = 1
+        for dim in dims:
+            size *= dim
+        assert len(values) == size, name
+
+
+def test_every_scan_visits_each_position_once():
+    scans = {k: v for k, v in read_tables("spec_tables").items() if "Scan" in k}
+    assert len(scans) == 32
+    for name, (_, values) in scans.items():
+        width, height = (int(side) for side in re.findall(r"\d+", name))
+        assert sorted(values) == list(range(width * height)), name
+
+
+def test_block_sizes_agree_with_their_names():
+    constants = dict(
+        re.findall(r"int (BLOCK_\d+X\d+) = (\d+);", (CORE / "constants.h").read_text("utf-8"))
+    )
+    tables = read_tables("spec_tables")
+    assert len(constants) == 22
+    for name, index in constants.items():
+        width, height = (int(side) for side in re.findall(r"\d+", name))
+        assert tables["kBlockWidth"][1][int(index)] == width
+        assert tables["kBlockHeight"][1][int(index)] == height
+        assert tables["kMiWidthLog2"][1][int(index)] == (width // 4).bit_length() - 1

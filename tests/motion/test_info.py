@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import AV1, Encode, Ffmpeg, make_frames
+
+from colmap_av1.motion.info import inspect
+
+
+def test_good_stream(clip: Path) -> None:
+    report = inspect(clip)
+    assert report.good
+    assert (report.width, report.height, report.display.rotation) == (192, 128, 0)
+    assert (report.num_shown, report.num_coded, report.num_key_frames) == (16, 16, 1)
+    assert report.inter_share > 0.6
+    assert report.reference_distances[-1] > 0.5
+    assert sum(report.reference_distances.values()) == pytest.approx(1)
+    assert 2 <= report.median_motion <= 4
+    size = clip.stat().st_size
+    assert 0.9 * size < report.bytes_per_frame * 16 < size
+    assert report.bits_per_pixel == pytest.approx(report.bytes_per_frame * 8 / (192 * 128))
+
+
+def test_pyramid_references_the_future(encode: Encode, tmp_path: Path) -> None:
+    how = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "19", "-crf", "20"]
+    report = inspect(encode(make_frames(20), tmp_path / "pyramid.mp4", *how))
+    assert report.num_shown == 20
+    assert max(report.reference_distances) > 0
+    assert sum(report.reference_distances.values()) + report.hidden_reference_share == (
+        pytest.approx(1)
+    )
+
+
+def test_rotation_is_reported(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    turned = ffmpeg("-display_rotation", "90", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
+    assert inspect(turned).display.rotation == 90
+
+
+@pytest.mark.parametrize(
+    ("frames", "how", "reason"),
+    [
+        (make_frames(6), [*AV1[:-1], "1"], "every frame is intra coded"),
+        (make_frames(12), [*AV1[:-1], "3"], "a key frame every 3.0 frames"),
+        (make_frames(2), AV1, "only 2 frames"),
+        (np.repeat(make_frames(1), 12, axis=0), AV1, "the camera hardly moves"),
+        (np.array([cv2.blur(f, (31, 31)) for f in make_frames(12)]), AV1, "a low rate"),
+    ],
+    ids=["intra", "key frames", "short", "still", "low rate"],
+)
+def test_poor_streams(
+    encode: Encode, tmp_path: Path, frames: np.ndarray, how: list[str], reason: str
+) -> None:
+    if reason == "a low rate":
+        how = ["63" if word == "20" else word for word in how]
+    report = inspect(encode(frames, tmp_path / "poor.mp4", *how))
+    assert not report.good
+    assert any(reason in r for r in report.reasons), report.reasons

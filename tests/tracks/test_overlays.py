@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from conftest import PROJECT
+from hypothesis import given
+from hypothesis import strategies as st
+
+import colmap_av1
+from colmap_av1.tracks.overlays import remove_overlays
+from colmap_av1.tracks.tracks import Tracks
+
+SCENE = PROJECT / "examples" / "scene.mp4"
+
+
+def make_tracks(paths: list[tuple[int, np.ndarray]], num_frames: int) -> Tracks:
+    """Tracks from (first frame, positions [n, 2])."""
+    lengths = [len(xy) for _, xy in paths]
+    total = sum(lengths)
+    return Tracks(
+        *(num_frames, 640, 480),
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        frame=np.concatenate([f + np.arange(len(xy)) for f, xy in paths]).astype(np.int32),
+        xy=np.concatenate([xy for _, xy in paths]).astype(np.float32),
+        sigma=np.zeros(total, dtype=np.float32),
+        confirmed=np.zeros(total, dtype=np.bool_),
+    )
+
+
+def moving(step: float, length: int) -> np.ndarray:
+    return 100 + step * np.arange(length)[:, None] * [0.6, 0.8]
+
+
+@given(
+    step=st.floats(0, 20),
+    length=st.integers(2, 20),
+    num_still=st.integers(1, 4),
+    at_rest=st.integers(0, 30),
+)
+def test_only_what_stands_still_before_a_moving_picture_goes(
+    step: float, length: int, num_still: int, at_rest: int
+) -> None:
+    still = [(at_rest, np.full((length, 2), 50.0 + i)) for i in range(num_still)]
+    others = [(at_rest, moving(step, length)) for _ in range(num_still + 1)]
+    # Tracks of the frames before, in which the camera rests.
+    resting = [(0, np.full((at_rest, 2), 9.0))] * (at_rest > 1)
+    tracks = make_tracks(still + others + resting, at_rest + length)
+    kept = remove_overlays(tracks)
+    if step * (length - 1) >= 4.01:
+        expected = make_tracks(others + resting, at_rest + length)
+        np.testing.assert_array_equal(kept.offsets, expected.offsets)
+        np.testing.assert_array_equal(kept.xy, expected.xy)
+    elif step * (length - 1) < 3.99:
+        assert kept is tracks
+
+
+def test_no_tracks() -> None:
+    tracks = make_tracks([(0, moving(1, 2))], 2)
+    none = remove_overlays(
+        Tracks(
+            5,
+            640,
+            480,
+            np.zeros(1, np.int64),
+            *(a[:0] for a in (tracks.frame, tracks.xy)),
+            tracks.sigma[:0],
+            tracks.confirmed[:0],
+        )
+    )
+    assert none.offsets.tolist() == [0]
+
+
+@pytest.mark.slow
+def test_logo_over_a_clip(tmp_path: Path) -> None:
+    logo = np.zeros((80, 160, 4), dtype=np.uint8)
+    cv2.putText(logo, "LOGO", (8, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.8, (255, 255, 255, 255), 8)
+    cv2.imwrite(str(tmp_path / "logo.png"), logo)
+    clip = tmp_path / "clip.mp4"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(SCENE), "-i"]
+    command += [str(tmp_path / "logo.png"), "-filter_complex", "overlay=20:20", "-frames:v", "24"]
+    command += ["-c:v", "libaom-av1", "-usage", "realtime", "-cpu-used", "8", "-lag-in-frames", "0"]
+    subprocess.run([*command, "-crf", "20", "-b:v", "0", str(clip)], check=True)
+    tracks = colmap_av1.build_tracks(colmap_av1.read_motion(clip))
+    kept = remove_overlays(tracks)
+
+    def still_in_logo(t: Tracks) -> int:
+        begin, end = t.xy[t.offsets[:-1]], t.xy[t.offsets[1:] - 1]
+        inside = np.all((begin > 28) & (begin < [172, 92]), axis=1)
+        return int(np.count_nonzero(inside & (np.abs(end - begin).max(axis=1) <= 0.05)))
+
+    assert still_in_logo(tracks) > 20
+    # A few move a little to and fro.
+    assert still_in_logo(kept) < 0.15 * still_in_logo(tracks)
+    num_left_out = len(tracks.offsets) - len(kept.offsets)
+    assert num_left_out < 2 * still_in_logo(tracks)

@@ -1,0 +1,226 @@
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import render_scene
+from conftest import PROJECT
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import RefineOptions
+from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks
+from colmap_av1.video.decoding import decode_frames
+
+WIDTH, HEIGHT, FRAMES = 320, 240, 12
+LK = RefineOptions(refine="lk")
+STEP = np.array([1.3, -0.45])
+FLAT = 80  # columns on the left without texture
+EXAMPLES = PROJECT / "examples"
+EXAMPLE = EXAMPLES / "scene.mp4"
+
+
+def texture(size: int, seed: int = 0) -> NDArray[np.float32]:
+    noise = np.random.default_rng(seed).normal(size=(size, size)).astype(np.float32)
+    return np.asarray(128 + 160 * cv2.GaussianBlur(noise, (0, 0), 1.6), np.float32)
+
+
+def pictures(noise: float = 1.0) -> list[tuple[int, NDArray[np.uint8]]]:
+    """A textured plane that moves by STEP a frame behind a flat strip that stays."""
+    rng = np.random.default_rng(1)
+    plane = texture(512)
+    frames = []
+    for index in range(FRAMES):
+        centre = (256.0, 256.0) - index * STEP
+        patch = cv2.getRectSubPix(plane, (WIDTH, HEIGHT), (float(centre[0]), float(centre[1])))
+        patch[:, :FLAT] = 90
+        patch += rng.normal(0, noise, patch.shape)
+        frames.append((index, np.clip(np.rint(patch), 0, 255).astype(np.uint8)))
+    return frames
+
+
+def moving_tracks(step_error: float, seed: int = 2) -> tuple[Tracks, NDArray[np.float64]]:
+    """Tracks whose steps are wrong by some px, and where they truly go."""
+    rng = np.random.default_rng(seed)
+    start = rng.uniform((30, 40), (WIDTH - 40, HEIGHT - 30), (800, 2))
+    start = start[np.abs(start[:, 0] - FLAT) > 25]
+    moves = np.where(start[:, :1] > FLAT, STEP, 0.0)
+    truth = start[:, None] + np.arange(FRAMES)[:, None] * moves[:, None]
+    errors = rng.normal(0, step_error, truth.shape)
+    errors[:, 0] = 0
+    xy = (truth + np.cumsum(errors, axis=1)).astype(np.float32).reshape(-1, 2)
+    sigma = np.tile(step_error * np.sqrt(np.arange(FRAMES)), len(start)).astype(np.float32)
+    tracks = Tracks(
+        num_frames=FRAMES,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=np.arange(len(start) + 1, dtype=np.int64) * FRAMES,
+        frame=np.tile(np.arange(FRAMES, dtype=np.int32), len(start)),
+        xy=xy,
+        sigma=sigma,
+        confirmed=np.zeros(len(xy), bool),
+    )
+    return tracks, truth.reshape(-1, 2)
+
+
+def is_textured(tracks: Tracks) -> NDArray[np.bool_]:
+    first = tracks.xy[tracks.offsets[:-1], 0]
+    return np.asarray(np.repeat(first > FLAT, np.diff(tracks.offsets)))
+
+
+def test_errors_shrink_and_do_not_add_up() -> None:
+    tracks, truth = moving_tracks(0.3)
+    refined = refine_tracks(tracks, pictures(), LK)
+    textured = is_textured(tracks)
+    later = tracks.frame > 0
+    assert refined.confirmed[textured & later].mean() > 0.98
+    error = np.linalg.norm(refined.xy - truth, axis=1)
+    before = np.linalg.norm(tracks.xy - truth, axis=1)
+    last = textured & (tracks.frame == FRAMES - 1)
+    assert np.median(before[last]) > 1.0
+    assert np.median(error[last]) < 0.06
+    assert np.percentile(error[textured & refined.confirmed], 99) < 0.3
+    # Sure of it, and not surer than the errors are small.
+    sure = last & refined.confirmed
+    assert np.median(refined.sigma[sure] / tracks.sigma[sure]) < 0.5
+    assert np.sqrt(np.mean(error[sure] ** 2)) < np.sqrt(np.mean(refined.sigma[sure] ** 2))
+
+
+def test_what_pixels_cannot_confirm_keeps_the_bitstreams_steps() -> None:
+    tracks, _ = moving_tracks(0.3)
+    refined = refine_tracks(tracks, pictures(), LK)
+    flat = ~is_textured(tracks)
+    assert flat.sum() > 200
+    assert not refined.confirmed[flat].any()
+    np.testing.assert_allclose(refined.xy[flat], tracks.xy[flat], atol=1e-4)
+    np.testing.assert_allclose(refined.sigma[flat], tracks.sigma[flat], rtol=1e-4)
+    assert len(refined.frame) == len(tracks.frame)
+
+
+def test_a_wrong_step_is_not_confirmed_and_gets_lost_for_good() -> None:
+    tracks, truth = moving_tracks(0.05)
+    # From frame 5 on every third track is 8 px off.
+    off = np.repeat(np.arange(len(tracks.offsets) - 1) % 3 == 0, FRAMES) & (tracks.frame >= 5)
+    tracks.xy[off] += np.float32(8)
+    refined = refine_tracks(tracks, pictures(), LK)
+    textured = is_textured(tracks)
+    at_jump = off & textured & (tracks.frame == 5)
+    assert refined.confirmed[at_jump].mean() < 0.1
+    error = np.linalg.norm(refined.xy - truth, axis=1)
+    # A new template is taken where it is: it may be confirmed again, its error as large as said.
+    np.testing.assert_allclose(np.median(error[at_jump]), 8 * np.sqrt(2), atol=0.3)
+    assert np.median(error[textured & ~off]) < 0.06
+
+
+def test_frames_that_are_missing_keep_the_bitstreams_steps() -> None:
+    tracks, truth = moving_tracks(0.3)
+    shown = [frame for frame in pictures() if frame[0] not in (4, 5, FRAMES - 1)]
+    refined = refine_tracks(tracks, shown, LK)
+    missing = np.isin(tracks.frame, (4, 5, FRAMES - 1))
+    assert not refined.confirmed[missing].any()
+    steps = np.flatnonzero(missing)
+    np.testing.assert_allclose(
+        refined.xy[steps] - refined.xy[steps - 1],
+        tracks.xy[steps] - tracks.xy[steps - 1],
+        atol=1e-3,
+    )
+    # Later frames find the template again.
+    later = is_textured(tracks) & (tracks.frame == 8)
+    assert np.median(np.linalg.norm((refined.xy - truth)[later], axis=1)) < 0.06
+
+
+def test_no_refinement_reads_no_frames() -> None:
+    def frames() -> Any:
+        pytest.fail("read")
+        yield
+
+    tracks, _ = moving_tracks(0.3)
+    assert refine_tracks(tracks, frames(), RefineOptions(refine="none")) is tracks
+
+
+def test_threads_and_colour_do_not_change_the_result() -> None:
+    tracks, _ = moving_tracks(0.3)
+    frames = pictures()
+    first = refine_tracks(tracks, frames, LK)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        again = refine_tracks(tracks, frames, LK)
+    finally:
+        cv2.setNumThreads(threads)
+    in_colour = ((i, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)) for i, image in frames)
+    for other in (again, refine_tracks(tracks, in_colour, LK)):
+        for name in ("xy", "sigma", "confirmed"):
+            assert getattr(first, name).tobytes() == getattr(other, name).tobytes()
+
+
+def test_frames_of_another_size_or_order_are_refused() -> None:
+    tracks, _ = moving_tracks(0.3)
+    frames = pictures()
+    small = [(0, frames[0][1][:-2])]
+    with pytest.raises(ImageError, match="320x238"):
+        refine_tracks(tracks, small, LK)
+    with pytest.raises(ImageError, match="order"):
+        refine_tracks(tracks, [frames[1], frames[0]], LK)
+    with pytest.raises(ImageError, match="order"):
+        refine_tracks(tracks, [(FRAMES, frames[0][1])], LK)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"refine": "sift"},
+        {"refine_window": 8},
+        {"refine_window": 3},
+        {"refine_move": 0.0},
+        {"refine_difference": float("nan")},
+    ],
+)
+def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
+    tracks, _ = moving_tracks(0.3)
+    with pytest.raises(OptionError, match=next(iter(options))):
+        refine_tracks(tracks, [], RefineOptions(**options))
+
+
+def test_progress_counts_frames() -> None:
+    tracks, _ = moving_tracks(0.3)
+    seen: list[int] = []
+    refine_tracks(tracks, pictures(), LK, seen.append)
+    assert seen == list(range(1, FRAMES + 1))
+
+
+def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
+    tracks = build_tracks(read_motion(EXAMPLE))
+    refined = refine_tracks(tracks, decode_frames(EXAMPLE), LK)
+    later = np.ones(len(tracks.frame), bool)
+    later[tracks.offsets[:-1]] = False
+    assert refined.confirmed[later].mean() > 0.9
+    np.testing.assert_array_equal(refined.xy[~later], tracks.xy[~later])
+    np.testing.assert_array_equal(refined.offsets, tracks.offsets)
+
+    scene = render_scene.build_scene()
+    # Tracks that start in every twentieth frame, four steps later.
+    start = tracks.offsets[:-1][np.diff(tracks.offsets) > 4]
+    start = start[(tracks.frame[start] % 20 == 0) & (tracks.frame[start + 4] % 20 == 4)]
+    truth = np.full((len(start), 2), np.nan)
+    for first in np.unique(tracks.frame[start]):
+        of_first = np.flatnonzero(tracks.frame[start] == first)
+        there, visible = render_scene.transfer(
+            scene, tracks.xy[start[of_first]], int(first), int(first) + 4
+        )
+        truth[of_first[visible]] = there[visible]
+    for found, largest in ((tracks, 0.11), (refined, 0.09)):
+        errors = np.clip(found.xy[start + 4] - truth, -4, 4)
+        seen = np.isfinite(errors).all(axis=1)
+        assert seen.sum() > 2000
+        assert np.median(np.abs(errors[seen])) < largest
+        # In every third of the expected error, surest first, it is of the right size.
+        order = np.argsort(found.sigma[start + 4][seen])
+        for part in np.array_split(order, 3):
+            expected = np.sqrt(np.mean(found.sigma[start + 4][seen][part] ** 2))
+            actual = np.sqrt(np.mean(errors[seen][part] ** 2))
+            assert 0.5 < actual / expected < 2

@@ -1,0 +1,942 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import TrackOptions
+from colmap_av1.tracks.tracks import Tracks, build_tracks, keep_long_tracks
+
+BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32 = 0, 3, 6, 9
+NEWMV, GLOBALMV = 16, 15
+LOCALWARP = 2
+LAST, GOLDEN, ALTREF = 1, 4, 7
+ONE = 1 << 16
+# No rule of trust: every displacement counts.
+OPEN = TrackOptions(
+    cosine=None,
+    max_interval=None,
+    max_block_area=None,
+    max_uncoded_block_area=None,
+    smoothness=None,
+    border=None,
+    interpolation=None,
+    bridge=None,
+)
+# The rules of trust that do not depend on how large the picture is.
+SMALL_PICTURES = TrackOptions(border=None)
+
+# A list's motion: (dx, dy) in px for all units, or an int16 array [rows, cols, 2] (row, col).
+Motion = tuple[float, float] | NDArray[np.int16]
+
+
+def frame(
+    decode: int,
+    display: int | None = None,
+    refs: dict[int, tuple[int, int]] | None = None,
+    motion: Sequence[tuple[int, Motion]] = (),
+    *,
+    width: int = 64,
+    height: int = 48,
+    ref_sizes: dict[int, tuple[int, int]] | None = None,
+    slots: Iterable[int] | None = None,
+    mi_size: int = BLOCK_4X4,
+    shown: bool = True,
+) -> FrameMotion:
+    """A coded frame whose list l references motion[l][0] by motion[l][1].
+
+    refs maps RefFrame to the (decode, display) index of the frame behind it. Slots hold
+    this frame and its references unless given. Without motion, the frame is intra. A
+    frame that is not shown at once (shown=False) waits for a later one's showing.
+    """
+    refs = refs or {}
+    rows, cols = 2 * ((height + 7) // 8), 2 * ((width + 7) // 8)
+    ref_frame = np.full((rows, cols, 2), -1, np.int8)
+    mv = np.zeros((rows, cols, 2, 2), np.int16)
+    if not motion:
+        ref_frame[..., 0] = 0
+    for index, (ref, vector) in enumerate(motion):
+        ref_frame[..., index] = ref
+        if isinstance(vector, tuple):
+            mv[..., index, :] = round(8 * vector[1]), round(8 * vector[0])
+        else:
+            mv[..., index, :] = vector
+    ref_decode_index = np.full(8, -1, np.int32)
+    ref_display_index = np.full(8, -1, np.int32)
+    ref_size = np.zeros((8, 2), np.int32)
+    for ref, (ref_decode, ref_display) in refs.items():
+        ref_decode_index[ref] = ref_decode
+        ref_display_index[ref] = ref_display
+        ref_size[ref] = (ref_sizes or {}).get(ref, (width, height))
+    kept = [decode, *(d for d, _ in refs.values())] if slots is None else list(slots)
+    units = {
+        name: np.zeros((rows, cols), np.uint8)
+        for name in (
+            "skip",
+            "skip_mode",
+            "segment_id",
+            "motion_mode",
+            "compound_type",
+            "interintra",
+            "use_intrabc",
+        )
+    }
+    return FrameMotion(
+        decode_index=decode,
+        display_index=decode if display is None else display,
+        width=width,
+        height=height,
+        header={
+            "frame_width": width,
+            "show_frame": int(shown),
+            "force_integer_mv": 0,
+            "gm_type": np.zeros(7, np.int32),
+            "gm_params": np.tile(np.array([0, 0, ONE, 0, 0, ONE], np.int32), (7, 1)),
+        },
+        ref_decode_index=ref_decode_index,
+        ref_display_index=ref_display_index,
+        ref_size=ref_size,
+        slot_decode_index=np.resize(np.array(kept, np.int32), 8),
+        ref_frame=ref_frame,
+        mv=mv,
+        mi_size=np.full((rows, cols), mi_size, np.uint8),
+        y_mode=np.full((rows, cols), NEWMV if motion else 0, np.uint8),
+        is_inter=np.full((rows, cols), 1 if motion else 0, np.uint8),
+        warp_index=np.full((rows, cols), -1, np.int32),
+        local_warp_params=np.zeros((0, 6), np.int32),
+        **units,
+    )
+
+
+def low_delay(motions: Sequence[Motion], **keywords: Any) -> list[FrameMotion]:
+    """A key frame, then one frame for each motion into the frame before."""
+    frames = [frame(0, **keywords)]
+    for i, vector in enumerate(motions, start=1):
+        frames.append(frame(i, refs={LAST: (i - 1, i - 1)}, motion=[(LAST, vector)], **keywords))
+    return frames
+
+
+def displacement(motion: FrameMotion, list_index: int = 0) -> NDArray[np.float32]:
+    return _core.displacement(
+        list_index,
+        motion.mv,
+        motion.ref_frame,
+        motion.is_inter,
+        motion.use_intrabc,
+        motion.motion_mode,
+        motion.interintra,
+        motion.mi_size,
+        motion.warp_index,
+        motion.local_warp_params,
+        motion.header["gm_type"],
+        motion.header["gm_params"],
+        motion.y_mode,
+        motion.ref_size,
+        motion.header["frame_width"],
+        motion.height,
+        bool(motion.header["force_integer_mv"]),
+    )
+
+
+def split(tracks: Tracks) -> list[tuple[NDArray[np.int32], NDArray[np.float32]]]:
+    return [
+        (tracks.frame[a:b], tracks.xy[a:b])
+        for a, b in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True)
+    ]
+
+
+def check_invariants(tracks: Tracks, min_length: int, cell: int = 4) -> None:
+    lengths = np.diff(tracks.offsets)
+    assert tracks.offsets[0] == 0
+    assert tracks.offsets[-1] == len(tracks.frame) == len(tracks.xy)
+    assert len(tracks.sigma) == len(tracks.confirmed) == len(tracks.frame)
+    assert not tracks.confirmed.any()
+    assert (lengths >= min_length).all()
+    inside = np.ones(len(tracks.frame), bool)
+    inside[tracks.offsets[:-1]] = False
+    assert (np.diff(tracks.frame, prepend=-1)[inside] > 0).all()
+    assert np.isfinite(tracks.sigma).all()
+    assert (tracks.sigma[inside] > 0).all()
+    assert (tracks.sigma >= 0).all()
+    assert ((tracks.xy >= 0) & (tracks.xy < (tracks.width, tracks.height))).all()
+    assert ((tracks.frame >= 0) & (tracks.frame < tracks.num_frames)).all()
+    cells = np.column_stack([tracks.frame, np.floor(tracks.xy / cell).astype(np.int32)])
+    assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+def warp_units(motion: FrameMotion, params: Sequence[int]) -> FrameMotion:
+    """All units as LOCALWARP blocks of one model; the mv is nonsense."""
+    return replace(
+        motion,
+        motion_mode=np.full_like(motion.motion_mode, LOCALWARP),
+        mi_size=np.full_like(motion.mi_size, BLOCK_8X8),
+        warp_index=np.zeros_like(motion.warp_index),
+        local_warp_params=np.array([params], np.int32),
+        mv=np.full_like(motion.mv, 999),
+    )
+
+
+def similarity_params(angle: float, zoom: float, shift: tuple[float, float]) -> list[int]:
+    """Warp parameters of p -> zoom R p + shift in corner-origin coordinates."""
+    c, s = zoom * math.cos(angle), zoom * math.sin(angle)
+    # In coordinates that are zero at the first pixel's centre.
+    tx = shift[0] + 0.5 * (c - s) - 0.5
+    ty = shift[1] + 0.5 * (s + c) - 0.5
+    return [round(v * ONE) for v in (tx, ty, c, -s, s, c)]
+
+
+# displacement
+
+
+def test_displacement_of_a_translation_is_the_vector() -> None:
+    motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (1.375, -2.25))])
+    assert (displacement(motion) == (1.375, -2.25)).all()
+    assert np.isnan(displacement(motion, 1)).all()
+    assert displacement(motion).dtype == np.float32
+
+
+def test_displacement_of_intra_blocks_is_nan() -> None:
+    motion = frame(0)
+    assert np.isnan(displacement(motion)).all()
+    copied = replace(
+        motion, is_inter=np.ones_like(motion.is_inter), use_intrabc=np.ones_like(motion.skip)
+    )
+    assert np.isnan(displacement(copied)).all()
+
+
+def test_displacement_of_a_warp_has_its_origin_at_the_pixel_corner() -> None:
+    motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (0, 0))])
+    params = similarity_params(0.02, 1.05, (3.0, -2.0))
+    found = displacement(warp_units(motion, params))
+    rows, cols = np.mgrid[0 : found.shape[0], 0 : found.shape[1]]
+    x, y = 4.0 * cols + 2, 4.0 * rows + 2
+    c, s = 1.05 * math.cos(0.02), 1.05 * math.sin(0.02)
+    expected = np.stack([c * x - s * y + 3 - x, s * x + c * y - 2 - y], axis=-1)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def global_warp(block: int, **changes: Any) -> FrameMotion:
+    motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (1.0, 2.0))], mi_size=block)
+    motion.header["gm_type"][0] = 2
+    motion.header["gm_params"][0] = similarity_params(0.01, 1.01, (0.0, 0.0))
+    return replace(motion, y_mode=np.full_like(motion.y_mode, GLOBALMV), **changes)
+
+
+def test_global_warp_applies_where_the_specification_says() -> None:
+    def is_translation(motion: FrameMotion) -> bool:
+        return bool((displacement(motion) == (1.0, 2.0)).all())
+
+    warped = global_warp(BLOCK_8X8)
+    assert not is_translation(warped)
+    np.testing.assert_allclose(
+        displacement(warped)[0, 0],
+        np.array([[0.01, -0.0101], [0.0101, 0.01]]) @ (2, 2),
+        atol=2e-3,
+    )
+    assert is_translation(global_warp(BLOCK_4X4))
+    assert is_translation(replace(warped, y_mode=np.full_like(warped.y_mode, NEWMV)))
+    assert is_translation(replace(warped, header=warped.header | {"force_integer_mv": 1}))
+    scaled = warped.ref_size.copy()
+    scaled[LAST] = 128, 96
+    assert is_translation(replace(warped, ref_size=scaled))
+    sheared = warped.header["gm_params"].copy()
+    sheared[0, 3] = 10000  # 7 |beta| reaches 1: the shear is not valid (7.11.3.6)
+    assert is_translation(replace(warped, header=warped.header | {"gm_params": sheared}))
+
+
+def test_displacement_refuses_indices_outside_its_tables() -> None:
+    motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (0, 0))])
+    with pytest.raises(ValueError, match="warp_index"):
+        displacement(replace(motion, warp_index=np.full_like(motion.warp_index, 3)))
+    with pytest.raises(ValueError, match="mi_size"):
+        displacement(replace(motion, mi_size=np.full_like(motion.mi_size, 22)))
+    with pytest.raises(ValueError, match="ref_frame"):
+        displacement(replace(motion, ref_frame=np.full_like(motion.ref_frame, 8)))
+    with pytest.raises(ValueError, match="y_mode"):
+        displacement(replace(motion, y_mode=motion.y_mode[:-1].copy()))
+
+
+# chaining
+
+
+@pytest.mark.parametrize("step", [(0.0, 0.0), (0.375, -0.625), (-5.125, 3.5), (4.0, 8.0)])
+def test_constant_translation_adds_up_exactly(step: tuple[float, float]) -> None:
+    tracks = build_tracks(low_delay([step] * 6), OPEN)
+    check_invariants(tracks, 4)
+    assert tracks.num_frames == 7
+    for _, xy in split(tracks):
+        np.testing.assert_array_equal(
+            np.diff(xy, axis=0), np.full((len(xy) - 1, 2), -np.float32(step))
+        )
+    # All start at unit centres, and of the first frame's none is lost but over the edge.
+    starts = tracks.xy[tracks.offsets[:-1]]
+    np.testing.assert_array_equal(starts % 4, 2)
+    third = np.mgrid[2:64:4, 2:48:4].reshape(2, -1).T - 3 * np.array(step)
+    staying = ((third >= 0) & (third < (64, 48))).all(axis=1).sum()
+    assert (tracks.frame[tracks.offsets[:-1]] == 0).sum() == staying
+
+
+def mv_of(flow: Callable[[Any, Any], tuple[Any, Any]], width: int, height: int) -> Motion:
+    y, x = np.mgrid[2 : 8 * ((height + 7) // 8) : 4, 2 : 8 * ((width + 7) // 8) : 4]
+    dx, dy = flow(x, y)
+    return np.stack([np.rint(8 * dy), np.rint(8 * dx)], axis=-1).astype(np.int16)
+
+
+@pytest.mark.parametrize(("angle", "zoom"), [(0.01, 1.0), (0.0, 1.02), (0.0, 0.98), (-0.02, 0.99)])
+def test_rotation_and_zoom_stay_near_the_true_path(angle: float, zoom: float) -> None:
+    width, height = 160, 120
+    c, s = zoom * math.cos(angle), zoom * math.sin(angle)
+
+    def back(x: Any, y: Any) -> tuple[Any, Any]:
+        u, v = x - width / 2, y - height / 2
+        return c * u - s * v + width / 2, s * u + c * v + height / 2
+
+    def flow(x: Any, y: Any) -> tuple[Any, Any]:
+        u, v = back(x, y)
+        return u - x, v - y
+
+    motion = mv_of(flow, width, height)
+    tracks = build_tracks(low_delay([motion] * 8, width=width, height=height), SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    assert len(tracks.offsets) > 900
+    errors = []
+    for _, xy in split(tracks):
+        truth = xy[-1].astype(float)
+        for _ in range(len(xy) - 1):
+            truth = np.array(back(*truth))
+        errors.append(np.hypot(*(truth - xy[0])) / (len(xy) - 1))
+    # A step's error: vectors to 1/8 px, and motion held over a unit (2 px x gradient).
+    assert np.max(errors) < 0.15
+    assert np.mean(errors) < 0.06
+
+
+def test_warp_is_inverted_without_an_offset() -> None:
+    params = similarity_params(0.03, 0.97, (1.5, 0.25))
+    frames = low_delay([(0, 0)] * 4)
+    frames[1:] = [warp_units(f, params) for f in frames[1:]]
+    tracks = build_tracks(frames, SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    assert len(tracks.offsets) > 50
+    matrix = np.array(params[2:], float).reshape(2, 2) / ONE
+    shift = np.array(params[:2]) / ONE
+    for _, xy in split(tracks):
+        back = (xy[1:] - 0.5) @ matrix.T + shift + 0.5
+        np.testing.assert_allclose(back, xy[:-1], atol=1e-4)
+
+
+def hierarchy(step: Any, far: Any) -> list[FrameMotion]:
+    """Five frames coded as 0 4 2 1 3; frame 4's vector is `far`, the others are true."""
+    step = np.asarray(step)
+
+    def node(decode: int, display: int, past: tuple[int, int], future: tuple[int, int]) -> Any:
+        motion = [
+            (ref, tuple((display - other[1]) * step))
+            for ref, other in ((ALTREF, future), (LAST, past))
+        ]
+        refs = {LAST: past, ALTREF: future}
+        return frame(decode, display, refs, motion, slots=[0, 1, 2, 3, 4], shown=display in (1, 3))
+
+    return [
+        frame(0, 0),
+        frame(1, 4, {LAST: (0, 0)}, [(LAST, far)], slots=[0, 1], shown=False),
+        node(2, 2, (0, 0), (1, 4)),
+        node(3, 1, (0, 0), (2, 2)),
+        node(4, 3, (2, 2), (1, 4)),
+    ]
+
+
+@pytest.mark.parametrize("far", [(5.0, -2.0), (-17.0, 3.0)])
+def test_random_access_follows_short_steps_in_both_directions(far: tuple[float, float]) -> None:
+    step = (1.25, -0.5)
+    tracks = build_tracks(hierarchy(step, far), SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    # What leaves the picture is left to the far vector.
+    ends = [(xy, xy[0] - 4 * np.float32(step)) for shown, xy in split(tracks) if len(shown) == 5]
+    full = [xy for xy, end in ends if ((end >= 0) & (end < (64, 48))).all()]
+    assert len(full) >= 14 * 10
+    for xy in full:
+        np.testing.assert_array_equal(np.diff(xy, axis=0), np.tile(-np.float32(step), (4, 1)))
+
+
+def test_a_frame_coded_ahead_ends_the_video() -> None:
+    # The last frames are shown by headers alone, which yield no motion.
+    tracks = build_tracks(
+        hierarchy((0.0, 0.0), (0.0, 0.0))[:3], TrackOptions(min_length=3, border=None)
+    )
+    assert tracks.num_frames == 5
+    assert len(tracks.offsets) - 1 == 16 * 12
+    np.testing.assert_array_equal(tracks.frame.reshape(-1, 3), [[0, 2, 4]] * (16 * 12))
+
+
+def test_frames_out_of_order_are_refused() -> None:
+    frames = low_delay([(0.0, 0.0)] * 3)
+    with pytest.raises(ValueError, match="bitstream order"):
+        build_tracks([frames[0], frames[2], frames[1]])
+    with pytest.raises(ValueError, match="twice"):
+        build_tracks([frames[0], frames[0]])
+
+
+def test_steps_longer_than_the_limit_are_not_taken() -> None:
+    frames = [frame(0), frame(1, 3, {LAST: (0, 0)}, [(LAST, (0.0, 0.0))])]
+
+    def count(limit: int | None) -> int:
+        options = TrackOptions(min_length=2, max_interval=limit, border=None)
+        return len(build_tracks(frames, options).offsets) - 1
+
+    assert count(3) == count(None) == 16 * 12
+    assert count(2) == 0
+
+
+def test_hidden_frames_carry_tracks_and_are_not_observed() -> None:
+    step = (0.5, 0.25)
+    frames = [
+        frame(0, 0),
+        frame(1, -1, {LAST: (0, 0)}, [(LAST, step)]),
+        frame(2, 1, {LAST: (1, -1)}, [(LAST, step)]),
+        frame(3, -1, {LAST: (2, 1)}, [(LAST, step)]),
+        frame(4, 2, {LAST: (3, -1)}, [(LAST, step)]),
+        frame(5, 3, {LAST: (4, 2)}, [(LAST, step)]),
+    ]
+    tracks = build_tracks(frames, SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    assert tracks.num_frames == 4
+    paths = split(tracks)
+    assert len(paths) > 100
+    for shown, xy in paths:
+        np.testing.assert_array_equal(shown, [0, 1, 2, 3])
+        np.testing.assert_array_equal(xy[0] - xy, np.outer([0, 2, 4, 5], step))
+
+
+def test_the_second_list_is_used_where_the_first_finds_no_track() -> None:
+    # The nearer reference is no longer in a slot that was ever coded here.
+    frames = low_delay([(1.0, 0.0)] * 3)
+    frames.append(
+        frame(
+            9,
+            9,
+            {LAST: (8, 8), GOLDEN: (3, 3)},
+            [(LAST, (5.0, 5.0)), (GOLDEN, (1.0, 0.0))],
+            slots=[9],
+        )
+    )
+    tracks = build_tracks(frames, replace(OPEN, min_length=5))
+    assert len(tracks.offsets) > 50
+    for shown, xy in split(tracks):
+        np.testing.assert_array_equal(shown, [0, 1, 2, 3, 9])
+        np.testing.assert_array_equal(np.diff(xy, axis=0), [[-1, 0]] * 4)
+
+
+def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
+    frames = low_delay([(0.0, 0.0)] * 8)
+    hole = frames[4]
+    hole.ref_frame[2:6, 3:7] = (0, -1)
+    hole.is_inter[2:6, 3:7] = 0
+    hole.mv[2:6, 3:7] = 0
+    tracks = build_tracks(frames, replace(SMALL_PICTURES, bridge=None))
+    check_invariants(tracks, 4)
+    counts = {}
+    for shown, xy in split(tracks):
+        inside = 12 <= xy[0, 0] < 28 and 8 <= xy[0, 1] < 24
+        counts[inside, int(shown[0]), int(shown[-1])] = (
+            counts.get((inside, int(shown[0]), int(shown[-1])), 0) + 1
+        )
+    assert counts == {(False, 0, 8): 16 * 12 - 16, (True, 0, 3): 16, (True, 4, 8): 16}
+
+
+@pytest.mark.parametrize(("jump", "goes_on"), [(0.0, True), (1.5, True), (3.0, False)])
+def test_tracks_cross_intra_blocks_where_both_sides_move_alike(jump: float, goes_on: bool) -> None:
+    mv = np.zeros((12, 16, 2), np.int16)
+    mv[:, 7:, 1] = round(8 * jump)
+    frames = low_delay([(0.0, 0.0)] * 3 + [mv] + [(0.0, 0.0)] * 4)
+    hole = frames[4]
+    hole.ref_frame[:, 3:7] = (0, -1)
+    hole.is_inter[:, 3:7] = 0
+    tracks = build_tracks(frames, replace(OPEN, min_length=1, bridge=2.0))
+    check_invariants(tracks, 1)
+    whole = [xy for shown, xy in split(tracks) if len(shown) == 9 and 12 <= xy[0, 0] < 28]
+    assert (len(whole) == 4 * 12) == goes_on
+    assert (len(whole) == 0) == (not goes_on)
+    for xy in whole:
+        # From the left side's motion to that of the right side, by the distance to both.
+        share = ((xy[0, 0] - 2) / 4 - 2) / 5
+        np.testing.assert_allclose(xy[3, 0] - xy[4, 0], share * jump, atol=1e-5)
+        np.testing.assert_array_equal(xy[:, 1], xy[0, 1])
+    # They are less sure than those beside that have motion of their own.
+    if jump and goes_on:
+        bridged = tracks.sigma[tracks.frame == 4].reshape(12, 16)
+        assert (bridged[:, 3:7] > bridged[:, :3].max()).all()
+
+
+def test_tracks_in_the_gap_between_blocks_go_on() -> None:
+    # The tracks of columns 0 to 8 come to lie half a pixel from the left edges of their units.
+    shift = np.zeros((12, 16, 2), np.int16)
+    shift[:, :9, 1] = round(8 * 1.5)
+    # Then the right half comes from a pixel further right, and no vector leads to x = 32.5.
+    apart = np.zeros((12, 16, 2), np.int16)
+    apart[:, 8:, 1] = 8
+    frames = low_delay([shift, apart])
+
+    def carried(bridge: float | None) -> int:
+        tracks = build_tracks(frames, replace(OPEN, min_length=2, bridge=bridge))
+        check_invariants(tracks, 2)
+        paths = [xy for shown, xy in split(tracks) if shown[-1] == 2 and xy[-2, 0] == 32.5]
+        assert all(len(xy) == 3 and xy[-1, 0] == 32.5 for xy in paths)
+        return len(paths)
+
+    assert (carried(None), carried(0.5), carried(2.0)) == (0, 0, 12)
+
+
+@pytest.mark.parametrize(
+    ("cell", "going_on"),
+    [(4, [[6.0, 5.5, 5.5, 3.5]]), (2, [[6.0, 5.5, 5.5, 3.5], [2.0, 3.5, 1.5]])],
+)
+def test_of_two_tracks_in_one_cell_the_longer_goes_on(
+    cell: int, going_on: list[list[float]]
+) -> None:
+    # Column 0 seeds tracks in frame 1 that come to x = 3.5; those of column 1 are from frame 0 and
+    # lie at 5.5. In frame 3 one unit finds both, the young one nearer to its centre.
+    steps = np.zeros((3, 12, 16, 2), np.int16)
+    steps[0, :, 1, 1] = round(8 * 0.5)
+    steps[1, :, 0, 1] = round(8 * -1.5)
+    steps[2, :, 0, 1] = 8 * 2
+    frames = low_delay(list(steps))
+    for index, col in ((1, 0), (3, 1)):
+        frames[index].ref_frame[:, col] = (0, -1)
+        frames[index].is_inter[:, col] = 0
+    tracks = build_tracks(frames, replace(OPEN, min_length=2, cell=cell))
+    check_invariants(tracks, 2, cell)
+    paths = [xy[:, 0].tolist() for shown, xy in split(tracks) if shown[-1] == 3 and xy[-1, 0] < 4]
+    assert sorted(paths) == sorted(going_on * 12)
+
+
+@pytest.mark.parametrize(("cell", "seeding"), [(4, 4), (2, 4), (1, 4), (2, 2), (1, 2), (1, 1)])
+def test_a_track_starts_in_every_empty_square(cell: int, seeding: int) -> None:
+    steps = [(1.0, 0.5)] * 3
+    options = replace(OPEN, min_length=1, cell=cell, seeding=seeding)
+    tracks = build_tracks(low_delay(steps), options)
+    check_invariants(tracks, 1, cell)
+    first = tracks.xy[tracks.offsets[:-1]]
+    at_once = tracks.frame[tracks.offsets[:-1]] == 0
+    assert at_once.sum() == 64 * 48 // seeding**2
+    assert (first % seeding == seeding / 2).all()
+    # What moves to the left and up leaves squares at the right and below.
+    assert (first[~at_once] >= np.array([64, 48]) - 3 * seeding).any(axis=1).all()
+    for shown, xy in split(tracks):
+        assert np.array_equal(xy, xy[0] - np.outer(shown - shown[0], steps[0]))
+    # Of a frame that nothing moves into every square has a track of its own.
+    assert np.bincount(tracks.frame).min() >= 60 * 46 // seeding**2
+
+
+def test_one_track_goes_to_one_unit_the_best_one() -> None:
+    # Both columns of units look at column 0 of the reference; the second by way of a
+    # vector that lands 1 px off its centre.
+    mv = np.zeros((12, 16, 2), np.int16)
+    mv[:, 1, 1] = 8 * -5
+    frames = low_delay([(0.0, 0.0), mv, (0.0, 0.0), (0.0, 0.0)])
+    tracks = build_tracks(frames, replace(OPEN, min_length=3))
+    check_invariants(tracks, 3)
+    for shown, xy in split(tracks):
+        if xy[0, 0] == 2:
+            assert len(shown) == 5
+            assert (xy[:, 0] == 2).all()
+        if 4 <= xy[0, 0] < 8:
+            assert shown[0] == 2
+
+
+def test_a_reference_of_another_size_is_scaled() -> None:
+    small, large = (64, 48), (128, 96)
+    step = (1.0, 0.5)  # px of the small frame
+    frames = [
+        frame(0, width=128, height=96),
+        frame(1, refs={LAST: (0, 0)}, motion=[(LAST, step)], ref_sizes={LAST: large}),
+        frame(2, refs={LAST: (1, 1)}, motion=[(LAST, step)]),
+        frame(
+            3,
+            refs={LAST: (2, 2)},
+            motion=[(LAST, (2.0, 1.0))],
+            width=128,
+            height=96,
+            ref_sizes={LAST: small},
+        ),
+    ]
+    tracks = build_tracks(frames, SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    assert (tracks.width, tracks.height) == large
+    paths = split(tracks)
+    assert len(paths) > 100
+    for _, xy in paths:
+        np.testing.assert_allclose(np.diff(xy, axis=0), [[-2, -1]] * 3, atol=1e-5)
+
+
+def test_super_resolution_positions_are_in_the_upscaled_picture() -> None:
+    # FrameWidth 32, UpscaledWidth 64: a coded pixel is two wide.
+    def half(motion: FrameMotion) -> FrameMotion:
+        return replace(motion, width=64, header=motion.header | {"frame_width": 32})
+
+    upscaled = {LAST: (64, 48)}
+    frames = [half(frame(0, width=32))]
+    frames += [
+        half(
+            frame(
+                i,
+                refs={LAST: (i - 1, i - 1)},
+                motion=[(LAST, (0.5, 1.0))],
+                width=32,
+                ref_sizes=upscaled,
+            )
+        )
+        for i in range(1, 5)
+    ]
+    tracks = build_tracks(frames, SMALL_PICTURES)
+    assert tracks.width == 64
+    paths = split(tracks)
+    assert len(paths) > 30
+    for _, xy in paths:
+        np.testing.assert_allclose(np.diff(xy, axis=0), [[-1, -1]] * (len(xy) - 1), atol=1e-5)
+    assert tracks.xy[:, 0].max() > 56
+
+
+def test_tracks_below_the_minimum_length_are_left_out() -> None:
+    frames = low_delay([(0.0, 0.0)] * 3)
+    assert len(build_tracks(frames, TrackOptions(min_length=5, border=None)).offsets) == 1
+    assert len(build_tracks(frames, TrackOptions(min_length=4, border=None)).offsets) == 16 * 12 + 1
+    empty = build_tracks(frames, TrackOptions(min_length=5, border=None))
+    assert empty.frame.shape == (0,)
+    assert empty.xy.shape == (0, 2)
+    assert len(build_tracks(frames[:3], TrackOptions(border=None)).offsets) == 1
+    short = build_tracks(frames[:3], TrackOptions(min_length=3, border=None))
+    assert len(short.offsets) == 16 * 12 + 1
+
+
+def test_long_tracks_are_kept() -> None:
+    frames = low_delay([(3.0, 0.0)] * 7)
+    tracks = build_tracks(frames, TrackOptions(min_length=1, border=None))
+    assert set(np.diff(tracks.offsets)) > {1, 2, 8}
+    longer = build_tracks(frames, TrackOptions(min_length=4, border=None))
+    kept = keep_long_tracks(tracks, 4)
+    for name in ("offsets", "frame", "xy", "sigma"):
+        assert np.array_equal(getattr(kept, name), getattr(longer, name))
+
+
+# trust
+
+
+def test_large_and_uncoded_blocks_are_not_followed() -> None:
+    frames = low_delay([(0.0, 0.0)] * 4, mi_size=BLOCK_16X16)
+    for f in frames:
+        f.mi_size[:, 8:] = BLOCK_32X32
+        f.skip[:4] = 1
+
+    def kept(**options: Any) -> NDArray[np.bool_]:
+        tracks = build_tracks(frames, replace(OPEN, **options))
+        seen = np.zeros((12, 16), bool)
+        col, row = (tracks.xy // 4).astype(int).T
+        seen[row, col] = True
+        return seen
+
+    assert kept().all()
+    small = kept(max_block_area=256)
+    assert small[:, :8].all()
+    assert not small[:, 8:].any()
+    coded = kept(max_uncoded_block_area=256)
+    assert coded[4:].all()
+    assert coded[:4, :8].all()
+    assert not coded[:4, 8:].any()
+
+
+def test_smoothness_takes_out_the_block_that_disagrees() -> None:
+    frames = low_delay([(0.0, 0.0)] * 4, mi_size=BLOCK_8X8)
+    for f in frames[1:]:
+        f.mv[4:6, 6:8, 0, :] = 24
+    tracks = build_tracks(frames, replace(OPEN, smoothness=0.5))
+    seen = np.zeros((12, 16), bool)
+    col, row = (tracks.xy // 4).astype(int).T
+    seen[row, col] = True
+    assert not seen[4:6, 6:8].any()
+    assert seen.sum() == 12 * 16 - 4
+
+
+def test_motion_at_the_edge_is_not_followed() -> None:
+    frames = low_delay([(0.0, 0.0)] * 5)
+    tracks = build_tracks(frames, replace(OPEN, border=8.0))
+    assert tracks.xy.min() >= 8
+    assert np.all(tracks.xy <= np.array([tracks.width, tracks.height]) - 8)
+    assert len(tracks.offsets) - 1 == (16 - 4) * (12 - 4)
+
+
+def block_field(slope: float, jump: float = 0.0) -> list[FrameMotion]:
+    """A field of 16x16 blocks whose one vector is the linear field's at their centres."""
+    x = np.tile(np.arange(2, 160, 4), (32, 1))
+    dx = slope * (x // 16 * 16 + 8) + np.where(x >= 80, jump, 0.0)
+    field = np.stack([np.zeros_like(dx), np.rint(8 * dx)], axis=-1).astype(np.int16)
+    return low_delay([field] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+
+
+def first_steps(tracks: Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the motion of the second frame is from, and the displacement there."""
+    start = tracks.offsets[:-1][tracks.frame[tracks.offsets[:-1]] == 0]
+    step = tracks.xy[start] - tracks.xy[start + 1]
+    return tracks.xy[start + 1, 0].astype(float), step[:, 0].astype(float)
+
+
+def test_interpolation_lets_motion_vary_within_a_block() -> None:
+    frames = block_field(1 / 16)
+
+    def errors(interpolation: float | None) -> Any:
+        options = replace(OPEN, interpolation=interpolation)
+        x, dx = first_steps(build_tracks(frames, options))
+        inner = (x > 8) & (x < 152)
+        assert inner.sum() > 500
+        return np.abs(dx - x / 16)[inner]
+
+    assert np.max(errors(1.5)) < 0.15
+    assert np.max(errors(None)) > 0.4
+    # Blocks that differ by a pixel do not move alike.
+    np.testing.assert_array_equal(errors(0.5), errors(None))
+
+
+def test_interpolation_keeps_edges_of_motion() -> None:
+    x, dx = first_steps(build_tracks(block_field(1 / 32, 4.0), replace(OPEN, interpolation=1.5)))
+    left = (x > 8) & (x < 70)
+    right = (x > 90) & (x < 150)
+    for side, jump in ((left, 0.0), (right, 4.0)):
+        np.testing.assert_allclose(dx[side], x[side] / 32 + jump, atol=0.3)
+
+
+def test_expected_errors_follow_the_bitstream() -> None:
+    def last_sigma(**changes: Any) -> float:
+        frames = low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+        frames = [
+            replace(f, **{k: np.full_like(f.skip, v) for k, v in changes.items()}) for f in frames
+        ]
+        tracks = build_tracks(frames, OPEN)
+        return float(np.median(tracks.sigma[tracks.offsets[1:] - 1]))
+
+    plain = last_sigma()
+    assert last_sigma(skip=1) > plain
+    assert last_sigma(y_mode=GLOBALMV) > plain
+    assert last_sigma(mi_size=BLOCK_8X8) < plain < last_sigma(mi_size=BLOCK_32X32)
+    # Blocks in disorder are less sure than those that move as one.
+    rng = np.random.default_rng(0)
+    rough = rng.integers(-16, 17, (8, 10, 2)).repeat(4, axis=0).repeat(4, axis=1)
+    frames = low_delay([rough.astype(np.int16)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
+    disorder = build_tracks(frames, replace(OPEN, min_length=2))
+    steady = build_tracks(
+        low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16),
+        replace(OPEN, min_length=2),
+    )
+    second = [float(np.median(t.sigma[t.offsets[:-1] + 1])) for t in (steady, disorder)]
+    assert second[1] > 2 * second[0]
+
+
+def shaking(seed: int = 0, frames: int = 20) -> list[FrameMotion]:
+    """A camera that moves steadily and shakes by several pixels each frame."""
+    rng = np.random.default_rng(seed)
+    shake = np.rint(8 * rng.normal(0, 4, (frames, 2))) / 8
+    return low_delay([tuple(s) for s in shake], width=160, height=120)
+
+
+def test_cosine_relative_to_the_dominant_motion_survives_shaking() -> None:
+    def count(relative_to: Any, cosine: float | None = 0.9) -> int:
+        options = replace(OPEN, min_length=8, cosine=cosine, cosine_relative_to=relative_to)
+        return len(build_tracks(shaking(), options).offsets) - 1
+
+    free = count("none", None)
+    assert free > 500
+    assert count("dominant") == free
+    assert count("none") == 0
+
+
+def test_cosine_ends_a_track_that_leaves_the_motion_around_it() -> None:
+    frames = shaking()
+    corner = (slice(8, 16), slice(8, 16))
+    for i, f in enumerate(frames[1:]):
+        # Back and forth against the rest, by 3 px.
+        f.mv[(*corner, 0)] += np.array([0, 24 if i % 2 else -24], np.int16)
+    strict = build_tracks(frames, replace(OPEN, cosine=0.9))
+    free = build_tracks(frames, OPEN)
+
+    def steps_in_corner(tracks: Tracks) -> int:
+        return sum(
+            int(((xy[1:] >= 33) & (xy[1:] < 63)).all(axis=1).sum()) for _, xy in split(tracks)
+        )
+
+    assert steps_in_corner(free) > 100
+    assert steps_in_corner(strict) < 0.2 * steps_in_corner(free)
+    assert len(strict.offsets) > 0.8 * len(free.offsets)
+
+
+# real streams
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["good_lag0", "good_cpu4_lag35", "svt4_p6", "gm_affine_scene"])
+def test_tracks_follow_the_decoded_pictures(shared: Path, name: str) -> None:
+    stream = shared / "conformance" / "streams" / f"{name}.ivf"
+    tracks = build_tracks(read_motion(stream), SMALL_PICTURES)
+    check_invariants(tracks, 4)
+    with av.open(str(stream)) as container:
+        images = [f.to_ndarray(format="gray") for f in container.decode(video=0)]
+    assert tracks.num_frames == len(images)
+
+    ends = np.arange(1, len(tracks.frame))
+    ends = ends[tracks.frame[1:] > tracks.frame[:-1]]
+    ends = ends[~np.isin(ends, tracks.offsets)]
+    ends = np.random.default_rng(0).choice(ends, 2000, replace=False)
+
+    def patches(frames: Any, xy: Any) -> Any:
+        return np.stack(
+            [
+                cv2.getRectSubPix(images[f].astype(np.float32), (9, 9), (float(x), float(y)))
+                for f, (x, y) in zip(frames, xy - np.float32(0.5), strict=True)
+            ]
+        )
+
+    before = patches(tracks.frame[ends - 1], tracks.xy[ends - 1])
+
+    def difference(shift: tuple[float, float]) -> float:
+        after = patches(tracks.frame[ends], tracks.xy[ends] + np.float32(shift))
+        return float(np.median(np.abs(after - before).mean(axis=(1, 2))))
+
+    followed = difference((0.0, 0.0))
+    for shift in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)):
+        assert followed < 0.9 * difference(shift)
+
+
+# any input
+
+
+@st.composite
+def random_video(draw: st.DrawFn) -> list[FrameMotion]:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    width, height = draw(st.sampled_from([(8, 8), (37, 21), (64, 48), (130, 18)]))
+    count = draw(st.integers(1, 9))
+    spread = draw(st.sampled_from([0, 4, 24, 300]))
+    frames: list[FrameMotion] = []
+    # Each frame is shown at once, by a later header, or never.
+    shown = [-1] * count
+    at_once = rng.random(count) < 0.6
+    waiting: list[int] = []
+    order: list[int] = []
+    for i in range(count):
+        if waiting and rng.random() < 0.4:
+            order.append(waiting.pop(rng.integers(len(waiting))))
+        (order if at_once[i] else waiting).append(i)
+    for i, index in enumerate(order):
+        shown[index] = i
+    slots = np.full(8, -1)
+    for i in range(count):
+        past = {
+            ref: (int(slot), shown[slot])
+            for ref, slot in enumerate(slots[1:], start=1)
+            if slot >= 0
+        }
+        base = frame(i, shown[i], past, width=width, height=height, shown=bool(at_once[i]))
+        shape = base.skip.shape
+        if past:
+            refs = np.array(sorted(past), np.int8)
+            base.ref_frame[..., 0] = rng.choice(refs, shape)
+            base.ref_frame[..., 1] = rng.choice(np.append(refs, np.int8([-1, 0])), shape)
+            base.is_inter[:] = rng.random(shape) < 0.95
+            base.mv[:] = rng.integers(-spread, spread + 1, base.mv.shape)
+            base.mi_size[:] = rng.integers(0, 22, shape)
+            base.y_mode[:] = rng.integers(13, 25, shape)
+            base.skip[:] = rng.integers(0, 2, shape)
+            base.motion_mode[:] = rng.integers(0, 3, shape)
+            base.header["gm_type"][:] = rng.integers(0, 4, 7)
+            base.header["gm_params"][:] += rng.integers(-2000, 2000, (7, 6), np.int32)
+            params = np.array([[0, 0, ONE, 0, 0, ONE]], np.int32)
+            base = replace(
+                base,
+                warp_index=rng.integers(-1, 1, shape, np.int32),
+                local_warp_params=params + rng.integers(-3000, 3000, (1, 6), np.int32),
+            )
+        slots[rng.random(8) < 0.4] = i
+        frames.append(replace(base, slot_decode_index=slots.astype(np.int32)))
+    return frames
+
+
+any_options = st.builds(
+    TrackOptions,
+    min_length=st.integers(1, 4),
+    cosine=st.sampled_from([None, 0.5, 0.95]),
+    cosine_relative_to=st.sampled_from(["dominant", "none"]),
+    max_interval=st.sampled_from([None, 1, 4]),
+    bridge=st.sampled_from([None, 2.0]),
+    max_block_area=st.sampled_from([None, 1024]),
+    max_uncoded_block_area=st.sampled_from([None, 256]),
+    smoothness=st.sampled_from([None, 1.5]),
+    border=st.sampled_from([None, 6.0]),
+    interpolation=st.sampled_from([None, 1.5]),
+    cell=st.sampled_from([None, 4, 2, 1]),
+)
+
+
+@given(motion=random_video(), options=any_options)
+@settings(max_examples=200, deadline=None)
+def test_any_motion_gives_valid_tracks(motion: list[FrameMotion], options: TrackOptions) -> None:
+    if all(f.display_index < 0 for f in motion):
+        with pytest.raises(VideoError):
+            build_tracks(motion, options)
+        return
+    tracks = build_tracks(motion, options)
+    check_invariants(tracks, options.min_length, options.cell or 4)
+    again = build_tracks(iter(motion), options)
+    for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
+        assert getattr(tracks, name).tobytes() == getattr(again, name).tobytes()
+
+
+def test_progress_counts_coded_frames() -> None:
+    seen: list[int] = []
+    build_tracks(low_delay([(0.0, 0.0)] * 3), progress=seen.append)
+    assert seen == [1, 2, 3, 4]
+
+
+def test_no_shown_frame_is_an_error() -> None:
+    with pytest.raises(VideoError, match="no frame"):
+        build_tracks([])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"min_length": 0},
+        {"cosine": 1.5},
+        {"cosine": math.nan},
+        {"cosine_relative_to": "median"},
+        {"cosine_scale": -1.0},
+        {"max_block_area": -5},
+        {"smoothness": math.nan},
+        {"border": -1.0},
+        {"interpolation": -1.0},
+        {"cell": 3},
+        {"seeding": 8},
+        {"seeding": 2, "cell": 4},
+    ],
+)
+def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=next(iter(options))):
+        build_tracks([], TrackOptions(**options))
+
+
+def test_options_are_checked_before_the_motion_is_read() -> None:
+    def motion() -> Iterable[FrameMotion]:
+        pytest.fail("read")
+        yield frame(0)
+
+    with pytest.raises(OptionError):
+        build_tracks(motion(), TrackOptions(min_length=0))

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import AV1, Encode, Ffmpeg, make_frames
+
+from colmap_av1.errors import BitstreamError
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import MatchOptions, ReadOptions, RefineOptions
+from colmap_av1.tracks.tracks import build_tracks
+from colmap_av1.tracks.video_tracks import (
+    TrackedVideo,
+    VideoSource,
+    decodable_frames,
+    open_source,
+    times_of_frames,
+    track_video,
+)
+from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.video.decoding import decode_frames
+
+OPTIONS = MatchOptions()
+STRICT = MatchOptions(read=ReadOptions(strict=True))
+
+
+def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
+    return open_source(video, options, clock=Clock(), progress=no_progress)
+
+
+def tracked(source: VideoSource, options: MatchOptions = OPTIONS) -> TrackedVideo:
+    return track_video(source, options, one_size=False, clock=Clock(), progress=no_progress)
+
+
+@pytest.fixture
+def trimmed(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
+    """The clip without its first five frames: they are coded, and no player shows them."""
+    return ffmpeg("-ss", "0.2", "-i", clip, "-c", "copy", tmp_path / "trimmed.mp4")
+
+
+def test_an_av1_video_is_its_own_stream(clip: Path) -> None:
+    source = opened(clip)
+    assert source.stream == source.pictures == clip
+    assert source.num_packets == 16
+    assert source.presented is None
+
+
+def test_frames_that_are_not_shown_are_in_the_stream(trimmed: Path) -> None:
+    source = opened(trimmed)
+    assert source.num_packets == 16
+    assert source.presented is not None
+    assert source.presented.tolist() == list(range(5, 16))
+    found = tracked(source)
+    assert found.num_coded_frames == 16
+    assert found.tracks.num_frames == 11
+    times = times_of_frames(source, 11)
+    assert times is not None
+    np.testing.assert_allclose(np.diff(times), 1 / 25)
+
+
+def test_times_are_those_of_all_frames_or_none(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    source = opened(clip)
+    times = times_of_frames(source, 7)
+    assert times is not None
+    np.testing.assert_allclose(times, np.arange(7) / 25)
+    assert times_of_frames(source, 17) is None
+    timeless = ffmpeg("-i", clip, "-c", "copy", tmp_path / "timeless.ivf")
+    data = timeless.read_bytes()
+    timeless.write_bytes(data[:16] + bytes(8) + data[24:])  # neither rate nor scale
+    assert times_of_frames(opened(timeless), 16) is None
+
+
+def test_a_poor_stream_is_told_of_where_it_could_be_converted(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Not where it was: the encoder's settings are this package's own."""
+    often = encode(make_frames(12), tmp_path / "often.mp4", *AV1[:-1], "4")
+    source = opened(often)
+    (note,) = tracked(source).warnings
+    assert note.startswith("a key frame every 4.0 frames")
+    assert note.endswith("; or let --reencode 1 convert the video first")
+    video = ffmpeg("-i", often, "-c:v", "libx264", tmp_path / "video.mp4")
+    assert tracked(replace(source, pictures=video)).warnings == ()
+
+
+def test_what_lies_over_the_picture_is_told_of(encode: Encode, tmp_path: Path) -> None:
+    frames = make_frames(12)
+    plain = tracked(opened(encode(frames, tmp_path / "plain.mp4")))
+    frames[:, 32:96, 48:112] = frames[0, 32:96, 48:112]
+    found = tracked(opened(encode(frames, tmp_path / "logo.mp4")))
+    assert plain.warnings == ()
+    num_before = len(build_tracks(read_motion(tmp_path / "logo.mp4")).offsets)
+    share = 1 - len(found.tracks.offsets) / num_before
+    assert share > 0.05
+    (note,) = found.warnings
+    assert note.startswith(f"{share:.0%} of the tracks stand still while the picture moves")
+
+
+def test_stages_do_not_count_twice(clip: Path) -> None:
+    clock = Clock()
+    lk = replace(OPTIONS, refine=RefineOptions(refine="lk"))
+    told: list[tuple[str, int, int | None]] = []
+    with clock.measure("all"):
+        track_video(
+            *(opened(clip), lk), one_size=True, clock=clock, progress=lambda *w: told.append(w)
+        )
+    whole = clock.seconds.pop("all")
+    assert set(clock.seconds) == {"motion", "tracks", "decoding", "refinement"}
+    assert min(clock.seconds.values()) >= 0
+    assert sum(clock.seconds.values()) <= whole
+    assert [w for w in told if w[0] == "motion"] == [("motion", i, 16) for i in range(1, 17)]
+    assert told[-1] == ("refinement", 16, 16)
+
+
+@pytest.fixture
+def hurt(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
+    """The clip with its last frames cut off."""
+    whole = ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf")
+    cut = tmp_path / "cut.ivf"
+    cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * 0.7)])
+    return cut
+
+
+def test_pictures_end_before_the_damage(hurt: Path) -> None:
+    with pytest.warns(UserWarning, match=r"cut\.ivf: .*; tracks are refined in (\d+) frames only"):
+        count = len(list(decodable_frames(hurt, 16, OPTIONS)))
+    assert 4 < count < 16
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the frames that are asked for are whole
+        whole = list(decodable_frames(hurt, count, OPTIONS))
+    assert [index for index, _ in whole] == list(range(count))
+    with pytest.raises(BitstreamError, match=r"cut\.ivf: cannot be decoded further"):
+        list(decodable_frames(hurt, 16, STRICT))
+
+
+def test_pictures_are_those_of_the_frames_with_tracks(clip: Path) -> None:
+    asked = list(decodable_frames(clip, 3, OPTIONS))
+    assert [index for index, _ in asked] == [0, 1, 2]
+    for (_, picture), (_, whole) in zip(asked, decode_frames(clip), strict=False):
+        np.testing.assert_array_equal(picture, whole)

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.util.processes import bound, bound_shell
+
+BOUND = """
+import subprocess, sys, time
+from colmap_av1.util.processes import bound
+child = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+subprocess.Popen(bound([sys.executable, "-c", child]))
+time.sleep(60)
+"""
+BINDING = """
+import os, subprocess, sys, time
+child = (
+    "import os, sys, time; from colmap_av1.processes import bind; "
+    "bind(int(sys.argv[1])); print(os.getpid(), flush=True); time.sleep(60)"
+)
+subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
+time.sleep(60)
+"""
+SHELL = """
+import shlex, subprocess, sys, time
+from colmap_av1.util.processes import bound_shell
+child = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+command = f"{shlex.join([sys.executable, '-c', child])} && echo not reached"
+subprocess.Popen(bound_shell(command))
+time.sleep(60)
+"""
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children so")
+
+
+def is_running(process: int) -> bool:
+    try:  # what has ended and is not waited for has no words left
+        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
+    except OSError:
+        return False
+
+
+def test_a_bound_process_is_the_one_asked_for() -> None:
+    program = "import sys; print(sys.argv[1:]); sys.exit(3)"
+    words = ["a b", "", "-c", "'", "$x"]
+    run = subprocess.run(
+        bound([sys.executable, "-c", program, *words]), capture_output=True, text=True, check=False
+    )
+    assert run.stdout == f"{words}\n"
+    assert run.returncode == 3
+
+
+def test_a_program_without_a_folder_is_looked_for() -> None:
+    run = subprocess.run(bound(["echo", "here"]), capture_output=True, text=True, check=True)
+    assert run.stdout == "here\n"
+
+
+@linux
+def test_a_bound_shell_runs_what_is_asked_for() -> None:
+    words = bound_shell("echo 'a b' && sh -c 'exit 3'")
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert run.stdout == "a b\n"
+    assert run.returncode == 3
+    killed = subprocess.run(bound_shell("kill -KILL $$"), check=False)
+    assert killed.returncode == 137
+
+
+@linux
+def test_nothing_that_a_bound_shell_started_outlives_it() -> None:
+    words = bound_shell("sleep 60 & echo $!")
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as shell:
+        assert shell.stdout is not None
+        left = int(shell.stdout.readline())
+        assert shell.wait(timeout=30) == 0
+    wait_for_end(left)
+
+
+def wait_for_end(process: int) -> None:
+    deadline = time.monotonic() + 10
+    while is_running(process):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@linux
+@pytest.mark.parametrize("program", [BOUND, BINDING, SHELL], ids=["bound", "binding", "shell"])
+def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+    ) as starter:
+        assert starter.stdout is not None
+        child = int(starter.stdout.readline())
+        assert is_running(child)
+        starter.kill()
+    wait_for_end(child)

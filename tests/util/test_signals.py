@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.util.signals import ending_in_order
+
+# Shells let what they start in the background ignore interrupts, and it is passed on.
+HEEDING = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); "
+HEEDING += "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+IGNORING = HEEDING.replace("SIG_DFL", "SIG_IGN")
+# As pip writes it.
+SCRIPT = (
+    "import sys\nfrom colmap_av1.cli import main\nif __name__ == '__main__':\n    sys.exit(main())"
+)
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals end otherwise there")
+
+
+def end_while_importing(words: list[str], number: int, folder: Path) -> tuple[int, str]:
+    """Status of a program that is told to end before the package is there, and what it says."""
+    command = [sys.executable, "-c", words[0], "-X", "importtime", *words[1:]]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.endswith(" numpy.version\n"):
+                break
+        process.send_signal(number)
+        rest = process.stderr.read().splitlines()
+    assert not any(line.endswith("| colmap_av1") for line in rest) or words[0] == IGNORING
+    said = [line for line in rest if not line.startswith("import time:")]
+    return process.returncode, "\n".join(said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("start", ["module", "script"])
+def test_signal_during_the_imports(tmp_path: Path, start: str, number: int) -> None:
+    (tmp_path / "colmap-av1").write_text(SCRIPT)
+    program = ["-m", "colmap_av1"] if start == "module" else [str(tmp_path / "colmap-av1")]
+    words = [HEEDING, *program, "--version"]
+    assert end_while_importing(words, number, tmp_path) == (128 + number, "")
+
+
+def test_ignored_signal_during_the_imports(tmp_path: Path) -> None:
+    words = [IGNORING, "-m", "colmap_av1", "info", "--video", "none.mp4"]
+    status, said = end_while_importing(words, signal.SIGINT, tmp_path)
+    assert status == 2
+    assert "none.mp4: no such file" in said
+
+
+def test_programs_that_import_the_package_keep_their_handlers(tmp_path: Path) -> None:
+    program = "import signal, colmap_av1; print(signal.getsignal(signal.SIGINT).__name__, "
+    program += "signal.getsignal(signal.SIGTERM).name)"
+    words = [sys.executable, "-c", HEEDING, "-c", program]
+    run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert run.stdout == "default_int_handler SIG_DFL\n"
+
+
+def test_handlers_within_and_after() -> None:
+    before = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)}
+    with pytest.raises(SystemExit) as end, ending_in_order():
+        signal.raise_signal(signal.SIGTERM)
+    assert end.value.code == 143
+    assert {n: signal.getsignal(n) for n in before} == before
+
+
+def test_threads_leave_handlers_alone() -> None:
+    def run() -> None:
+        with ending_in_order():
+            within.append(signal.getsignal(signal.SIGTERM))
+
+    within: list[object] = []
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert within == [signal.getsignal(signal.SIGTERM)]

@@ -1,0 +1,357 @@
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from colmap_av1.cli import reports
+from colmap_av1.errors import VideoError
+from colmap_av1.match import match
+from colmap_av1.motion.info import inspect
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import CameraOptions, DensityOptions, ImageOptions, MatchOptions
+from colmap_av1.tracks.tracks import build_tracks, show_tracks
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.display import (
+    Display,
+    shown_picture,
+    shown_points,
+    shown_size,
+    turn_of_matrix,
+)
+from colmap_av1.video.facts import presented_frames, read_display
+
+# The presets choose tracks by cells of the picture, which are not those of a cut or scaled one.
+ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"))
+TURNS = [
+    ((a, 0), (0, d)) if not swapped else ((0, a), (d, 0))
+    for swapped in (False, True)
+    for a in (1, -1)
+    for d in (1, -1)
+]
+
+
+def keypoints(database: Path) -> list[np.ndarray]:
+    with sqlite3.connect(database) as connection:
+        rows = connection.execute("SELECT data FROM keypoints ORDER BY image_id").fetchall()
+    return [np.frombuffer(data, "<f4").reshape(-1, 2) for (data,) in rows]
+
+
+def cut_by_ffmpeg(ffmpeg: Ffmpeg, video: Path, folder: Path, *how: str) -> list[np.ndarray]:
+    folder.mkdir()
+    ffmpeg("-i", video, *how, folder / "%04d.png")
+    return [cv2.imread(str(path)) for path in sorted(folder.iterdir())]
+
+
+def boxes(data: bytes, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
+    while start < end:
+        size = int.from_bytes(data[start : start + 4], "big")
+        yield start, size, data[start + 4 : start + 8]
+        start += size
+
+
+def with_clean_aperture(
+    data: bytes, size: tuple[int, int], crop: tuple[int, int, int, int]
+) -> bytes:
+    """An MP4 file, its index at the end, with a 'clap' box (ISO/IEC 14496-12, 12.1.4)."""
+    left, top, right, bottom = crop
+    width, height = size[0] - left - right, size[1] - top - bottom
+    # Width, height and the offset of the middle as fractions.
+    values = (width, 1, height, 1, left - right, 2, top - bottom, 2)
+    clap = struct.pack(">I4s8i", 40, b"clap", *values)
+    start, end = 0, len(data)
+    sizes = []
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"):
+        at, length, _ = next(box for box in boxes(data, start, end) if box[2] == name)
+        sizes.append(at)
+        start, end = at + 8, at + length
+    at, length, _ = next(boxes(data, start + 8, end))
+    sizes.append(at)
+    grown = bytearray(data[: at + length] + clap + data[at + length :])
+    for at in sizes:
+        grown[at : at + 4] = (int.from_bytes(grown[at : at + 4], "big") + 40).to_bytes(4, "big")
+    return bytes(grown)
+
+
+@settings(deadline=None)
+@given(
+    st.sampled_from(TURNS),
+    st.tuples(*[st.integers(0, 3)] * 4),
+    st.tuples(st.integers(8, 12), st.integers(8, 12)),
+)
+def test_points_stay_on_their_pixels(
+    turn: tuple[tuple[int, int], tuple[int, int]],
+    crop: tuple[int, int, int, int],
+    size: tuple[int, int],
+) -> None:
+    width, height = size
+    display = Display(crop, turn)
+    # Every pixel holds its own place.
+    y, x = np.mgrid[:height, :width]
+    stored = np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8)
+    shown = shown_picture(stored, display)
+    assert shown.shape[1::-1] == shown_size(size, display)
+    centres = np.stack([x, y], axis=2).reshape(-1, 2).astype(np.float32) + 0.5
+    points = shown_points(centres, size, display)
+    inside = np.all((points > 0) & (points < shown_size(size, display)), axis=1)
+    assert inside.sum() == shown.shape[0] * shown.shape[1]
+    column, row = np.floor(points[inside]).astype(int).T
+    np.testing.assert_array_equal(shown[row, column, :2], centres[inside] - 0.5)
+
+
+def test_matrix_that_is_no_quarter_turn() -> None:
+    one = 1 << 16
+    assert turn_of_matrix([0, one, 0, -one, 0, 0, 0, 0, 1 << 30]) == ((0, -1), (1, 0))
+    assert turn_of_matrix([2 * one, 0, 0, 0, one, 0, 0, 0, 1 << 30]) == ((1, 0), (0, 1))
+    assert turn_of_matrix([one, one, 0, -one, one, 0, 0, 0, 1 << 30]) is None
+    assert turn_of_matrix([one, 0, 0, one, 0, 0, 0, 0, 1 << 30]) is None
+    assert turn_of_matrix([0] * 9) is None
+
+
+@pytest.mark.parametrize("angle", [0, 90, 180, 270])
+@pytest.mark.parametrize("flip", [[], ["-display_hflip"], ["-display_vflip"]])
+def test_pictures_and_keypoints_are_where_ffmpeg_shows_them(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int, flip: list[str]
+) -> None:
+    how = ["-display_rotation", str(angle), *flip]
+    turned = ffmpeg(*how, "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
+    display = read_display(turned)
+    assert display.is_mirrored == bool(flip)
+    assert angle == (display.rotation if not flip else angle)
+    stored = next(decode_frames(clip))[1]
+    (first,) = cut_by_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
+    shown = next(decode_frames(turned))[1]
+    np.testing.assert_array_equal(shown, shown_picture(stored, display))
+    # FFmpeg's and PyAV's ways from YUV to RGB round differently.
+    assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
+
+    tracks = build_tracks(read_motion(clip))
+    moved = show_tracks(tracks, display)
+    np.testing.assert_array_equal(moved.offsets, tracks.offsets)
+    # Tracks start between four pixels; these are the same before and after.
+    starts = tracks.frame == 0
+    around = [
+        np.sort([picture[row + i, column + j] for i in (-1, 0) for j in (-1, 0)], axis=0)
+        for picture, observed in ((stored, tracks.xy), (shown, moved.xy))
+        for column, row in [np.rint(observed[starts]).astype(int).T]
+    ]
+    assert starts.sum() > 300
+    np.testing.assert_array_equal(around[0], around[1])
+
+
+def test_example_clip_turned(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """Turned as phones do: every keypoint and every pixel is that of the plain clip, turned."""
+    plain = PROJECT / "examples" / "scene.mp4"
+    turned = ffmpeg("-display_rotation", "270", "-i", plain, "-c", "copy", tmp_path / "t.mp4")
+    # Cells that fit both sides of the picture are turned with it.
+    options = MatchOptions(images=ImageOptions(every=15), density=DensityOptions(spacing=8))
+    for name, video in (("plain", plain), ("turned", turned)):
+        match(tmp_path / f"{name}.db", video, image_path=tmp_path / name, options=options)
+    width, height = 640, 360
+    for before, after in zip(
+        keypoints(tmp_path / "plain.db"), keypoints(tmp_path / "turned.db"), strict=True
+    ):
+        x, y = before.T
+        np.testing.assert_allclose(after, np.stack([height - y, x], axis=1), atol=1e-4)
+    for path in (tmp_path / "plain").iterdir():
+        image = cv2.imread(str(tmp_path / "turned" / path.name))
+        np.testing.assert_array_equal(image, np.rot90(cv2.imread(str(path)), 3))
+    assert width > height
+
+
+def test_turn_by_other_angles_is_refused(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    turned = ffmpeg("-display_rotation", "30", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
+    with pytest.raises(VideoError, match="no multiple of 90 degrees"):
+        match(tmp_path / "a.db", turned)
+    assert not (tmp_path / "a.db").exists()
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+@pytest.mark.parametrize("angle", [0, 90])
+def test_cropped_by_the_container(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str, angle: int
+) -> None:
+    crop = (12, 4, 20, 10)
+    turned = ffmpeg(
+        "-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "turned.mp4"
+    )
+    cropped = tmp_path / "cropped.mp4"
+    cropped.write_bytes(with_clean_aperture(turned.read_bytes(), (192, 128), crop))
+    if ending == "mkv":
+        if angle:
+            pytest.skip("FFmpeg writes no display matrix to Matroska")
+        cropped = ffmpeg("-i", cropped, "-c", "copy", tmp_path / "cropped.mkv")
+    assert read_display(cropped).crop == crop
+    assert inspect(cropped).display.crop == crop
+    first, *_ = cut_by_ffmpeg(ffmpeg, cropped, tmp_path / "cut", "-frames:v", "1")
+    shown = next(decode_frames(cropped))[1]
+    assert shown.shape == first.shape == ((160, 114, 3) if angle else (114, 160, 3))
+    assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
+
+    report = match(tmp_path / "a.db", cropped, image_path=tmp_path / "images")
+    assert report.num_inliers > 1000
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        size = connection.execute("SELECT width, height FROM cameras").fetchone()
+    assert size == shown.shape[1::-1]
+    plain = build_tracks(read_motion(clip)).xy
+    for xy in keypoints(tmp_path / "a.db"):
+        assert np.all((xy >= 0) & (xy <= size))
+        # Back in the stored picture, they are places that tracks have there.
+        x, y = xy.T if not angle else (size[1] - xy[:, 1], xy[:, 0])
+        back = np.stack([x + crop[0], y + crop[1]], axis=1)
+        distance = np.abs(plain[None, :] - back[:50, None]).sum(axis=2).min(axis=1)
+        assert distance.max() < 1e-3
+
+
+def test_metadata_that_looks_like_cropping(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    words = "x\n    Side data:\n      Frame Cropping: 8/8/8/8"
+    odd = ffmpeg(
+        *("-i", clip, "-c", "copy", "-metadata:s:v", f"handler_name={words}"), tmp_path / "odd.mp4"
+    )
+    assert read_display(odd).crop == (0, 0, 0, 0)
+
+
+def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    trimmed = ffmpeg("-ss", "0.2", "-i", clip, "-c", "copy", tmp_path / "trimmed.mp4")
+    assert presented_frames(clip) is None
+    presented = presented_frames(trimmed)
+    assert presented is not None
+    assert presented.tolist() == list(range(5, 16))
+    assert inspect(trimmed).num_cut == 5
+    cut = cut_by_ffmpeg(ffmpeg, trimmed, tmp_path / "cut")
+    decoded = list(decode_frames(trimmed))
+    assert [index for index, _ in decoded] == list(range(len(cut))) == list(range(11))
+    for (_, ours), theirs in zip(decoded, cut, strict=True):
+        assert np.abs(ours.astype(int) - theirs.astype(int)).mean() < 2
+
+    # Images are the frames that players show, but tracks began before.
+    tracks = build_tracks(read_motion(clip))
+    shown = show_tracks(tracks, Display(), presented)
+    assert shown.num_frames == 11
+    np.testing.assert_array_equal(shown.frame, tracks.frame[tracks.frame >= 5] - 5)
+    for name, folder in (("new", "images"), ("cut", "cut")):
+        report = match(
+            tmp_path / f"{name}.db", trimmed, image_path=tmp_path / folder, options=ALL_TRACKS
+        )
+        assert report.num_frames == report.num_images == 11
+        for index, xy in enumerate(keypoints(tmp_path / f"{name}.db")):
+            assert len(xy) > 300
+            places = set(map(tuple, tracks.xy[tracks.frame == index + 5].tolist()))
+            assert places.issuperset(map(tuple, xy.tolist()))
+
+
+def test_edit_list_of_a_clip_with_b_frames(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    how = ["-c:v", "libx264", "-bf", "3", "-g", "100", "-crf", "18"]
+    phone = encode(make_frames(24), tmp_path / "phone.mp4", *how)
+    trimmed = ffmpeg("-ss", "0.28", "-i", phone, "-c", "copy", tmp_path / "trimmed.mp4")
+    with av.open(str(trimmed)) as container:
+        expected = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+    assert 10 < len(expected) < 24
+    decoded = [image for _, image in decode_frames(trimmed)]
+    np.testing.assert_array_equal(decoded, expected)
+    report = match(tmp_path / "a.db", trimmed, image_path=tmp_path / "images")
+    assert report.num_images == len(expected)
+    assert report.num_coded_frames == 24
+    for name, image in zip(sorted((tmp_path / "images").iterdir()), expected, strict=True):
+        np.testing.assert_array_equal(cv2.imread(str(name)), image)
+    # Keypoints lie on the pictures' content: the layers move by 2 and 4 px a frame.
+    check_motion(tmp_path / "a.db")
+
+
+def check_motion(database: Path) -> None:
+    """Steps between neighbours are 2 or 4 px to the left, as the layers move."""
+    with sqlite3.connect(database) as connection:
+        rows = connection.execute("SELECT pair_id, rows, data FROM matches").fetchall()
+        ids = [i for (i,) in connection.execute("SELECT image_id FROM images ORDER BY image_id")]
+    xy = dict(zip(ids, keypoints(database), strict=True))
+    checked = 0
+    for pair_id, count, data in rows:
+        i, j = divmod(pair_id, 2147483647)
+        if j - i != 1:
+            continue
+        a, b = np.frombuffer(data, np.uint32).reshape(count, 2).T
+        step = xy[j][b] - xy[i][a]
+        assert np.median(np.minimum(np.abs(step[:, 0] + 2), np.abs(step[:, 0] + 4))) < 0.4
+        checked += 1
+    assert checked == len(ids) - 1
+
+
+@pytest.mark.parametrize("angle", [0, 90])
+def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -> None:
+    clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
+    turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
+    aspect = 1.5 if angle == 0 else 1 / 1.5
+    assert read_display(turned).pixel_aspect == pytest.approx(aspect)
+    assert "pixel aspect" in dict(info_rows(turned))
+
+    report = match(tmp_path / "a.db", turned, image_path=tmp_path / "images")
+    assert report.warnings == ()
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        model, params, prior = connection.execute(
+            "SELECT model, params, prior_focal_length FROM cameras"
+        ).fetchone()
+    fx, fy, *_ = np.frombuffer(params)
+    assert (model, prior) == (4, 0)  # OPENCV
+    # As far as the picture is shown, 288x128 or turned, it is COLMAP's guess.
+    assert (fx * aspect, fy) == pytest.approx((1.2 * 288 / 1.5 * (1.5 if angle == 0 else 1),) * 2)
+    # Images keep stored pixels, as ffmpeg cuts them.
+    (first,) = cut_by_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
+    written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
+    assert written.shape == first.shape
+
+    options = MatchOptions(camera=CameraOptions("SIMPLE_RADIAL"))
+    (warning,) = match(tmp_path / "b.db", turned, options=options).warnings
+    assert "times as wide as high, but SIMPLE_RADIAL has one focal length" in warning
+
+
+def info_rows(video: Path) -> list[tuple[str, str]]:
+    return reports.info_rows(inspect(video))
+
+
+def test_images_whose_pixels_were_made_square(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
+    cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-vf", "scale=288:128,setsar=1")
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut", options=ALL_TRACKS)
+    assert (report.num_images, report.num_written_images, report.warnings) == (10, 0, ())
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        row = connection.execute("SELECT model, width, height, params FROM cameras").fetchone()
+    assert row[:3] == (2, 288, 128)
+    assert np.frombuffer(row[3])[0] == pytest.approx(1.2 * 288)
+    match(tmp_path / "b.db", clip, options=ALL_TRACKS)
+    for square, stored in zip(
+        keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db"), strict=True
+    ):
+        np.testing.assert_allclose(square, stored * [1.5, 1], atol=1e-4)
+
+
+def test_superres(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """Pictures are coded narrower than they are shown; motion is that of the shown ones."""
+    rng = np.random.default_rng(3)
+    scene = cv2.GaussianBlur(rng.integers(0, 256, (128, 400, 3), dtype=np.uint8), (0, 0), 3)
+    scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
+    pan = np.stack([scene[:, 6 * i : 6 * i + 256] for i in range(12)])
+    how = ["-c:v", "libsvtav1", "-preset", "8", "-crf", "20", "-svtav1-params"]
+    how += ["superres-mode=1:superres-denom=12:superres-kf-denom=12"]
+    clip = encode(pan, tmp_path / "clip.mp4", *how)
+    assert 171 in {frame.header["frame_width"] for frame in read_motion(clip)}
+    tracks = build_tracks(read_motion(clip))
+    next_one = (np.diff(tracks.frame) == 1) & (np.diff(tracks.xy[:, 1]) < 1)
+    steps = np.diff(tracks.xy, axis=0)[next_one]
+    assert np.median(steps[:, 0]) == pytest.approx(-6, abs=0.3)
+    assert tracks.xy[:, 0].max() > 200
+    match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
+    (first,) = cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-frames:v", "1")
+    written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
+    assert written.shape == first.shape == (128, 256, 3)
+    assert read_display(clip).pixel_aspect == pytest.approx(1, abs=5e-3)

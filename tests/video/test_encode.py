@@ -1,0 +1,398 @@
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from conftest import HEED_INTERRUPTS, Encode, Ffmpeg, make_frames
+
+from colmap_av1.cli import main
+from colmap_av1.errors import (
+    BitstreamError,
+    ColmapAv1Error,
+    EncodeError,
+    OptionError,
+    VideoError,
+)
+from colmap_av1.match import match
+from colmap_av1.motion.info import inspect
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import EncodeOptions, MatchOptions
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.encode import encode as encode_video
+from colmap_av1.video.encode import stream_of
+from colmap_av1.video.encoders import find_encoder
+
+H264 = ("-c:v", "libx264", "-g", "6", "-bf", "2")
+
+
+@pytest.fixture(scope="session")
+def phone(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An H.264 clip of 12 frames, 96x64, with B frames."""
+    return encode(make_frames(12, 96, 64), tmp_path_factory.mktemp("phone") / "phone.mp4", *H264)
+
+
+def times(video: Path) -> list[float]:
+    with av.open(str(video)) as container:
+        stamps = sorted(float(p.pts * p.time_base) for p in container.demux(video=0) if p.size)
+    return [stamp - stamps[0] for stamp in stamps]
+
+
+@pytest.mark.parametrize("encoder", ["libaom", "svt"])
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+def test_streams_refer_backwards_only(
+    phone: Path, tmp_path: Path, encoder: str, ending: str
+) -> None:
+    done: list[tuple[str, int, int | None]] = []
+    report = encode_video(
+        phone,
+        tmp_path / f"out.{ending}",
+        options=EncodeOptions(encoder=encoder),
+        progress=lambda *what: done.append(what),
+    )
+    assert report.num_frames == 12
+    assert done[0] == ("encoding", 0, 12)
+    assert done[-1] == ("encoding", 12, 12)
+    frames = list(read_motion(report.output))
+    assert [f.display_index for f in frames] == list(range(12))
+    assert sum(f.header["frame_type"] == 0 for f in frames) == 1
+    for f in frames:
+        assert f.ref_display_index[1:].max() < max(f.display_index, 1)
+    np.testing.assert_allclose(times(report.output), times(phone), atol=2e-3)
+    assert [p.name for p in tmp_path.iterdir()] == [f"out.{ending}"]
+    # Motion to the frame before is what makes good tracks.
+    assert inspect(report.output).reference_distances[-1] > 0.6
+
+
+def test_pictures_are_those_of_the_video(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    turned = ffmpeg("-display_rotation", "90", "-i", phone, "-c", "copy", tmp_path / "t.mp4")
+    report = encode_video(turned, tmp_path / "out.mp4", options=EncodeOptions(quality=5))
+    for (_, before), (_, after) in zip(
+        decode_frames(turned), decode_frames(report.output), strict=True
+    ):
+        assert after.shape == (96, 64, 3)
+        assert cv2.PSNR(before, after) > 30
+
+
+def test_varying_frame_rate_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    uneven = ffmpeg(
+        *("-i", phone, "-vf", "setpts=N*N*0.004/TB", "-fps_mode", "passthrough"),
+        *("-enc_time_base", "1/1000", *H264, tmp_path / "uneven.mp4"),
+    )
+    report = encode_video(uneven, tmp_path / "out.mp4")
+    assert report.num_frames == 12
+    np.testing.assert_allclose(times(report.output), times(uneven), atol=2e-3)
+
+
+@pytest.mark.parametrize("encoder", ["libaom", "svt"])
+def test_odd_sizes(encode: Encode, tmp_path: Path, encoder: str) -> None:
+    source = encode(make_frames(4, 97, 65), tmp_path / "odd.mkv", "-c:v", "ffv1")
+    report = encode_video(source, tmp_path / "out.mp4", options=EncodeOptions(encoder=encoder))
+    assert {image.shape for _, image in decode_frames(report.output)} == {(65, 97, 3)}
+
+
+def test_stream_is_kept_and_used_again(phone: Path, tmp_path: Path) -> None:
+    video = Path(shutil.copy(phone, tmp_path / "phone.mov"))
+    first = stream_of(video)
+    assert first.output == tmp_path / "phone.av1.mp4"
+    assert not first.reused
+    bytes_before = first.output.read_bytes()
+    assert stream_of(video).reused
+    assert stream_of(video, options=EncodeOptions(quality=20)).reused
+    # Made with other settings, cut off, or older than the video: made again.
+    assert not stream_of(video, options=EncodeOptions(quality=40)).reused
+    assert not stream_of(video, options=EncodeOptions(quality=20)).reused
+    assert first.output.read_bytes() == bytes_before
+    first.output.write_bytes(bytes_before[: len(bytes_before) // 2])
+    with pytest.raises(OptionError, match="exists and is no stream that was kept"):
+        stream_of(video)
+    first.output.unlink()
+    stream_of(video)
+    os.utime(first.output, (0, 0))
+    assert not stream_of(video).reused
+
+
+def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
+    first = stream_of(video)
+    # As many frames, older than the stream, and the stream's name is the same.
+    other = ffmpeg("-i", phone, "-vf", "hflip", *H264, tmp_path / "phone.mov")
+    os.utime(other, (0, 0))
+    assert not stream_of(other).reused
+    assert not stream_of(video).reused
+    assert stream_of(video).output == first.output
+    with pytest.raises(OptionError, match=r"ends in \.mp4, \.mkv, \.webm"):
+        stream_of(video, keep_stream=tmp_path / "out.ivf")
+
+
+def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
+    video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
+    other = tmp_path / "phone.av1.mp4"
+    shutil.copy(phone, other)
+    with pytest.raises(OptionError, match="exists and is no stream that was kept"):
+        stream_of(video)
+    with pytest.raises(OptionError, match="exists: give another output, or --overwrite"):
+        encode_video(video, other)
+    with pytest.raises(OptionError, match="is the video itself"):
+        encode_video(video, video, overwrite=True)
+    assert other.read_bytes() == video.read_bytes() == phone.read_bytes()
+    assert encode_video(video, other, overwrite=True).num_frames == 12
+
+
+def test_match_takes_any_codec(phone: Path, tmp_path: Path) -> None:
+    video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
+    stream = tmp_path / "elsewhere.mp4"
+    options = MatchOptions(keep_stream=str(stream))
+    report = match(tmp_path / "a.db", video, image_path=tmp_path / "frames", options=options)
+    assert report.stream == stream
+    assert report.num_images == 12
+    assert report.num_verified_pairs > 0
+    # The pictures are the video's own, not those of the stream.
+    for index, picture in decode_frames(video):
+        written = cv2.imread(str(tmp_path / "frames" / f"frame_{index:06d}.png"))
+        np.testing.assert_array_equal(written, picture)
+    again = match(tmp_path / "b.db", video, options=options)
+    assert again.num_matches == report.num_matches
+
+
+def test_reencode_only_what_is_poor(
+    clip: Path, encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    how = ("-c:v", "libaom-av1", "-cpu-used", "8", "-g", "1", "-crf", "20")
+    intra = encode(make_frames(8), tmp_path / "intra.mp4", *how)
+    assert not inspect(intra).good
+    words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(intra)]
+    assert main(words) == 2
+    assert "--reencode 1" in capsys.readouterr().err
+    assert main([*words, "--reencode", "1"]) == 0
+    assert (tmp_path / "intra.av1.mp4").is_file()
+    good = match(tmp_path / "b.db", clip, options=MatchOptions(reencode=True))
+    assert good.stream == clip
+
+
+def hurt(video: Path, output: Path, packet: int) -> Path:
+    """A copy of an MP4 file in which a packet, counted as coded, cannot be decoded."""
+    with av.open(str(video)) as container:
+        coded = [p for p in container.demux(video=0) if p.size][packet]
+        start, end = coded.pos, coded.pos + coded.size
+    data = bytearray(video.read_bytes())
+    data[start:end] = b"\xff" * (end - start)
+    output.write_bytes(data)
+    return output
+
+
+def test_damaged_video_is_used_up_to_the_damage(
+    encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Without B frames, so that packets come in the order of the pictures.
+    how = ("-c:v", "libx264", "-g", "6", "-bf", "0")
+    whole = encode(make_frames(24, 96, 64), tmp_path / "whole.mp4", *how)
+    video = hurt(whole, tmp_path / "video.mp4", 13)
+    with pytest.warns(UserWarning, match=r"video\.mp4: damaged after 13 of 24 frames"):
+        first = stream_of(video)
+    assert first.num_frames == len(list(decode_frames(first.output))) == 13
+    for (_, before), (_, after) in zip(
+        decode_frames(whole), decode_frames(first.output), strict=False
+    ):
+        assert cv2.PSNR(before, after) > 30
+    # Nor is the damage forgotten when the stream is used again.
+    with pytest.warns(UserWarning, match="damaged after 13 of 24 frames"):
+        again = stream_of(video)
+    assert again.reused
+    assert again.num_frames == 13
+    bytes_before = first.output.read_bytes()
+    with pytest.raises(BitstreamError, match="damaged after 13 frames"):
+        stream_of(video, strict=True)
+    words = ["encode", "--video", str(video), "--output", str(tmp_path / "out.mp4"), "--quiet"]
+    assert main([*words, "--strict"]) == 2
+    assert not (tmp_path / "out.mp4").exists()
+    assert main(words) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1] for line in lines] == [" error", " warning"]
+    assert first.output.read_bytes() == bytes_before
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_frames_are_counted_where_the_container_does_not(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    video = ffmpeg("-i", phone, "-c", "copy", tmp_path / "phone.ts")
+    done: list[tuple[str, int, int | None]] = []
+    encode_video(video, tmp_path / "out.mp4", progress=lambda *what: done.append(what))
+    assert done[0] == ("encoding", 0, 12)
+    assert done[-1] == ("encoding", 12, 12)
+
+
+def test_video_that_changes(phone: Path, tmp_path: Path) -> None:
+    """As one does that is still copied from the phone."""
+    video = tmp_path / "v.mov"
+    shutil.copyfile(phone, video)
+
+    def write_on(stage: str, done: int, total: int | None) -> None:
+        if done == 0:
+            with video.open("ab") as file:
+                file.write(b"more")
+
+    with pytest.raises(VideoError, match="changed or went while it was read"):
+        encode_video(video, tmp_path / "s.mp4", progress=write_on)
+    assert list(tmp_path.iterdir()) == [video]
+
+
+def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
+    video = tmp_path / "video.h264"
+    video.write_bytes(
+        b"".join(
+            encode(make_frames(4, *size), tmp_path / "part.h264", "-c:v", "libx264").read_bytes()
+            for size in [(96, 64), (128, 96)]
+        )
+    )
+    with pytest.raises(VideoError, match="change their size from 96x64 to 128x96"):
+        encode_video(video, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
+    assert not list(tmp_path.glob("*out*"))
+
+
+@contextmanager
+def long_conversion(ffmpeg: Ffmpeg, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is converting long.mp4 of a folder to out.mp4, for some time yet."""
+    long = ffmpeg(
+        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
+        *("-c:v", "libx264", "-preset", "ultrafast", folder / "long.mp4"),
+    )
+    words = ["encode", "--video", str(long), "--output", str(folder / "out.mp4")]
+    words += ["--encoder", "libaom", "--speed", "2"]
+    command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
+    with subprocess.Popen(command, cwd=folder) as process:
+        deadline = time.monotonic() + 60
+        while not list(folder.glob(".out.mp4.*.partial")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        yield process
+
+
+def is_converted(video: Path) -> bool:
+    running = subprocess.run(
+        ["ps", "-ww", "-eo", "args"], capture_output=True, text=True, check=True
+    )
+    return str(video) in running.stdout
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_conversion_leaves_nothing(
+    ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int
+) -> None:
+    with long_conversion(ffmpeg, tmp_path) as process:
+        process.send_signal(number)
+        assert process.wait(30) == status
+    assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
+    assert not is_converted(tmp_path / "long.mp4")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
+def test_killed_conversion_ends_and_is_cleaned_up_after(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    with long_conversion(ffmpeg, tmp_path) as process:
+        process.kill()
+        process.wait(30)
+    deadline = time.monotonic() + 10
+    while is_converted(tmp_path / "long.mp4"):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert list(tmp_path.glob(".out.mp4.*.partial"))
+    others = [f".out.mp4.{os.getppid()}.partial", ".out.mp4.backup.partial", ".in.mp4.1.partial"]
+    for name in others:
+        (tmp_path / name).touch()
+    encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
+    assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "out.mp4", *others}
+
+
+def fake_ffmpeg(folder: Path, script: str) -> Path:
+    """A program that does as the real ffmpeg does, until `script` says otherwise."""
+    path = folder / "ffmpeg"
+    path.write_text(f'#!/bin/sh\n{script}\nexec {imageio_ffmpeg.get_ffmpeg_exe()} "$@"\n')
+    path.chmod(0o755)
+    return path
+
+
+FAIL_HALF_WAY = """case "$*" in *lavfi*) ;; *)
+  echo frame=7; echo 'Error submitting a packet to the encoder' >&2; exit 1;; esac"""
+
+
+def test_encoder_that_fails_half_way(
+    phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bin").mkdir()
+    program = fake_ffmpeg(tmp_path / "bin", FAIL_HALF_WAY)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with pytest.raises(EncodeError, match=r"failed after 7 frames \(Error submitting a packet"):
+        encode_video(phone, tmp_path / "out.mp4")
+    assert [p.name for p in tmp_path.iterdir()] == ["bin"]
+
+
+def test_full_disk(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = """Svt[info]: ----
+    [vost#0:0/libsvtav1 @ 0x55d5b6f68380] [error] Error muxing a packet: No space left"""
+    script = f"case \"$*\" in *lavfi*) ;; *) echo '{words} on device' >&2; exit 1;; esac"
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, script)))
+    with pytest.raises(EncodeError, match="the disk is full"):
+        encode_video(phone, tmp_path / "out.mp4")
+    assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+def test_no_encoder_at_all(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = fake_ffmpeg(tmp_path, "echo 'Unknown encoder' >&2; exit 1")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(EncodeError, match=r"no AV1 encoder: none of nvenc, .* Unknown encoder"):
+        encode_video(phone, tmp_path / "out.mp4")
+    with pytest.raises(EncodeError, match=r"svt: Unknown encoder.*another --encoder"):
+        find_encoder(EncodeOptions(encoder="svt"))
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "message"),
+    [
+        (("absent.mp4", "out.mp4"), VideoError, "no such file"),
+        ((".", "out.mp4"), VideoError, "is a folder"),
+        (("text.mp4", "out.mp4"), VideoError, "not a video"),
+        (("phone.mp4", "out.avi"), OptionError, r"ends in \.mp4"),
+        (("phone.mp4", "absent/out.mp4"), EncodeError, "the folder does not exist"),
+    ],
+)
+def test_bad_input(
+    phone: Path,
+    tmp_path: Path,
+    names: tuple[str, str],
+    error: type[ColmapAv1Error],
+    message: str,
+) -> None:
+    shutil.copy(phone, tmp_path / "phone.mp4")
+    (tmp_path / "text.mp4").write_text("no video\n" * 50)
+    with pytest.raises(error, match=message) as caught:
+        encode_video(tmp_path / names[0], tmp_path / names[1])
+    assert "\n" not in str(caught.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["phone.mp4", "text.mp4"]
+
+
+def test_video_without_a_decodable_frame(phone: Path, tmp_path: Path) -> None:
+    data = phone.read_bytes()
+    start, end = data.index(b"mdat") + 4, data.index(b"moov")
+    assert start < end
+    damaged = tmp_path / "damaged.mp4"
+    damaged.write_bytes(data[:start] + bytes(end - start) + data[end:])
+    with pytest.raises(ColmapAv1Error, match=str(damaged)) as caught:
+        encode_video(damaged, tmp_path / "out.mp4")
+    assert "\n" not in str(caught.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["damaged.mp4"]

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.errors import ImageError, OptionError, VideoError
+from colmap_av1.video.unchanged import unchanged
+
+
+def write_on(video: Path) -> None:
+    before = video.stat()
+    with video.open("ab") as file:
+        file.write(b"more")
+    os.utime(video, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def write_anew(video: Path) -> None:
+    video.write_bytes(b"VIDEO")
+    os.utime(video, ns=(0, 0))
+
+
+def point_elsewhere(video: Path) -> None:
+    """At a file of the same size and time."""
+    other = video.with_name("other")
+    other.write_bytes(video.read_bytes())
+    os.utime(other, ns=(video.stat().st_atime_ns, video.stat().st_mtime_ns))
+    video.unlink()
+    video.symlink_to(other)
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    (tmp_path / "v.mp4").write_bytes(b"video")
+    return tmp_path / "v.mp4"
+
+
+def test_what_stays_is_accepted(video: Path) -> None:
+    with unchanged(video) as check:
+        video.read_bytes()
+        check()
+
+
+def read(video: Path, change: Callable[[Path], None], error: Exception | None = None) -> None:
+    """Read a video that changes; the error where its check notices."""
+    with unchanged(video) as check:
+        change(video)
+        try:
+            check()
+        except VideoError:
+            if error is not None:
+                raise error from None
+
+
+@pytest.mark.parametrize("change", [write_on, write_anew, point_elsewhere, Path.unlink])
+def test_what_changes_is_refused(video: Path, change: Callable[[Path], None]) -> None:
+    with pytest.raises(VideoError, match=r"v\.mp4: changed or went .*: let it be"):
+        read(video, change)
+
+
+def test_what_changes_is_refused_at_once(video: Path) -> None:
+    with pytest.raises(ZeroDivisionError):  # which is no user's fault, and stays what it is
+        read(video, write_on, ZeroDivisionError())
+
+
+def test_errors_that_come_of_a_change_say_so(video: Path) -> None:
+    with pytest.raises(ImageError, match="of its own"), unchanged(video):
+        raise ImageError("of its own")
+    with pytest.raises(VideoError, match="changed or went"):
+        read(video, write_on, ImageError("no frame 7"))
+
+
+def test_a_video_that_was_never_there(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="no such file"), unchanged(tmp_path / "none.mp4"):
+        raise OptionError("no such file")
