@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED = PROJECT.parent / "shared"
+# For `sys.path` of processes that use parts of the tests.
+TEST_PATHS = os.pathsep.join(str(p) for p in (PROJECT / "tests", *(PROJECT / "tests").glob("*/")))
 
 AV1 = [
     *("-c:v", "libaom-av1", "-usage", "realtime", "-cpu-used", "6", "-lag-in-frames", "0"),

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
-TESTS = Path(__file__).parent
+from conftest import TEST_PATHS
 
 _WAITING = """
     import os, sys, time
@@ -50,15 +49,7 @@ def start_writing(
     """
     script = textwrap.dedent(_WAITING)
     process = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            script,
-            os.pathsep.join([str(TESTS), str(TESTS / "database")]),
-            module,
-            rows,
-            mode,
-        ],
+        [sys.executable, "-c", script, path, TEST_PATHS, module, rows, mode],
         stdout=subprocess.PIPE,
         text=True,
         cwd=path.parent,  # else the checkout would hide the installed package

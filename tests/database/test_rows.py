@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import PROJECT
+from conftest import TEST_PATHS
 from half_way import kill, start_writing
 from hypothesis import given
 from hypothesis import strategies as st
@@ -479,7 +479,7 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
     make_empty(path)
     query(path, f"PRAGMA journal_mode = {journal}")
     before = dump(path)
-    kill(start_writing(path, "error", "test_database", "ROWS"))
+    kill(start_writing(path, "error", "test_rows", "ROWS"))
     assert dump(path) == before
     write_matches(path, NAMES, None, **ROWS)
     assert len(query(path, "SELECT * FROM matches")) == len(ROWS["pairs"])
@@ -492,10 +492,10 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
         make_empty(path)
     before = path.read_bytes() if existing else None
     script = """
-        import resource, signal, sys
-        sys.path.insert(0, sys.argv[2])
-        from test_database import CAMERA, NAMES, ROWS
-        from colmap_av1.database.writing import (write_matches)
+        import os, resource, signal, sys
+        sys.path[:0] = sys.argv[2].split(os.pathsep)
+        from test_rows import CAMERA, NAMES, ROWS
+        from colmap_av1.database.writing import write_matches
         from colmap_av1.errors import DatabaseError
 
         # Writes beyond this size fail, as they do on a full disk.
@@ -507,7 +507,7 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
             print(error)
     """
     output = subprocess.check_output(
-        [sys.executable, "-c", textwrap.dedent(script), path, PROJECT / "tests"],
+        [sys.executable, "-c", textwrap.dedent(script), path, TEST_PATHS],
         text=True,
         cwd=tmp_path,  # else the checkout would hide the installed package
     )

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import PROJECT, SHARED
+from conftest import PROJECT, SHARED, TEST_PATHS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -68,11 +68,11 @@ _SILENT = ("flip_frame_header_2.ivf", "duplicated_tu.ivf", "reserved_obu_types.i
 # Reads files in a process of its own: a crash or a hang must not take the tests with it.
 # One line of JSON a file, written before the next is touched.
 _WORKER = """
-import gc, json, resource, sys, time, warnings
-sys.path.insert(0, sys.argv[1])
+import gc, json, os, resource, sys, time, warnings
+sys.path[:0] = sys.argv[1].split(os.pathsep)
 from test_damaged import digest
 from colmap_av1.errors import ColmapAv1Error
-from colmap_av1.motion.reading import (read_motion)
+from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 
 def peak():
@@ -111,7 +111,7 @@ def digest(fields: dict[str, NDArray[Any]]) -> str:
 
 def read_apart(paths: list[Path]) -> dict[str, dict[str, Any]]:
     """What a process of its own makes of the files, by name; a crash or hang fails the test."""
-    command = [sys.executable, "-c", _WORKER, str(Path(__file__).parent), *map(str, paths)]
+    command = [sys.executable, "-c", _WORKER, TEST_PATHS, *map(str, paths)]
     run = subprocess.run(
         command,
         capture_output=True,
