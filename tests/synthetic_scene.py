@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.matching.pairs import image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.matching.verify import TwoViewGeometry, verify_pairs
+from colmap_av1.matching.two_view_geometry import TwoViewGeometry
+from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 

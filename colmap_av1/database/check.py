@@ -14,7 +14,6 @@ from colmap_av1.database.contents import (
     Parallax,
     images_with_rows,
     layout_of,
-    name_of_config,
     pairs_with_rows,
     parallax_of,
 )
@@ -28,10 +27,9 @@ from colmap_av1.database.findings import (
     orphan_findings,
     pair_findings,
 )
-from colmap_av1.database.reading import (
-    cameras_of,
-)
+from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
+from colmap_av1.matching.two_view_geometry import config_name
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     layout, readers = layout_of(connection)
     group = _largest_group(len(images.ids), pairs.index[used])
     parallax = parallax_of(connection, path, images, pairs, cameras)
-    configs = [name_of_config(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
+    configs = [config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]

@@ -11,30 +11,21 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.file import columns
-from colmap_av1.database.reading import (
-    image_ids_from_pair_id,
-    keypoints_from_row,
-    matches_from_row,
+from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
+from colmap_av1.matching.mapper_limits import (
+    INITIAL_MAX_FORWARD_MOTION,
+    INITIAL_MIN_INLIERS,
+    MIN_INLIERS,
 )
+from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, UNUSED_CONFIGS, TwoViewConfig
 
-# COLMAP's kinds of two-view geometry, by number.
-CONFIGS = (
-    "UNDEFINED",
-    "DEGENERATE",
-    "CALIBRATED",
-    "UNCALIBRATED",
-    "PLANAR",
-    "PANORAMIC",
-    "PLANAR_OR_PANORAMIC",
-    "WATERMARK",
-    "MULTIPLE",
-)
-_IGNORED_CONFIGS = ("UNDEFINED", "DEGENERATE", "WATERMARK")
-# Defaults of COLMAP's mappers: inliers of a pair they use, of one they start with, and the
-# angles of one they start with, at first and after halving it twice.
-MIN_INLIERS = 15
-MIN_INITIAL_INLIERS = 100
-_MAX_FORWARD_MOTION = 0.95
+# The model that gives a pose, by configuration; those of several models, or none, give none.
+_MODEL_OF_CONFIG = {
+    TwoViewConfig.CALIBRATED: "E",
+    TwoViewConfig.CALIBRATED_RIG: "E",
+    TwoViewConfig.UNCALIBRATED: "F",
+    **dict.fromkeys(FLAT_CONFIGS, "H"),
+}
 # Pairs whose geometry is computed for the parallax, and the quantile of their angles that is
 # taken for the largest: a wrong model may give any angle.
 _NUM_DEEPEST = 24
@@ -114,8 +105,7 @@ class Pairs:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Pairs that the mappers of all versions use."""
-        ignored = [CONFIGS.index(name) for name in _IGNORED_CONFIGS]
-        return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, ignored)
+        return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, UNUSED_CONFIGS)
 
 
 def layout_of(connection: sqlite3.Connection) -> tuple[str, str]:
@@ -165,7 +155,6 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
     matched = [np.zeros(len(k), dtype=np.bool_) for k in images.keypoints]
     rows: dict[int, tuple[int, int, float, float]] = {}
     num_astray = 0
-    ignored = [CONFIGS.index(name) for name in _IGNORED_CONFIGS]
     for pair_id, num_rows, data, config in connection.execute(
         "SELECT pair_id, rows, data, config FROM two_view_geometries"
     ):
@@ -181,7 +170,7 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
             step = images.keypoints[j][b].astype(np.float64) - images.keypoints[i][a]
             spread = np.hypot(*np.subtract(*np.quantile(step, (0.9, 0.1), axis=0)))
             rows[pair_id] = (num_rows, config, np.median(np.hypot(*step.T)), spread)
-        if num_rows >= MIN_INLIERS and config not in ignored:
+        if num_rows >= MIN_INLIERS and config not in UNUSED_CONFIGS:
             matched[i][a] = matched[j][b] = True
     pair_ids = np.array(sorted(rows.keys() | num_matches.keys()), dtype=np.int64)
     index = np.array(
@@ -217,7 +206,7 @@ def parallax_of(
     if used.size == 0:
         return None
     # The mapper starts with pairs of many inliers; without one, any used pair will do.
-    strong = used[pairs.num_inliers[used] >= MIN_INITIAL_INLIERS]
+    strong = used[pairs.num_inliers[used] >= INITIAL_MIN_INLIERS]
     candidates = strong if strong.size else used
     deepest = candidates[np.argsort(-pairs.spread[candidates], kind="stable")]
     angles, forward, known = [], [], True
@@ -234,7 +223,9 @@ def parallax_of(
             ends[0], images.keypoints[i], ends[1], images.keypoints[j], geometry
         ):
             angles.append(np.rad2deg(geometry.tri_angle))
-            forward.append(abs(geometry.cam2_from_cam1.translation[2]) >= _MAX_FORWARD_MOTION)
+            forward.append(
+                abs(geometry.cam2_from_cam1.translation[2]) >= INITIAL_MAX_FORWARD_MOTION
+            )
             known = known and all(camera.has_prior_focal_length for camera in ends)
     widest = candidates[np.argmax(pairs.displacement[candidates])]
     i, j = pairs.index[widest]
@@ -263,18 +254,14 @@ def _read_geometry(
         for name, blob in zip(names, blobs, strict=True)
         if blob is not None and len(blob) == 72
     }
-    kind = name_of_config(config)
-    needed = {"CALIBRATED": "E", "UNCALIBRATED": "F"}.get(kind, "H")
-    if kind == "MULTIPLE" or kind not in CONFIGS or needed not in models:
+    if _MODEL_OF_CONFIG.get(config) not in models:
         return None
     geometry = pycolmap.TwoViewGeometry()
+    if config == TwoViewConfig.CALIBRATED_RIG:
+        # Its essential matrix is one like any other, but COLMAP takes no pose from it.
+        config = TwoViewConfig.CALIBRATED
     geometry.config = pycolmap.TwoViewGeometryConfiguration(config)
     geometry.inlier_matches = matches_from_row(path, pair_id, num_rows, data)
     for name, model in models.items():
         setattr(geometry, name, model)
     return geometry
-
-
-def name_of_config(config: int) -> str:
-    """COLMAP's name of a kind of geometry; the number of one that it has none for."""
-    return CONFIGS[config] if 0 <= config < len(CONFIGS) else str(config)

@@ -220,6 +220,11 @@ def columns(connection: sqlite3.Connection, table: str) -> set[str]:
     return {row[1] for row in connection.execute(f"PRAGMA table_info({table})")}
 
 
+def has_rows(connection: sqlite3.Connection, table: str) -> bool:
+    """Whether a table of the file has any row."""
+    return connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None
+
+
 def check_layout(connection: sqlite3.Connection, path: Path) -> None:
     """Refuse a file that is not a COLMAP database."""
     for table, required in _REQUIRED_COLUMNS.items():

@@ -10,18 +10,16 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from colmap_av1.database.contents import (
-    CONFIGS,
-    MIN_INITIAL_INLIERS,
-    MIN_INLIERS,
-    Images,
-    Pairs,
-    Parallax,
-)
+from colmap_av1.database.contents import Images, Pairs, Parallax
 from colmap_av1.database.file import columns
+from colmap_av1.matching.mapper_limits import (
+    INITIAL_LEAST_ANGLE,
+    INITIAL_MIN_ANGLE,
+    INITIAL_MIN_INLIERS,
+    MIN_INLIERS,
+)
+from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
 
-_FLAT_CONFIGS = ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
-_INITIAL_ANGLE, _LEAST_INITIAL_ANGLE = 16.0, 4.0
 # Share of keypoints without a match that is worth a line.
 _NOTED_SHARE = 0.01
 Severity = Literal["error", "warning", "note"]
@@ -145,19 +143,17 @@ def pair_findings(pairs: Pairs, images: Images) -> Iterator[Finding]:
             "note", f"{few} pairs have fewer than {MIN_INLIERS} inliers: mappers leave them out"
         )
     for config, why in (
-        ("UNDEFINED", "their geometry was never estimated: mappers from COLMAP 4.2 on"),
-        ("DEGENERATE", "their geometry is degenerate: mappers from COLMAP 4.2 on"),
-        ("WATERMARK", "they match a watermark: mappers"),
+        (TwoViewConfig.UNDEFINED, "their geometry was never estimated: mappers from COLMAP 4.2 on"),
+        (TwoViewConfig.DEGENERATE, "their geometry is degenerate: mappers from COLMAP 4.2 on"),
+        (TwoViewConfig.WATERMARK, "they match a watermark: mappers"),
     ):
-        count = np.count_nonzero(
-            (pairs.num_inliers >= MIN_INLIERS) & (pairs.config == CONFIGS.index(config))
-        )
+        count = np.count_nonzero((pairs.num_inliers >= MIN_INLIERS) & (pairs.config == config))
         if count:
             yield Finding(
-                "note" if config == "WATERMARK" else "warning",
+                "note" if config == TwoViewConfig.WATERMARK else "warning",
                 f"{count} pairs have inliers, but {why} leave them out",
             )
-    multiple = np.count_nonzero(used & (pairs.config == CONFIGS.index("MULTIPLE")))
+    multiple = np.count_nonzero(used & (pairs.config == TwoViewConfig.MULTIPLE))
     if multiple:
         yield Finding(
             "note", f"{multiple} pairs have several geometries: the global mapper leaves them out"
@@ -189,13 +185,13 @@ def motion_findings(
             f"pairs connect at most {group} of {num_images} images: the others stay out of the "
             "model, or go to another one",
         )
-    if pairs.num_inliers[used].max() < MIN_INITIAL_INLIERS:
+    if pairs.num_inliers[used].max() < INITIAL_MIN_INLIERS:
         yield Finding(
             "warning",
-            f"no pair has {MIN_INITIAL_INLIERS} inliers: the incremental mapper starts with "
+            f"no pair has {INITIAL_MIN_INLIERS} inliers: the incremental mapper starts with "
             "none unless --Mapper.init_min_num_inliers is lower",
         )
-    flat = np.isin(pairs.config[used], [CONFIGS.index(name) for name in _FLAT_CONFIGS])
+    flat = np.isin(pairs.config[used], FLAT_CONFIGS)
     if np.mean(flat) > 0.5:
         yield Finding(
             "warning",
@@ -204,13 +200,13 @@ def motion_findings(
         )
     if parallax.angle is None:
         yield Finding("note", "parallax is unknown: the widest pairs have no model stored")
-    elif parallax.angle < _LEAST_INITIAL_ANGLE:
+    elif parallax.angle < INITIAL_LEAST_ANGLE:
         yield Finding(
             "warning",
             f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no start, "
             "take the global one",
         )
-    elif parallax.angle < _INITIAL_ANGLE:
+    elif parallax.angle < INITIAL_MIN_ANGLE:
         yield Finding(
             "note",
             f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts "

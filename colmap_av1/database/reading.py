@@ -11,12 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import (
-    MAX_NUM_IMAGES,
-    check_layout,
-    is_new,
-    open_database,
-)
+from colmap_av1.database.file import MAX_NUM_IMAGES, check_layout, is_new, open_database
 from colmap_av1.errors import DatabaseError
 
 # A keypoint's columns after x and y where it has no shape of its own: scale and orientation,

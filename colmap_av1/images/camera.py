@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pycolmap
 
 from colmap_av1.errors import OptionError
 from colmap_av1.options import CameraOptions
 
+# Models that a pinhole camera is a first guess of, and those of them without distortion.
+_UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
+_RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 # Models of new cameras: COLMAP's own choice; where the focal length is known, one with two
 # parameters for the distortion, as what a lens does beyond one bends focal length and path; and the
 # simplest with two focal lengths that knows distortion.
@@ -44,8 +48,8 @@ def make_camera(
     names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     name = options.camera_model
     if name is None:
-        told = focal_length is not None and options.camera_params is None
-        square = _MODEL_OF_KNOWN_FOCAL_LENGTH if told else _MODEL
+        estimated = focal_length is not None and options.camera_params is None
+        square = _MODEL_OF_KNOWN_FOCAL_LENGTH if estimated else _MODEL
         name = square if is_square(pixel_aspect) else _MODEL_OF_OBLONG_PIXELS
     if name not in names:
         raise OptionError(f"unknown camera model {name!r}: give one of {', '.join(names)}")
@@ -55,7 +59,7 @@ def make_camera(
     if focal_length is None:
         focal_length = 1.2 * max(width * pixel_aspect, height)
     camera = create(0, model, focal_length, width, height)
-    if len(camera.focal_length_idxs()) == 2:
+    if has_two_focal_lengths(camera):
         params = camera.params
         params[camera.focal_length_idxs()[0]] = focal_length / pixel_aspect
         camera.params = params
@@ -68,6 +72,37 @@ def make_camera(
     if options.camera_params is not None:
         camera.params = _parse_camera_params(options.camera_params, camera)
     return camera
+
+
+def is_undistorted(camera: Any) -> bool:
+    """Whether the model of a pycolmap.Camera has no distortion."""
+    return camera.model_name in _UNDISTORTED
+
+
+def is_nearly_pinhole(model: str | None) -> bool:
+    """Whether a pinhole camera is a first guess of the named model; that of none given is one."""
+    return model is None or model in _RECTILINEAR
+
+
+def has_two_focal_lengths(camera: Any) -> bool:
+    """Whether the model of a pycolmap.Camera has a focal length along either axis of its own."""
+    return len(camera.focal_length_idxs()) == 2
+
+
+def check_pixel_aspect(camera: Any, pixel_aspect: float, what_to_do: str) -> list[str]:
+    """Warnings of a camera with one focal length where pixels are not square.
+
+    Args:
+        camera: a pycolmap.Camera.
+        pixel_aspect: width of a pixel over its height.
+        what_to_do: how the user gets another model, for the message.
+    """
+    if is_square(pixel_aspect) or has_two_focal_lengths(camera):
+        return []
+    return [
+        f"pixels are {pixel_aspect:.3f} times as wide as high, but {camera.model_name} has one "
+        f"focal length for both directions; OPENCV and PINHOLE have two: {what_to_do}"
+    ]
 
 
 def is_square(pixel_aspect: float) -> bool:

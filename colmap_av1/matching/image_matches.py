@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
+from colmap_av1.images.camera import is_nearly_pinhole
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.matching.focal import estimate_focal_length
+from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.matching.verify import TwoViewGeometry, verify_pairs
+from colmap_av1.matching.two_view_geometry import TwoViewGeometry
+from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import Clock, Progress
-
-# The mapper's default limit for the translation along the axis of a first pair.
-_INIT_MAX_FORWARD_MOTION = 0.95
-# Camera models that a pinhole camera is a first guess of.
-_RECTILINEAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def shared_focal_length(
         In heights of a pixel; None where parameters are given or the motion does not tell it.
     """
     camera = options.camera
-    if camera.camera_params is not None or camera.camera_model not in (None, *_RECTILINEAR):
+    if camera.camera_params is not None or not is_nearly_pinhole(camera.camera_model):
         return None
     with clock.measure("focal length"):
         return estimate_focal_length(
@@ -167,4 +165,4 @@ def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
     Only pairs with known intrinsics say in which direction the camera moved.
     """
     along_axis = [abs(float(g.tvec[2])) for g in geometries if g.tvec is not None]
-    return bool(along_axis) and float(np.median(along_axis)) >= _INIT_MAX_FORWARD_MOTION
+    return bool(along_axis) and float(np.median(along_axis)) >= INITIAL_MAX_FORWARD_MOTION

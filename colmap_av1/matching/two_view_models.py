@@ -61,7 +61,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Points:
+class MatchedPoints:
     """Matched points of a pair, all in the same coordinates.
 
     Attributes:
@@ -81,7 +81,7 @@ class Points:
         return self.spread_a[:, :count], self.spread_b[:, :count]
 
 
-def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> Points:
+def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> MatchedPoints:
     """The points with those of some of them that are spread over the image.
 
     Args:
@@ -89,7 +89,7 @@ def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> Points:
         b: float64 [2, n] points in the second image.
         order: int64 [k] indices of the spread ones.
     """
-    return Points(a, b, a.take(order, axis=1), b.take(order, axis=1))
+    return MatchedPoints(a, b, a.take(order, axis=1), b.take(order, axis=1))
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Search:
         }
 
 
-def find_pose(points: Points, search: Search, focal_lengths: tuple[float, float]) -> Model:
+def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float, float]) -> Model:
     """The essential matrix of a pair, on undistorted pixels from the principal points.
 
     Args:
@@ -147,7 +147,7 @@ def find_pose(points: Points, search: Search, focal_lengths: tuple[float, float]
     return _again_on_inliers(refine, found, found.pose, points, search)
 
 
-def find_fundamental(points: Points, search: Search) -> Model:
+def find_fundamental(points: MatchedPoints, search: Search) -> Model:
     """The fundamental matrix of a pair."""
     if points.spread_a.shape[1] < MIN_MATCHES:
         return _no_model(points)
@@ -169,7 +169,7 @@ def find_fundamental(points: Points, search: Search) -> Model:
     return min(found, quick, key=lambda model: _epipolar_loss(model, points))
 
 
-def find_homography(points: Points, search: Search, num_rival: int) -> Model:
+def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Model:
     """The homography of a pair, as well as the decision between it and its rival needs it.
 
     A search until no better one is found is the costliest part of all and seldom decides: a
@@ -213,7 +213,7 @@ def _again_on_inliers(
     refine: Callable[[Any, _Floats, _Floats], Model],
     found: Model,
     model: Any,
-    points: Points,
+    points: MatchedPoints,
     search: Search,
 ) -> Model:
     """Refine a model that leaves out many matches once more, without those."""
@@ -228,7 +228,7 @@ def _again_on_inliers(
     return min(found, again, key=lambda model: _epipolar_loss(model, points))
 
 
-def _epipolar_loss(model: Model, points: Points) -> float:
+def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
     """The loss that refinement lowers: it tells models apart that have the same inliers."""
     if model.matrix is None:
         return math.inf
@@ -308,12 +308,12 @@ def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
     return np.vstack([np.linalg.solve(square, a @ xb.T).T, _IDENTITY[2]])
 
 
-def _no_model(points: Points) -> Model:
+def _no_model(points: MatchedPoints) -> Model:
     return Model(None, np.zeros(points.a.shape[1], dtype=bool), 0)
 
 
 def _test(
-    inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: Points, search: Search
+    inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: MatchedPoints, search: Search
 ) -> Model:
     """The matrix at unit norm with its inliers; no model where an estimator found none."""
     matrix = np.asarray(matrix, dtype=np.float64)

@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import pycolmap
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
 from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.two_view_models import (
     MAX_REFINED,
     MIN_MATCHES,
@@ -43,39 +43,6 @@ _PAIRS_FOR_A_THREAD = 2000
 _PAIRS_AT_A_TIME = 16
 # Cells of an image that one point each is taken from before any gives its second.
 _NUM_CELLS = 128
-
-
-class TwoViewConfig(IntEnum):
-    """Kinds of two-view geometry, numbered as in COLMAP's databases."""
-
-    DEGENERATE = 1
-    CALIBRATED = 2
-    UNCALIBRATED = 3
-    PLANAR_OR_PANORAMIC = 6
-
-
-@dataclass(frozen=True)
-class TwoViewGeometry:
-    """Geometry of one image pair, from the pair's first image to its second.
-
-    Attributes:
-        config: kind of geometry.
-        inlier_matches: uint32 [n, 2] the matches that agree with it, in their order.
-        E: float64 [3, 3] essential matrix on normalised, undistorted coordinates, or None.
-        F: float64 [3, 3] fundamental matrix on pixels, or None, also where E explains so many
-            matches that F was not needed.
-        H: float64 [3, 3] homography on pixels, or None.
-        qvec: float64 [4] (w, x, y, z) rotation from the first camera to the second, or None.
-        tvec: float64 [3] translation likewise, of unit length, or None.
-    """
-
-    config: TwoViewConfig
-    inlier_matches: NDArray[np.uint32]
-    E: _Floats | None = None
-    F: _Floats | None = None
-    H: _Floats | None = None
-    qvec: _Floats | None = None
-    tvec: _Floats | None = None
 
 
 def verify_pairs(

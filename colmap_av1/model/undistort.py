@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
+from colmap_av1.images.camera import is_undistorted
 
 _Image = NDArray[np.uint8]
 
@@ -35,7 +36,7 @@ def pinhole_camera(camera: Any) -> Any:
     centre = [camera.principal_point_x, camera.principal_point_y]
     focal = np.array([camera.focal_length_x, camera.focal_length_y])
     zoom = 1.0
-    if camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
+    if not is_undistorted(camera):
         width, height = size["width"], size["height"]
         x, y = np.arange(width + 1.0), np.arange(height + 1.0)
         edge = np.concatenate(
@@ -78,7 +79,7 @@ def on_pinhole(camera: Any, pinhole: Any, xy: NDArray[np.float32]) -> NDArray[np
 
 def undistortion(camera: Any, pinhole: Any) -> Callable[[_Image], _Image] | None:
     """A function that undistorts pictures; None where there is nothing to do."""
-    if camera.model_name in ("PINHOLE", "SIMPLE_PINHOLE"):
+    if is_undistorted(camera):
         return None
     fx, fy, cx, cy = pinhole.params
     width, height = int(pinhole.width), int(pinhole.height)

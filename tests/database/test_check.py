@@ -272,6 +272,19 @@ def test_little_parallax(tmp_path: Path, arc: float, text: str) -> None:
     assert any(re.match(text, ": ".join(f)) for f in found(check(tmp_path / "a.db")))
 
 
+def test_configuration_of_a_rig(tmp_path: Path) -> None:
+    """Pairs of a calibrated rig have a pose of their essential matrix, as calibrated ones."""
+    path = tmp_path / "a.db"
+    write_matches(path, NAMES, CAMERA, **OURS)
+    before = check(path)
+    alter(path, "UPDATE two_view_geometries SET config = 9")
+    report = check(path)
+    assert report.configs == {"CALIBRATED_RIG": len(OURS["pairs"])}
+    assert report.num_used_pairs == before.num_used_pairs
+    assert report.parallax is not None
+    assert report.parallax.angle == pytest.approx(before.parallax.angle)
+
+
 def test_guessed_focal_length_is_told(tmp_path: Path) -> None:
     guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500)

@@ -18,7 +18,7 @@ from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError, HlocError, OptionError
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.verify import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import ExportOptions
 
 FILES = ["features.h5", "matches.h5", "pairs.txt"]

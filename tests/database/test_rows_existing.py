@@ -38,7 +38,7 @@ from colmap_av1.database.reading import pair_id_from_image_ids, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.verify import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting
 
 COLMAP = shutil.which("colmap")

@@ -17,7 +17,8 @@ from colmap_av1.errors import OptionError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.matching import verify
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.matching.verify import TwoViewConfig, TwoViewGeometry, verify_pairs
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions, VerifyOptions
 
 SHELFBOX = SHARED / "sequences/shelfbox/frames"

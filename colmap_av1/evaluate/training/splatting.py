@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import pycolmap
+import numpy as np
 import scipy.spatial
 from numpy.typing import NDArray
 
 from colmap_av1.errors import EvaluationError, ModelError, OptionError
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
+from colmap_av1.images.camera import is_undistorted
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.util.processes import bound
 
@@ -173,8 +173,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
 
 
 def _intrinsics(model: Path, camera: Any) -> NDArray[np.float64]:
-    straight = (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE)
-    if camera.model not in straight:
+    if not is_undistorted(camera):
         raise ModelError(
             f"{model}: camera {camera.camera_id} is {camera.model_name}: undistort the images first"
         )

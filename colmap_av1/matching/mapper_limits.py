@@ -1,0 +1,14 @@
+"""What COLMAP's mappers ask of an image pair, by default, to use it or to start with it."""
+
+# Inliers of a pair that any mapper uses (min_num_matches).
+MIN_INLIERS = 15
+# Of the pair that the incremental mapper starts with: inliers (init_min_num_inliers), share of the
+# translation along the camera's axis (init_max_forward_motion), triangulation angle in degrees
+# (init_min_tri_angle).
+INITIAL_MIN_INLIERS = 100
+INITIAL_MAX_FORWARD_MOTION = 0.95
+INITIAL_MIN_ANGLE = 16.0
+# Where no pair has that angle, the mapper halves it twice.
+INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
+# The value of init_max_forward_motion with which forward motion keeps no pair from being first.
+ANY_FORWARD_MOTION = 1.0
