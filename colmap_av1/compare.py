@@ -27,7 +27,7 @@ from colmap_av1.evaluate.frontends.mapping import (
     map_database,
     model_figures,
 )
-from colmap_av1.evaluate.metrics.clouds import cloud_distances, model_points
+from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.evaluate.metrics.sequence import read_poses
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
@@ -310,7 +310,7 @@ def _larger(a: int | None, b: int | None) -> int | None:
 def _read_reference(path: Path, footage: Footage) -> _Reference:
     if path.is_dir():
         model = read_model(path)
-        poses, points = image_poses(model, footage.names), model_points(model)
+        poses, points = image_poses(model, footage.names), point_cloud(model)
     else:
         poses = read_poses(path, footage.num_frames)[list(footage.frames)]
         points = np.empty((0, 3))
@@ -338,7 +338,7 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
         if column is None or column.model_path is None:
             continue
         model = read_model(column.model_path)
-        poses, points = image_poses(model, footage.names), model_points(model)
+        poses, points = image_poses(model, footage.names), point_cloud(model)
         if given.poses is None:
             return _Reference(poses, points, name, name)
         similarity, errors = fit_similarity(poses, given.poses), pose_errors(poses, given.poses)
@@ -355,7 +355,7 @@ def _measure(
     if column.model_path is None:
         return column, None
     model = read_model(column.model_path)
-    poses, points = image_poses(model, footage.names), model_points(model)
+    poses, points = image_poses(model, footage.names), point_cloud(model)
     # A point may lie at several keypoints of an image.
     lengths = [len({e.image_id for e in p.track.elements}) for p in model.points3D.values()]
     counts = np.bincount(np.array(lengths, dtype=np.int64))

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, ModelError, OptionError, cannot_write
 from colmap_av1.images.choosing import choose_images
 from colmap_av1.images.files import size_of_images
-from colmap_av1.model.colmap_model import posed_images, read_model, write_model
-from colmap_av1.model.dense_points import (
+from colmap_av1.model.colmap_model import (
+    ModelImage,
+    ModelPoints,
+    posed_images,
+    read_model,
+    write_model,
+)
+from colmap_av1.model.track_points import (
     LEAST_AGREEING,
     Colours,
     chaining_for_points,
-    model_points,
     seen_in,
+    to_model_points,
     triangulate_tracks,
 )
-from colmap_av1.model.triangulate import Points, check_triangulate_options
+from colmap_av1.model.triangulate import TriangulatedPoints, check_triangulate_options
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import DensifyOptions
 from colmap_av1.tracks.tracks import scale_tracks
@@ -135,21 +143,12 @@ def densify(
         agreeing = _agreement(model, points)
         with clock.measure("colours"):
             colours = Colours(seen, view, points, len(images))
-            image_of_frame = {int(frame): i for i, frame in enumerate(chosen.frames)}
-            for frame, picture in decoded_pictures(source, options.match):
-                progress("colours", frame + 1, seen.num_frames)
-                if frame in image_of_frame:
-                    colours.add(image_of_frame[frame], picture)
-                if frame >= chosen.frames[-1]:
-                    break
+            pictures = decoded_pictures(source, options.match)
+            _add_pictures(colours, pictures, chosen.frames, seen.num_frames, progress)
     with clock.measure("writing"):
         xy = seen.xy[points.observation].astype(np.float64)
-        dense = model_points(points, colours.mean(), view, xy)
-        try:
-            with whole_folder(output) as partial:
-                write_model(partial, cameras, images, dense)
-        except OSError as error:
-            raise ModelError(cannot_write(output, error)) from error
+        dense = to_model_points(points, colours.mean(), view, xy)
+        _write(output, cameras, images, dense)
     return DensifyReport(
         output=output,
         model=model,
@@ -164,7 +163,34 @@ def densify(
     )
 
 
-def _agreement(model: Path, points: Points) -> float:
+def _add_pictures(
+    colours: Colours,
+    pictures: Iterable[tuple[int, NDArray[np.uint8]]],
+    frames: NDArray[np.int32],
+    num_frames: int,
+    progress: Progress,
+) -> None:
+    """Look at the pictures of the images, whose frames ascend."""
+    image_of_frame = {int(frame): i for i, frame in enumerate(frames)}
+    for frame, picture in pictures:
+        progress("colours", frame + 1, num_frames)
+        if frame in image_of_frame:
+            colours.add(image_of_frame[frame], picture)
+        if frame >= frames[-1]:
+            break
+
+
+def _write(
+    output: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
+) -> None:
+    try:
+        with whole_folder(output) as partial:
+            write_model(partial, cameras, images, points)
+    except OSError as error:
+        raise ModelError(cannot_write(output, error)) from error
+
+
+def _agreement(model: Path, points: TriangulatedPoints) -> float:
     """Share of the tracks that agree with the poses; refuses a model of another video."""
     agreeing = points.num_agreeing / max(points.num_tracks, 1)
     if agreeing < LEAST_AGREEING or len(points.xyz) == 0:

@@ -11,14 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
-from colmap_av1.database.writing import write_matches
+from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError
-from colmap_av1.images.camera import is_square, make_camera
+from colmap_av1.images.camera import check_pixel_aspect, make_camera
 from colmap_av1.images.preparing import prepare_images, write_chosen
-from colmap_av1.matching.image_matches import pair_images, shared_focal_length, verify_images
-from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.matching.image_matches import (
+    MatchedImages,
+    PairedImages,
+    pair_images,
+    shared_focal_length,
+    verify_images,
+)
+from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import keep_frames
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -148,7 +155,7 @@ def match(
         )
         source, display, chosen = prepared.source, prepared.display, prepared.chosen
         size, pixel_aspect = prepared.size, prepared.pixel_aspect
-        notes, num_coded_frames = list(prepared.tracked.warnings), prepared.tracked.num_coded_frames
+        warnings, num_coded_frames = prepared.tracked.warnings, prepared.tracked.num_coded_frames
 
         with clock.measure("pairs"):
             tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
@@ -157,16 +164,13 @@ def match(
         paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
         num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
         del tracks
-        focal_length = None
-        if not listed:
-            focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
-        cameras, new_cameras = _cameras(
-            *(database, listed, chosen.names, size, options.camera),
+        cameras = _cameras(
+            *(database, listed, chosen.names, paired, options),
+            size=size,
             pixel_aspect=pixel_aspect,
-            focal_length=focal_length,
+            clock=clock,
         )
-        notes += _camera_notes(cameras, listed, pixel_aspect)
-        matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
+        matched = verify_images(paired, cameras.of_images, options, clock=clock, progress=progress)
 
         num_written = 0
         if folder is not None:
@@ -177,19 +181,7 @@ def match(
                 )
 
     with clock.measure("database"):
-        write_matches(
-            database,
-            chosen.names,
-            new_cameras,
-            matched.keypoints,
-            pairs=matched.pairs,
-            matches=matched.matches,
-            geometries=matched.geometries,
-            on_existing=options.on_existing,
-        )
-    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
-    kinds = [geometry.config.name for geometry in matched.geometries]
-    num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
+        write_matched_images(database, chosen.names, cameras.new, matched, options.on_existing)
     return MatchReport(
         database=database,
         video=video,
@@ -197,21 +189,31 @@ def match(
         image_path=folder,
         num_frames=num_frames,
         num_coded_frames=num_coded_frames,
-        num_images=len(matched.keypoints),
         num_written_images=num_written,
-        num_tracks=len(lengths),
-        track_lengths=dict(zip(_LENGTH_QUANTILES, quantiles.tolist(), strict=True)),
-        num_observations=sum(len(k.xy) for k in matched.keypoints),
-        focal_length=focal_length,
-        num_pairs=len(matched.geometries),
-        num_verified_pairs=sum(count > 0 for count in num_inliers),
-        num_matches=sum(len(m) for m in matched.matches),
-        num_inliers=sum(num_inliers),
-        configs={kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        forward_motion=matched.forward_motion,
+        focal_length=cameras.focal_length,
         seconds=clock.seconds,
-        warnings=tuple(notes),
+        warnings=(*warnings, *cameras.warnings),
+        **_figures(lengths, matched),
     )
+
+
+def _figures(lengths: NDArray[np.int64], matched: MatchedImages) -> dict[str, Any]:
+    """What `MatchReport` counts of tracks, of these lengths, and of matches."""
+    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
+    kinds = [geometry.config.name for geometry in matched.geometries]
+    num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
+    return {
+        "num_images": len(matched.keypoints),
+        "num_tracks": len(lengths),
+        "track_lengths": dict(zip(_LENGTH_QUANTILES, quantiles.tolist(), strict=True)),
+        "num_observations": sum(len(k.xy) for k in matched.keypoints),
+        "num_pairs": len(matched.geometries),
+        "num_verified_pairs": sum(count > 0 for count in num_inliers),
+        "num_matches": sum(len(m) for m in matched.matches),
+        "num_inliers": sum(num_inliers),
+        "configs": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
+        "forward_motion": matched.forward_motion,
+    }
 
 
 def _no_option(path: Path) -> str:
@@ -238,42 +240,57 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     return listed
 
 
+@dataclass(frozen=True)
+class _Cameras:
+    """The cameras of the images.
+
+    Attributes:
+        of_images: the camera of each image; images share one where it is the same object.
+        new: what a database that lists no images is to get: one camera, or one for each image.
+        focal_length: the estimated one, see `MatchReport`.
+        warnings: what the user should know of them.
+    """
+
+    of_images: list[Any]
+    new: Any
+    focal_length: float | None
+    warnings: list[str]
+
+
 def _cameras(
     database: Path,
     listed: Sequence[DatabaseImage],
     names: Sequence[str],
-    size: tuple[int, int],
-    options: CameraOptions,
+    paired: PairedImages,
+    options: MatchOptions,
     *,
+    size: tuple[int, int],
     pixel_aspect: float,
-    focal_length: float | None,
-) -> tuple[list[Any], Any]:
-    """The camera of each image, and what the database is to get where it lists no images."""
+    clock: Clock,
+) -> _Cameras:
+    """Those of the database where it lists the images, else new ones."""
     if listed:
-        cameras = read_cameras(database)
-        camera_id = {image.name: image.camera_id for image in listed}
-        missing = next((n for n in names if camera_id[n] not in cameras), None)
-        if missing is not None:
-            raise DatabaseError(
-                f"{database}: image '{missing}' has no camera: import the images again"
-            )
-        return [cameras[camera_id[name]] for name in names], None
-    camera = make_camera(options, *size, pixel_aspect, focal_length)
-    if options.single_camera:
-        return [camera] * len(names), camera
-    # Images share a camera where theirs are one object.
+        of_images = _listed_cameras(database, listed, names)
+        what_to_do = "import the images with one of these"
+        warnings = check_pixel_aspect(of_images[0], pixel_aspect, what_to_do)
+        return _Cameras(of_images, None, None, warnings)
+    focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
+    camera = make_camera(options.camera, *size, pixel_aspect, focal_length)
+    what_to_do = "leave out --camera_model or give one"
+    warnings = check_pixel_aspect(camera, pixel_aspect, what_to_do)
+    if options.camera.single_camera:
+        return _Cameras([camera] * len(names), camera, focal_length, warnings)
     each = [copy.copy(camera) for _ in names]
-    return each, each
+    return _Cameras(each, each, focal_length, warnings)
 
 
-def _camera_notes(cameras: Sequence[Any], listed: Sequence[Any], pixel_aspect: float) -> list[str]:
-    """What is to be said of cameras whose one focal length cannot be right."""
-    if is_square(pixel_aspect) or len(cameras[0].focal_length_idxs()) == 2:
-        return []
-    what_to_do = (
-        "import the images with one of these" if listed else "leave out --camera_model or give one"
-    )
-    return [
-        f"pixels are {pixel_aspect:.3f} times as wide as high, but {cameras[0].model_name} has one "
-        f"focal length for both directions; OPENCV and PINHOLE have two: {what_to_do}"
-    ]
+def _listed_cameras(
+    database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
+) -> list[Any]:
+    """The cameras that the database has of its images, one for each name."""
+    cameras = read_cameras(database)
+    camera_id = {image.name: image.camera_id for image in listed}
+    missing = next((n for n in names if camera_id[n] not in cameras), None)
+    if missing is not None:
+        raise DatabaseError(f"{database}: image '{missing}' has no camera: import the images again")
+    return [cameras[camera_id[name]] for name in names]

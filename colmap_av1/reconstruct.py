@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any, get_args
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, cannot_write
-from colmap_av1.model.dense_points import LEAST_AGREEING
+from colmap_av1.model.reconstruct_model import model_stage
+from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage
 from colmap_av1.model.reconstruct_stages import (
     Run,
-    adjustment_stage,
     match_stage,
-    model_stage,
-    pose_stage,
     pose_tracks,
     read_tracks,
     track_stage,
 )
+from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.model.triangulate import check_triangulate_options
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import MapperOptions, ReconstructOptions

@@ -18,8 +18,8 @@ FLOW = (
 AT_THE_TOP = {"errors": "errors", "options": "options", "compare": "compare"}
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES = 14, 450, 60
 # Long for a reason: each says one thing in order.
-LONG_FUNCTIONS = {"match.match": 78, "images.preparing.prepare_images": 62, "densify.densify": 66}
-LONG_FILES = {"cli.commands": 542, "database.writing": 490, "model.reconstruct_stages": 451}
+LONG_FUNCTIONS = {"images.preparing.prepare_images": 62}
+LONG_FILES = {"cli.commands": 542}
 CLIMBS = ["images.preparing imports option_checks"]
 
 

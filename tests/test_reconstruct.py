@@ -272,7 +272,7 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
 
     with monkeypatch.context() as patch:
         patch.setattr(
-            importlib.import_module("colmap_av1.model.reconstruct_stages"), "write_model", full
+            importlib.import_module("colmap_av1.model.reconstruct_model"), "write_model", full
         )
         with pytest.raises(ModelError, match="No space left on device: the stages before are kept"):
             reconstruct(SCENE, made.output, options=other)
@@ -298,7 +298,7 @@ def test_model_of_two_images_is_none(
         return mapper_module.MapperRun((2,))
 
     shutil.copytree(made.output, tmp_path / "out")
-    stages = importlib.import_module("colmap_av1.model.reconstruct_stages")
+    stages = importlib.import_module("colmap_av1.model.reconstruct_poses")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(ModelError, match=r"incremental mapper finds no start: .* try --mapper"):

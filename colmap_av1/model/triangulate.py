@@ -50,7 +50,7 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Observations:
     """Observations of tracks by views, in compressed sparse row form.
 
     Attributes:
@@ -66,17 +66,17 @@ class Sightings:
     rays: _Floats
     sigma: NDArray[np.float32]
 
-    def part(self, first: int, last: int) -> Sightings:
+    def part(self, first: int, last: int) -> Observations:
         """Those of the tracks from `first` to before `last`."""
         offsets = self.offsets[first : last + 1]
         chosen = slice(int(offsets[0]), int(offsets[-1]))
-        return Sightings(
+        return Observations(
             offsets - offsets[0], self.view[chosen], self.rays[chosen], self.sigma[chosen]
         )
 
 
 @dataclass(frozen=True)
-class Points:
+class TriangulatedPoints:
     """Triangulated points, in compressed sparse row form.
 
     Point p has the observations observation[offsets[p] : offsets[p + 1]].
@@ -100,13 +100,13 @@ class Points:
 
 
 def triangulate(
-    sightings: Sightings,
+    observations: Observations,
     views: Views,
     options: TriangulateOptions | None = None,
     *,
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
-) -> Points:
+) -> TriangulatedPoints:
     """Triangulate tracks on known poses.
 
     The first guess of a point is the best of several midpoints of two rays (Hartley and Sturm,
@@ -118,7 +118,7 @@ def triangulate(
     is too much there is no point.
 
     Args:
-        sightings: the tracks.
+        observations: the tracks.
         views: poses and focal lengths.
         options: what makes a point; the defaults of TriangulateOptions if None.
         num_threads: threads; None: one per CPU. The result does not depend on it.
@@ -132,14 +132,14 @@ def triangulate(
     """
     options = options if options is not None else TriangulateOptions()
     check_triangulate_options(options)
-    offsets = sightings.offsets
+    offsets = observations.offsets
     chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK), side="left")
     bounds = np.unique(np.minimum(chunk, len(offsets) - 1))
     parts: list[_Part] = []
 
     def work(index: int) -> _Part:
         first, last = int(bounds[index]), int(bounds[index + 1])
-        part = _triangulate_part(sightings.part(first, last), views, options)
+        part = _triangulate_part(observations.part(first, last), views, options)
         return replace(part, observation=part.observation + offsets[first])
 
     # NumPy's loops release the interpreter lock.
@@ -154,7 +154,7 @@ def triangulate(
             raise
     parts = [_no_points(0, 0), *parts]
     counts = np.concatenate([part.counts for part in parts])
-    return Points(
+    return TriangulatedPoints(
         xyz=np.concatenate([part.xyz for part in parts]),
         error=np.concatenate([part.error for part in parts]),
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
@@ -186,7 +186,7 @@ def check_triangulate_options(options: TriangulateOptions) -> None:
 
 @dataclass(frozen=True)
 class _Part:
-    """Points of some of the tracks; as `Points`, with the observations a point has counted."""
+    """`TriangulatedPoints` of some of the tracks, with the number of observations of each."""
 
     xyz: _Floats
     error: _Floats
@@ -201,12 +201,14 @@ def _no_points(num_agreeing: int, num_tracks: int) -> _Part:
     return _Part(np.empty((0, 3)), np.empty(0), none, none, num_agreeing, num_tracks)
 
 
-def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOptions) -> _Part:
-    num_tracks = len(sightings.offsets) - 1
-    track = np.repeat(np.arange(num_tracks), np.diff(sightings.offsets))
-    left = np.flatnonzero(np.isfinite(sightings.rays).all(axis=1))
+def _triangulate_part(
+    observations: Observations, views: Views, options: TriangulateOptions
+) -> _Part:
+    num_tracks = len(observations.offsets) - 1
+    track = np.repeat(np.arange(num_tracks), np.diff(observations.offsets))
+    left = np.flatnonzero(np.isfinite(observations.rays).all(axis=1))
     found: list[tuple[NDArray[Any], ...]] = []
-    observations: list[NDArray[np.int64]] = []
+    used_rows: list[NDArray[np.int64]] = []
     num_agreeing = num_tried = 0
     for attempt in range(2):
         counts = np.bincount(track[left], minlength=num_tracks)
@@ -214,7 +216,7 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
         if len(left) == 0:
             break
         starts = np.flatnonzero(np.diff(track[left], prepend=-1))
-        group = _group(starts, sightings, left, views)
+        group = _group(starts, observations, left, views)
         xyz, kept, error, agrees = _solve(group, options)
         if attempt == 0:
             num_tried, num_agreeing = len(starts), int(agrees.sum())
@@ -224,7 +226,7 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
         used = kept & good[group.track]
         owner = track[left[starts]]
         found.append((owner[good], xyz[good], mean_error[good], sizes[good]))
-        observations.append(left[used])
+        used_rows.append(left[used])
         left = left[~kept & agrees[group.track]]
     if not found:
         return _no_points(num_agreeing, num_tried)
@@ -233,7 +235,7 @@ def _triangulate_part(sightings: Sightings, views: Views, options: TriangulateOp
     rank = np.empty(len(owner), np.int64)
     rank[order] = np.arange(len(owner))
     by_point = np.argsort(np.repeat(rank, sizes), kind="stable")
-    observation = np.concatenate(observations)[by_point]
+    observation = np.concatenate(used_rows)[by_point]
     return _Part(xyz[order], error[order], sizes[order], observation, num_agreeing, num_tried)
 
 
@@ -245,7 +247,7 @@ class _Group:
         starts: int64 [num_tracks] first observation of each track.
         track: int64 [n] track of each observation.
         view: int64 [n] its view.
-        rays: float64 [2, n] as in `Sightings`, by coordinate.
+        rays: float64 [2, n] as in `Observations`, by coordinate.
         weight: float64 [n] inverse expected variance.
         pose: float64 [3, 4, n] pose of its view.
         focal: float64 [2, n] focal lengths of its view.
@@ -294,17 +296,17 @@ class _Group:
 
 
 def _group(
-    starts: NDArray[np.int64], sightings: Sightings, rows: NDArray[np.int64], views: Views
+    starts: NDArray[np.int64], observations: Observations, rows: NDArray[np.int64], views: Views
 ) -> _Group:
-    """Some rows of the sightings; a track begins at each of `starts` among them."""
-    view = sightings.view[rows]
+    """Some rows of the observations; a track begins at each of `starts` among them."""
+    view = observations.view[rows]
     pose = np.ascontiguousarray(views.cam_from_world.transpose(1, 2, 0))
     return _Group(
         starts=starts,
         track=np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows)))),
         view=view,
-        rays=np.ascontiguousarray(sightings.rays[rows].T),
-        weight=1.0 / (_SIGMA_FLOOR**2 + sightings.sigma[rows].astype(np.float64) ** 2),
+        rays=np.ascontiguousarray(observations.rays[rows].T),
+        weight=1.0 / (_SIGMA_FLOOR**2 + observations.sigma[rows].astype(np.float64) ** 2),
         pose=pose[:, :, view],
         focal=np.ascontiguousarray(views.focal.T)[:, view],
         views=views,

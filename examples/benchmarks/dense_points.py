@@ -23,7 +23,7 @@ from tracks import load_render_scene
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
-from colmap_av1.evaluate.metrics.clouds import depth_differences, model_points
+from colmap_av1.evaluate.metrics.clouds import depth_differences, point_cloud
 from colmap_av1.model.colmap_model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
 
@@ -114,7 +114,7 @@ def print_row(
 
 def surface_errors(dense: Any, script: Any, scene: Any) -> NDArray[np.float64]:
     """Distances of points to the nearest surface, as shares of those from the first camera."""
-    xyz = model_points(dense)
+    xyz = point_cloud(dense)
     first = [
         min(e.image_id for e in dense.points3D[i].track.elements) for i in sorted(dense.points3D)
     ]

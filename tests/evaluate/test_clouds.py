@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.evaluate.metrics.clouds import cloud_distances, depth_differences, model_points
+from colmap_av1.evaluate.metrics.clouds import cloud_distances, depth_differences, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses
 
 
@@ -64,13 +64,13 @@ def test_models_are_aligned_by_their_cameras() -> None:
     moved = copy.deepcopy(model)
     turn = pycolmap.Rotation3d(np.array([0.1, -0.3, 0.2, 0.9]) / np.sqrt(0.95))
     moved.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -1, 7])))
-    assert np.abs(model_points(moved) - model_points(model)).max() > 1
+    assert np.abs(point_cloud(moved) - point_cloud(model)).max() > 1
     names = sorted(image.name for image in model.images.values())
     poses = image_poses(model, [*names, "not there"])
     assert np.isnan(poses[-1]).all()
     similarity = fit_similarity(image_poses(moved, names), poses[:-1])
     assert similarity is not None
-    np.testing.assert_allclose(similarity.move(model_points(moved)), model_points(model), atol=1e-6)
+    np.testing.assert_allclose(similarity.move(point_cloud(moved)), point_cloud(model), atol=1e-6)
     np.testing.assert_allclose(
         similarity.move_poses(image_poses(moved, names)), poses[:-1], atol=1e-6
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_av1.errors import OptionError
-from colmap_av1.model.triangulate import Points, Sightings, Views, triangulate
+from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import TriangulateOptions
 
 FOCAL = 500.0
@@ -24,10 +24,10 @@ def rays_of(xyz: np.ndarray, seen_by: Views) -> np.ndarray:
     return in_camera[..., :2] / in_camera[..., 2:]
 
 
-def sightings(rays: np.ndarray) -> Sightings:
+def observations(rays: np.ndarray) -> Observations:
     """Tracks that every view sees."""
     num_tracks, num_views = rays.shape[:2]
-    return Sightings(
+    return Observations(
         np.arange(num_tracks + 1) * num_views,
         np.tile(np.arange(num_views), num_tracks),
         rays.reshape(-1, 2),
@@ -41,14 +41,14 @@ def scene() -> tuple[np.ndarray, Views]:
     return rng.uniform([-2, -2, 4], [3, 2, 9], (400, 3)), views(9)
 
 
-def owners(points: Points, num_views: int) -> np.ndarray:
+def owners(points: TriangulatedPoints, num_views: int) -> np.ndarray:
     """The track that each point comes from."""
     return points.observation[points.offsets[:-1]] // num_views
 
 
 def test_exact(scene: tuple[np.ndarray, Views]) -> None:
     xyz, seen_by = scene
-    points = triangulate(sightings(rays_of(xyz, seen_by)), seen_by)
+    points = triangulate(observations(rays_of(xyz, seen_by)), seen_by)
     assert np.abs(points.xyz - xyz).max() < 1e-6
     assert points.error.max() < 1e-6
     assert np.array_equal(points.observation, np.arange(400 * 9))
@@ -60,7 +60,7 @@ def test_noise(scene: tuple[np.ndarray, Views]) -> None:
     xyz, seen_by = scene
     rays = rays_of(xyz, seen_by)
     rays += np.random.default_rng(0).normal(0, 0.3 / FOCAL, rays.shape)
-    points = triangulate(sightings(rays), seen_by)
+    points = triangulate(observations(rays), seen_by)
     off = points.xyz - xyz[owners(points, 9)]
     assert np.median(np.abs(off[:, 2]) / xyz[owners(points, 9), 2] ** 2) < 0.0006
     # Mean length of two-dimensional noise, a ninth of its freedom taken by the point.
@@ -72,7 +72,7 @@ def test_outliers_are_dropped(scene: tuple[np.ndarray, Views]) -> None:
     rays = rays_of(xyz, seen_by)
     rays[:, 0] += 20 / FOCAL
     rays[:, 8, 1] += 15 / FOCAL
-    points = triangulate(sightings(rays), seen_by)
+    points = triangulate(observations(rays), seen_by)
     assert len(points.xyz) == 400
     assert np.abs(points.xyz - xyz).max() < 1e-6
     assert set(np.diff(points.offsets)) == {7}
@@ -84,7 +84,7 @@ def test_slid_track_is_two_points(scene: tuple[np.ndarray, Views]) -> None:
     rays = rays_of(xyz, seen_by)
     other = rays_of(xyz + np.array([0, 1.0, 0]), seen_by)
     rays[0, 5:] = other[0, 5:]
-    points = triangulate(sightings(rays), seen_by)
+    points = triangulate(observations(rays), seen_by)
     assert len(points.xyz) == 401
     assert owners(points, 9)[:2].tolist() == [0, 0]
     assert np.diff(points.offsets)[:2].tolist() == [5, 4]
@@ -95,16 +95,16 @@ def test_what_is_no_point(scene: tuple[np.ndarray, Views]) -> None:
     _, seen_by = scene
     far = np.array([[0.0, 0.0, 4000.0]])
     behind = np.array([[0.5, 0.0, -6.0]])
-    points = triangulate(sightings(rays_of(far, seen_by)), seen_by)
+    points = triangulate(observations(rays_of(far, seen_by)), seen_by)
     assert len(points.xyz) == 0
     assert points.num_agreeing == 1
-    points = triangulate(sightings(rays_of(behind, seen_by)), seen_by)
+    points = triangulate(observations(rays_of(behind, seen_by)), seen_by)
     assert (len(points.xyz), points.num_agreeing, points.num_tracks) == (0, 0, 1)
     wild = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 9, 2))
-    assert len(triangulate(sightings(wild), seen_by).xyz) < 5
-    short = Sightings(np.array([0, 2]), np.arange(2), np.zeros((2, 2)), np.zeros(2, np.float32))
+    assert len(triangulate(observations(wild), seen_by).xyz) < 5
+    short = Observations(np.array([0, 2]), np.arange(2), np.zeros((2, 2)), np.zeros(2, np.float32))
     assert triangulate(short, seen_by).num_tracks == 0
-    nothing = Sightings(
+    nothing = Observations(
         np.zeros(1, np.int64), np.empty(0, int), np.empty((0, 2)), np.empty(0, np.float32)
     )
     assert len(triangulate(nothing, seen_by).xyz) == 0
@@ -122,10 +122,10 @@ def test_unsure_distances_are_no_points(scene: tuple[np.ndarray, Views]) -> None
     # Wrong alike in a part of the views, as tracks that drift are.
     rays[:, 5:, 0] += (noise * rng.choice([-1, 1], 4000))[:, None] / FOCAL
     every = TriangulateOptions(max_depth_error=None)
-    all_points = triangulate(sightings(rays), seen_by, every)
-    sure = triangulate(sightings(rays), seen_by, TriangulateOptions(max_depth_error=0.015))
+    all_points = triangulate(observations(rays), seen_by, every)
+    sure = triangulate(observations(rays), seen_by, TriangulateOptions(max_depth_error=0.015))
 
-    def off(points: Points) -> np.ndarray:
+    def off(points: TriangulatedPoints) -> np.ndarray:
         return np.abs(points.xyz[:, 2] / xyz[owners(points, 9), 2] - 1)
 
     dropped = ~np.isin(owners(all_points, 9), owners(sure, 9))
@@ -139,7 +139,7 @@ def test_unusable_observations_are_ignored(scene: tuple[np.ndarray, Views]) -> N
     xyz, seen_by = scene
     rays = rays_of(xyz, seen_by)
     rays[:, 4] = np.nan
-    points = triangulate(sightings(rays), seen_by)
+    points = triangulate(observations(rays), seen_by)
     assert np.abs(points.xyz - xyz).max() < 1e-6
     assert not np.any(points.observation % 9 == 4)
 
@@ -150,8 +150,8 @@ def test_threads_change_nothing() -> None:
     rays = rays_of(rng.uniform([-2, -2, 4], [3, 2, 9], (40_000, 3)), seen_by)
     rays += rng.normal(0, 1 / FOCAL, rays.shape)
     done: list[int] = []
-    one = triangulate(sightings(rays), seen_by, num_threads=1, progress=done.append)
-    two = triangulate(sightings(rays), seen_by, num_threads=2)
+    one = triangulate(observations(rays), seen_by, num_threads=1, progress=done.append)
+    two = triangulate(observations(rays), seen_by, num_threads=2)
     for name in ("xyz", "error", "offsets", "observation"):
         assert np.array_equal(getattr(one, name), getattr(two, name))
     assert len(done) > 1
@@ -172,4 +172,4 @@ def test_options_that_cannot_work(
 ) -> None:
     xyz, seen_by = scene
     with pytest.raises(OptionError):
-        triangulate(sightings(rays_of(xyz, seen_by)), seen_by, options)
+        triangulate(observations(rays_of(xyz, seen_by)), seen_by, options)

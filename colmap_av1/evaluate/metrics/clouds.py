@@ -81,7 +81,7 @@ def depth_differences(model: Any, reference: Any, *, pixels: float = 5.0) -> NDA
         reference's depth; NaN where no point of the reference is near.
     """
     ids = sorted(model.points3D)
-    xyz = model_points(model)
+    xyz = point_cloud(model)
     middle = np.array([_middle_image(model.points3D[i].track) for i in ids], np.int64)
     difference = np.full(len(ids), np.nan)
     for image_id in np.unique(middle):
@@ -113,7 +113,7 @@ def _middle_image(track: Any) -> int:
     return image_ids[len(image_ids) // 2]
 
 
-def model_points(model: Any) -> NDArray[np.float64]:
+def point_cloud(model: Any) -> NDArray[np.float64]:
     """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)

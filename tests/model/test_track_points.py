@@ -6,14 +6,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.model.dense_points import (
+from colmap_av1.model.track_points import (
     Colours,
     chaining_for_points,
-    model_points,
     seen_in,
+    to_model_points,
     triangulate_tracks,
 )
-from colmap_av1.model.triangulate import Points
+from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import MatchOptions, TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import no_progress
@@ -41,11 +41,11 @@ def make_tracks(xy: np.ndarray) -> Tracks:
     )
 
 
-def make_points(observation: list[list[int]]) -> Points:
+def make_points(observation: list[list[int]]) -> TriangulatedPoints:
     offsets = np.cumsum([0, *map(len, observation)])
     num = len(observation)
     flat = np.array([o for each in observation for o in each], dtype=np.int64)
-    return Points(np.zeros((num, 3)), np.zeros(num), offsets, flat, num, num)
+    return TriangulatedPoints(np.zeros((num, 3)), np.zeros(num), offsets, flat, num, num)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_images_of_several_cameras_see_one_scene() -> None:
     tracks = make_tracks(xy)
     seen, view = seen_in(tracks, np.arange(6, dtype=np.int32))
 
-    def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> Points:
+    def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> TriangulatedPoints:
         return triangulate_tracks(
             *(replace(seen, xy=xy), view, cameras, POSES, pinhole),
             options=TriangulateOptions(),
@@ -136,7 +136,7 @@ def test_points_of_a_model_name_the_images_that_see_them() -> None:
     view = np.array([0, 1, 2, 0, 1, 2])
     rgb = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.uint8)
     xy = np.arange(10.0).reshape(5, 2)
-    made = model_points(points, rgb, view, xy)
+    made = to_model_points(points, rgb, view, xy)
     assert made.image.tolist() == [1, 1, 0, 0, 2]
     assert made.offsets.tolist() == [0, 2, 5]
     assert made.rgb is rgb

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.model.colmap_model import ModelPoints
-from colmap_av1.model.triangulate import Points, Sightings, Views, triangulate
+from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.progress import Progress
@@ -56,7 +56,7 @@ def triangulate_tracks(
     options: TriangulateOptions,
     num_threads: int | None,
     progress: Progress,
-) -> Points:
+) -> TriangulatedPoints:
     """Triangulate all tracks; errors are in pixels of `pinhole`, else of each image's camera."""
     rays = np.full((len(view), 2), np.nan)
     camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
@@ -67,7 +67,7 @@ def triangulate_tracks(
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = len(tracks.offsets) - 1
     return triangulate(
-        Sightings(tracks.offsets, view, rays, tracks.sigma),
+        Observations(tracks.offsets, view, rays, tracks.sigma),
         Views(np.stack(poses), focal),
         options,
         num_threads=num_threads,
@@ -79,7 +79,7 @@ class Colours:
     """Mean colour of points over the pictures that see them, picture by picture."""
 
     def __init__(
-        self, tracks: Tracks, view: NDArray[np.int64], points: Points, num_images: int
+        self, tracks: Tracks, view: NDArray[np.int64], points: TriangulatedPoints, num_images: int
     ) -> None:
         self._size = np.array([tracks.width, tracks.height])
         self._sum = np.zeros((len(points.xyz), 3))
@@ -106,8 +106,8 @@ class Colours:
         return np.round(mean).astype(np.uint8)
 
 
-def model_points(
-    points: Points,
+def to_model_points(
+    points: TriangulatedPoints,
     rgb: _Image,
     view: NDArray[np.int64],
     xy: NDArray[np.float64],

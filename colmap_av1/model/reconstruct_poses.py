@@ -1,0 +1,217 @@
+"""The stages of `reconstruct` that find the poses: COLMAP's mapper, then an adjustment."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ModelError
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.model.colmap_model import ModelImage, posed_images, read_model, write_model
+from colmap_av1.model.mapper import adjust_model, map_poses
+from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run
+from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
+from colmap_av1.model.triangulate import TriangulatedPoints
+from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.stages import Kept, run_stage
+
+# Of an image, below which a mapper that finds no start may lack them.
+_FEW_TRACKS = 100
+# Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
+# of them come to 0.3 or 0.4 at most, those beyond have drifted.
+_ADJUSTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
+)
+_LOSS_SCALE = 0.25
+# Poses follow from rays, however uncertain the points are that these meet in.
+_FOR_POSES = TriangulateOptions(max_depth_error=None)
+
+
+def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
+    """Let COLMAP's mapper find the poses."""
+    options, clock, progress = run.options, run.clock, run.progress
+    mapping = options.mapping
+    forward = bool(matched.facts["forward_motion"])
+    mapper = mapping.mapper
+    if mapper == "auto":
+        mapper = "incremental" if matched.facts["guessed"] else "global"
+    refine = _refines_intrinsics(options)
+
+    def make(partial: Path) -> dict[str, Any]:
+        with clock.measure("poses"):
+            # pycolmap brings a database to its own layout.
+            copy = partial / "mapped.db"
+            shutil.copyfile(run.output / "database.db", copy)
+            mapped = map_poses(
+                copy,
+                partial / "poses",
+                mapper=mapper,
+                refine_intrinsics=refine,
+                forward_motion=forward,
+                seed=options.match.verify.seed,
+                num_threads=mapping.mapper_threads,
+                log=run.stages / "mapper.log",
+                num_images=num_images,
+                progress=progress,
+            )
+        if max(mapped.num_images, default=0) < LEAST_IMAGES:
+            raise ModelError(_why_no_start(matched.facts, mapper))
+        return {
+            "num_registered": mapped.num_images[0],
+            "other_models": [n for n in mapped.num_images[1:] if n >= LEAST_IMAGES],
+            "mapper": mapper,
+            "poses": "poses",
+        }
+
+    how = (mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
+    given = (mapper, refine, forward, *how)
+    return run_stage(
+        run.stages,
+        "poses",
+        [matched.key, given],
+        into=run.stages,
+        products=["poses"],
+        make=make,
+    )
+
+
+def _refines_intrinsics(options: ReconstructOptions) -> bool:
+    if options.mapping.refine_intrinsics is not None:
+        return options.mapping.refine_intrinsics
+    return options.match.camera.camera_params is None
+
+
+def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
+    """Why a mapper found no two images to start with, and what to try."""
+    no_start = f"COLMAP's {mapper} mapper finds no start"
+    other = "incremental" if mapper == "global" else "global"
+    most_agree = facts["num_verified_pairs"] >= facts["num_pairs"] / 2
+    if most_agree and facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
+        return (
+            f"{no_start}: too little parallax, in {facts['num_flat_pairs']} of "
+            f"{facts['num_verified_pairs']} pairs the camera only turns or the scene is flat: film "
+            "while moving sideways, or give a longer part of the video"
+        )
+    if not most_agree or facts["keypoints_per_image"] < _FEW_TRACKS:
+        return (
+            f"{no_start}: too few tracks, {facts['keypoints_per_image']:.0f} an image and "
+            f"{facts['num_verified_pairs']} of {facts['num_pairs']} pairs that agree with a rigid "
+            "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
+        )
+    if facts["guessed"]:
+        return (
+            f"{no_start}: the focal length is a guess and may be far off, or the parallax too "
+            "little, as where the camera moves along its axis: "
+            f"give --camera_model and --camera_params, or try --mapper {other}"
+        )
+    return (
+        f"{no_start}: the parallax between images that share tracks is too little, or the "
+        f"intrinsics do not fit: give --camera_model and --camera_params, or try --mapper {other}"
+    )
+
+
+def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
+    """Adjust the poses on more tracks than the mapper can take: long ones, spread over the images.
+
+    The mapper's own adjustments have no robust loss, and drop what drifts.
+    """
+    options = run.options
+    refine = _refines_intrinsics(options)
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, chosen)
+        spread = select_tracks(keep_frames(tracks, placed.frames), _ADJUSTED)
+        with run.clock.measure("adjustment"):
+            seen, view = seen_in(spread, placed.frames)
+            points = triangulate_images(
+                *(run, placed, seen, view), pinhole=None, options=_FOR_POSES, progress=no_progress
+            )
+            folder = partial / "adjusted"
+            folder.mkdir()
+            black = np.zeros((len(points.xyz), 3), np.uint8)
+            xy = seen.xy[points.observation].astype(np.float64)
+            cameras = {int(placed.camera.camera_id): placed.camera}
+            write_model(folder, cameras, placed.images, to_model_points(points, black, view, xy))
+            run.progress("adjustment", 0, 1)
+            adjust_model(
+                folder,
+                refine_intrinsics=refine,
+                loss_scale=_LOSS_SCALE,
+                seed=options.match.verify.seed,
+                num_threads=options.mapping.mapper_threads,
+                log=run.stages / "adjustment.log",
+            )
+            run.progress("adjustment", 1, 1)
+        return {"poses": "adjusted"}
+
+    how = (options.mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
+    given = (_ADJUSTED, _LOSS_SCALE, refine, *how)
+    return run_stage(
+        run.stages,
+        "adjustment",
+        [posed.key, given],
+        into=run.stages,
+        products=["adjusted"],
+        make=make,
+    )
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The images that have a pose, of one camera.
+
+    Attributes:
+        images: the images, in display order.
+        frames: int32 [n] their frames.
+        camera: their pycolmap.Camera.
+    """
+
+    images: list[ModelImage]
+    frames: NDArray[np.int32]
+    camera: Any
+
+
+def read_posed_images(run: Run, posed: Kept, chosen: ChosenImages) -> PosedImages:
+    """The images with the poses that a stage left."""
+    poses = read_model(run.stages / posed.facts["poses"])
+    posed_by_name = posed_images(poses)
+    index = [i for i, name in enumerate(chosen.names) if name in posed_by_name]
+    found = [posed_by_name[chosen.names[i]] for i in index]
+    camera = poses.cameras[found[0].camera_id]
+    images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
+    return PosedImages(images, chosen.frames[index], camera)
+
+
+def triangulate_images(
+    run: Run,
+    placed: PosedImages,
+    seen: Tracks,
+    view: NDArray[np.int64],
+    *,
+    pinhole: Any | None,
+    options: TriangulateOptions,
+    progress: Progress,
+) -> TriangulatedPoints:
+    """Points of tracks in the images that have a pose, one at least; see `triangulate_tracks`."""
+    points = triangulate_tracks(
+        *(seen, view, [placed.camera] * len(placed.images)),
+        *([image.cam_from_world for image in placed.images], pinhole),
+        options=options,
+        num_threads=run.options.match.verify.num_threads,
+        progress=progress,
+    )
+    if len(points.xyz) == 0:
+        raise ModelError(
+            f"none of the {points.num_tracks} tracks agrees with the poses: try the other "
+            "--mapper, or give --camera_params"
+        )
+    return points
