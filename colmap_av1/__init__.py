@@ -1,5 +1,8 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
+from colmap_av1.util import signals  # noqa: F401 - first, so that the program ends quietly
+
+# isort: split
 from colmap_av1.database.check import CheckReport, check
 from colmap_av1.database.hloc import HlocMatches, export_hloc, read_hloc
 from colmap_av1.densify import DensifyReport, densify
@@ -40,7 +43,6 @@ from colmap_av1.options import (
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.tracks.tracks import Tracks, build_tracks
-from colmap_av1.util import signals  # noqa: F401 - first, so that the program ends quietly from here on
 from colmap_av1.video.encode import EncodeReport, encode
 
 __all__ = [

@@ -364,7 +364,7 @@ def test_learned_features_without_their_extra(tmp_path):
 
 def test_without_matplotlib(video, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for name in ("report", "pictures"):
+    for name in ("report.report", "report.tables", "report.pictures"):
         monkeypatch.delitem(sys.modules, f"colmap_av1.evaluate.{name}", raising=False)
     with pytest.raises(EvaluationError, match=r"pip install 'colmap-av1\[evaluate\]'"):
         compare(video, tmp_path / "report")

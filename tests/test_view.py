@@ -17,6 +17,8 @@ from colmap_av1.cli import main
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, VideoError
 from colmap_av1.match import match
 from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.view import model as model_view
 
 
 @pytest.fixture(scope="session")
@@ -59,7 +61,7 @@ def test_tails_lead_to_where_tracks_were(panning: Path, tmp_path: Path) -> None:
     view.view_video(panning, tmp_path / "t", options=ViewOptions(draw="tracks", tail=6))
     first = cv2.imread(str(tmp_path / "t" / "frame_000000.png"))
     later = cv2.imread(str(tmp_path / "t" / "frame_000007.png"))
-    plain = next(image for i, image in view.decode_frames(panning) if i == 7)
+    plain = next(image for i, image in decode_frames(panning) if i == 7)
     changed = np.any(later != plain, axis=2)
     # Tails of 6 frames at 3 pixels a frame.
     drawn = cv2.connectedComponentsWithStats(changed.astype(np.uint8))[2][1:]
@@ -182,7 +184,7 @@ def test_model_shows_points_in_their_colours_and_the_path(model: Path, tmp_path:
         picture[600:, 800:],
     ):
         assert np.count_nonzero(np.all(panel == (30, 200, 10), axis=2)) > 200
-        assert np.count_nonzero(np.all(panel == view._PATH_COLOUR, axis=2)) > 50
+        assert np.count_nonzero(np.all(panel == model_view._PATH_COLOUR, axis=2)) > 50
 
 
 def test_model_in_the_browser(model: Path) -> None:

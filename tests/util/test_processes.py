@@ -19,7 +19,7 @@ time.sleep(60)
 BINDING = """
 import os, subprocess, sys, time
 child = (
-    "import os, sys, time; from colmap_av1.processes import bind; "
+    "import os, sys, time; from colmap_av1.util.processes import bind; "
     "bind(int(sys.argv[1])); print(os.getpid(), flush=True); time.sleep(60)"
 )
 subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
