@@ -36,7 +36,7 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
-from colmap_av1.video.facts import picture_size
+from colmap_av1.video.facts import read_video
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"
@@ -106,12 +106,12 @@ def compare(
     """
     options = options if options is not None else CompareOptions()
     progress = progress if progress is not None else no_progress
-    video, output = Path(video), Path(output)
+    output = Path(output)
     write_report = _report_writer()
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
     _check_training(options)
-    picture_size(video, options.match.read.operating_point)  # refuses what is no video
+    video = read_video(video, options.match.read.operating_point)
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
             video,
@@ -142,7 +142,7 @@ def compare(
         measured = [_measure(column, found, footage) for column in columns]
         report = CompareReport(
             output=output,
-            video=video,
+            video=video.path,
             num_frames=footage.num_frames,
             num_images=len(footage.names),
             size=footage.size,

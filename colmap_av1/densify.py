@@ -41,7 +41,7 @@ from colmap_av1.tracks.video_tracks import (
 )
 from colmap_av1.util.files import remove_leftovers, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
 
 
@@ -106,7 +106,7 @@ def densify(
     """
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress
-    model, video, output = Path(model), Path(video), Path(output)
+    model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
     _check_output(output)
@@ -115,10 +115,11 @@ def densify(
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
     camera_of_name = {name: cameras[image.camera_id] for name, image in posed.items()}
     sizes = {name: (int(c.width), int(c.height)) for name, c in camera_of_name.items()}
-    with unchanged(video):
+    video = read_video(video, options.match.read.operating_point)
+    with unchanged(video.state):
         size = _check_input(model, video, folder, sizes, options)
         source = open_source(video, options.match, clock=clock, progress=progress)
-        with unchanged(source.stream):
+        with unchanged(source.stream.state):
             matching = chaining_for_points(options.match, options.triangulate)
             tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
             with clock.measure("choice"):
@@ -214,19 +215,18 @@ def _check_output(output: Path) -> None:
 
 def _check_input(
     model: Path,
-    video: Path,
+    video: Video,
     folder: Path | None,
     sizes: Mapping[str, tuple[int, int]],
     options: DensifyOptions,
 ) -> tuple[int, int]:
     """Refuse what does not fit before the long work; (width, height) of the model's images."""
-    video_size = picture_size(video, options.match.read.operating_point)
-    check_options(options.match, video_size)
+    check_options(options.match, video.picture_size)
     check_triangulate_options(options.triangulate)
     if len(sizes) < 2:
         raise ModelError(f"{model}: only one image has a pose: give a model with two or more")
     try:
-        size = size_of_images(sizes, video_size, read_display(video).pixel_aspect)
+        size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
     except ImageError as error:
         raise ImageError(f"{model}: {error}") from error
     missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)

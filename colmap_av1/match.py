@@ -29,6 +29,7 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import keep_frames
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -143,13 +144,14 @@ def match(
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress
-    database, video = Path(database), Path(video)
+    database = Path(database)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
 
     listed = _read_listed_images(database, options)
     existing = {image.name: (image.width, image.height) for image in listed}
-    with unchanged(video) as check_video:
+    video = read_video(video, options.read.operating_point)
+    with unchanged(video.state) as check_video:
         prepared = prepare_images(
             video, folder, options, listed=existing, clock=clock, progress=progress
         )
@@ -161,7 +163,7 @@ def match(
             tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
         # All tracks of a video are its largest arrays: they make room for the matches.
         del prepared
-        paired = pair_images(video, tracks, chosen, options, clock=clock, progress=progress)
+        paired = pair_images(video.path, tracks, chosen, options, clock=clock, progress=progress)
         num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
         del tracks
         cameras = _cameras(
@@ -184,8 +186,8 @@ def match(
         write_matched_images(database, chosen.names, cameras.new, matched, options.on_existing)
     return MatchReport(
         database=database,
-        video=video,
-        stream=source.stream,
+        video=video.path,
+        stream=source.stream.path,
         image_path=folder,
         num_frames=num_frames,
         num_coded_frames=num_coded_frames,

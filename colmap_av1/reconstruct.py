@@ -27,8 +27,8 @@ from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
-from colmap_av1.video.facts import picture_size
-from colmap_av1.video.unchanged import check_unchanged, file_states
+from colmap_av1.video.facts import read_video
+from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
@@ -109,17 +109,17 @@ def reconstruct(
     """
     options = options if options is not None else ReconstructOptions()
     progress = progress if progress is not None else no_progress
-    video, output = Path(video), Path(output)
+    output = Path(output)
     clock = Clock()
-    check_options(options.match, picture_size(video, options.match.read.operating_point))
+    video = read_video(video, options.match.read.operating_point)
+    check_options(options.match, video.picture_size)
     _check_reconstruct_options(options)
     with open_stages(output, "reconstruct") as stages:
         source = open_source(video, options.match, clock=clock, progress=progress)
-        files = file_states(source.stream, source.pictures)
         try:
-            report = _run_stages(Run(source, files, output, stages, options, clock, progress))
+            report = _run_stages(Run(source, output, stages, options, clock, progress))
         except ColmapAv1Error:  # which may come of a change
-            check_unchanged(files)
+            check_unchanged(*source.files)
             raise
         _write_report(report)
     return report
@@ -143,7 +143,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     reported["other_models"] = tuple(facts["other_models"])
     return ReconstructReport(
         output=run.output,
-        video=run.source.pictures,
+        video=run.source.pictures.path,
         database=run.output / "database.db",
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
         seconds=run.clock.seconds,

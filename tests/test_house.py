@@ -18,7 +18,7 @@ FLOW = (
 AT_THE_TOP = {"errors": "errors", "options": "options", "compare": "compare"}
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES = 14, 450, 60
 # Long for a reason: each says one thing in order.
-LONG_FUNCTIONS = {"images.preparing.prepare_images": 62}
+LONG_FUNCTIONS: dict[str, int] = {}
 LONG_FILES = {"cli.commands": 542}
 CLIMBS = ["images.preparing imports option_checks"]
 

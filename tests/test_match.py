@@ -2,16 +2,17 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import av
 import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import AV1, Encode, Ffmpeg, make_frames
+from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
 
 from colmap_av1.database.reading import read_images
 from colmap_av1.errors import (
@@ -36,6 +37,7 @@ from colmap_av1.options import (
     TrackOptions,
     VerifyOptions,
 )
+from colmap_av1.video import facts, stored_frames
 
 ALL = MatchOptions(density=DensityOptions(preset="dense"))
 LK = replace(ALL, refine=RefineOptions(refine="lk"))
@@ -77,6 +79,36 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
         "motion", "tracks", "choice", "pairs", "focal length", "verification", "images", "database"
     ]  # fmt: skip
     assert report.warnings == ()
+
+
+@pytest.mark.parametrize("image_path", [None, "images"])
+def test_the_video_is_opened_once_and_passed_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image_path: str | None
+) -> None:
+    """For its facts with the edit list and without, for headers, motion, and the images."""
+    opened: list[str] = []
+    decoded: list[int] = []
+    open_file, decode_stream = av.open, stored_frames.decode_stream
+
+    def count_open(file: str, *args: Any, **kwargs: Any) -> Any:
+        opened.append(file)
+        return open_file(file, *args, **kwargs)
+
+    def count_decoded(*args: Any) -> Iterator[Any]:
+        for number, frame in enumerate(decode_stream(*args)):
+            decoded.append(number)
+            yield frame
+
+    monkeypatch.setattr(av, "open", count_open)
+    for module in (facts, stored_frames):
+        monkeypatch.setattr(module, "decode_stream", count_decoded)
+    folder = tmp_path / image_path if image_path is not None else None
+    report = match(tmp_path / "a.db", PROJECT / "examples" / "scene.mp4", image_path=folder)
+    written = report.num_frames if folder is not None else 0
+    assert len(opened) == (4 if folder is None else 5)
+    assert set(opened) == {str(PROJECT / "examples" / "scene.mp4")}
+    # The first picture is looked at once.
+    assert decoded == [0, *range(written)]
 
 
 @pytest.mark.parametrize("refine", ["none", "lk"])

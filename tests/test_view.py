@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -10,12 +11,13 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import Encode
+from conftest import SHARED, Encode
 
 from colmap_av1 import view
 from colmap_av1.cli import main
-from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, VideoError
+from colmap_av1.errors import ColmapAv1Error, LimitError, ModelError, OptionError, VideoError
 from colmap_av1.match import match
+from colmap_av1.motion.info import inspect
 from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.view import model as model_view
@@ -211,3 +213,14 @@ def test_view_says_what_it_lacks(
         view.view_model(tmp_path)
     with pytest.raises(OptionError, match=r"ends in \.png"):
         view.write_picture(view.view_model(model), tmp_path / "m.tiff")
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("read", [inspect, lambda video: view.view_video(video, "drawn.mp4")])
+def test_frames_that_are_too_large_are_refused_before_one_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(LimitError, match="larger than the limit"):
+        read(SHARED / "conformance" / "bad" / "huge_dimensions.ivf")
+    assert list(tmp_path.iterdir()) == []

@@ -26,6 +26,7 @@ from colmap_av1.images.names import (
 from colmap_av1.util.files import remove_leftovers, whole_file
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
+from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 
 # Images that others wrote are only read.
@@ -218,7 +219,8 @@ def write_images(
             ) from error
         remove_leftovers(parent)
     try:
-        with unchanged(Path(video)):
+        video = read_video(video, operating_point)
+        with unchanged(video.state):
             decoded = decode_frames(
                 video, operating_point=operating_point, num_threads=num_threads, display=display
             )

@@ -35,7 +35,7 @@ from colmap_av1.tracks.video_tracks import (
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display, shown_size, turned_back
-from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.facts import Video
 from colmap_av1.video.unchanged import unchanged
 
 _Image = NDArray[np.uint8]
@@ -64,8 +64,34 @@ class PreparedImages:
     pixel_aspect: float
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """How the pictures of a video and the images that exist go together.
+
+    Attributes:
+        existing: (width, height) of the images that exist, by name.
+        display: how the video's pictures are shown in the images.
+        back: what turns shown pictures so; None where images show them as players do.
+        video_size: (width, height) of the pictures so shown.
+        size: (width, height) of the images.
+    """
+
+    existing: dict[str, tuple[int, int]]
+    display: Display
+    back: Display | None
+    video_size: tuple[int, int]
+    size: tuple[int, int]
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Width of the images' pixels over their height."""
+        (width, height), (image_width, image_height) = self.video_size, self.size
+        # Images may be scaled by different factors along x and y.
+        return self.display.pixel_aspect * width * image_height / (height * image_width)
+
+
 def prepare_images(
-    video: Path,
+    video: Video,
     folder: Path | None,
     options: MatchOptions,
     *,
@@ -90,35 +116,20 @@ def prepare_images(
         OptionError: an option has a value that cannot work.
     """
     # What can be refused is refused before the long work.
-    video_size = picture_size(video, options.read.operating_point)
-    display = read_display(video)
-    existing = dict(listed)
-    if folder is not None and not existing:
-        names = existing_images(folder, options.images.image_name)
-        existing = {name: image_size(folder / name) for name in names}
-    back = _way_back(video, display, video_size, existing, folder)
-    if back is not None:
-        # What exists was written by a program that does not turn pictures.
-        display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
-        video_size = shown_size(video_size, back)
-    size = size_of_images(existing, video_size, display.pixel_aspect)
+    fit = _fit(video, folder, options, listed)
+    display, size, existing = fit.display, fit.size, list(fit.existing)
     check_options(options, size)
     if folder is not None:
-        check_image_folder(folder, list(existing) or options.images.image_name, size)
-        if size != video_size:
-            check_images_there(folder, list(existing))
+        check_image_folder(folder, existing or options.images.image_name, size)
+        if size != fit.video_size:
+            check_images_there(folder, existing)
 
     source = open_source(video, options, clock=clock, progress=progress)
-    with unchanged(source.stream):
+    with unchanged(source.stream.state):
         tracked = track_video(
             source, options, one_size=folder is not None, clock=clock, progress=progress
         )
-        tracks = tracked.tracks if back is None else show_tracks(tracked.tracks, back)
-        if (tracks.width, tracks.height) != video_size:
-            raise VideoError(
-                f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
-                f"{video} {video_size[0]}x{video_size[1]}: convert it by another --encoder"
-            )
+        tracks = _tracks_as_shown(tracked.tracks, source, fit)
 
         def decode() -> Iterator[tuple[int, _Image]]:
             pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
@@ -130,7 +141,7 @@ def prepare_images(
             chosen = choose_images(
                 tracks,
                 options.images,
-                existing=list(existing),
+                existing=existing,
                 folder=folder,
                 times=lambda: times_of_frames(source, tracks.num_frames),
                 decode=decode,
@@ -148,13 +159,46 @@ def prepare_images(
         tracks=scale_tracks(tracks, size),
         chosen=chosen,
         size=size,
-        # Images may be scaled by different factors along x and y.
-        pixel_aspect=display.pixel_aspect * video_size[0] * size[1] / (video_size[1] * size[0]),
+        pixel_aspect=fit.pixel_aspect,
     )
 
 
+def _fit(
+    video: Video,
+    folder: Path | None,
+    options: MatchOptions,
+    listed: Mapping[str, tuple[int, int]],
+) -> _Fit:
+    """Find the images that exist, and how they show the video; refuses those that cannot."""
+    display, video_size = video.display, video.picture_size
+    existing = dict(listed)
+    if folder is not None and not existing:
+        names = existing_images(folder, options.images.image_name)
+        existing = {name: image_size(folder / name) for name in names}
+    back = _way_back(video, existing, folder)
+    if back is not None:
+        # What exists was written by a program that does not turn pictures.
+        display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
+        video_size = shown_size(video_size, back)
+    size = size_of_images(existing, video_size, display.pixel_aspect)
+    return _Fit(existing, display, back, video_size, size)
+
+
+def _tracks_as_shown(tracks: Tracks, source: VideoSource, fit: _Fit) -> Tracks:
+    """The tracks as the images show the video; refuses a stream of other pictures."""
+    if fit.back is not None:
+        tracks = show_tracks(tracks, fit.back)
+    width, height = fit.video_size
+    if (tracks.width, tracks.height) != fit.video_size:
+        raise VideoError(
+            f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+            f"{source.pictures} {width}x{height}: convert it by another --encoder"
+        )
+    return tracks
+
+
 def write_chosen(
-    pictures: Path,
+    pictures: Video,
     folder: Path,
     chosen: ChosenImages,
     options: MatchOptions,
@@ -188,9 +232,7 @@ def write_chosen(
 
 
 def _way_back(
-    video: Path,
-    display: Display,
-    video_size: tuple[int, int],
+    video: Video,
     existing: dict[str, tuple[int, int]],
     folder: Path | None,
 ) -> Display | None:
@@ -199,12 +241,13 @@ def _way_back(
     Their shape says it. Where either would do, the first image says it by what it shows, if its
     file is there; else images count as turned, as players and ffmpeg do.
     """
+    display = video.display
     if display.turn == Display().turn or not existing:
         return None
     back = turned_back(display)
     name, size = next(iter(existing.items()))
-    as_shown = has_shape(size, video_size)
-    as_stored = has_shape(size, shown_size(video_size, back))
+    as_shown = has_shape(size, video.picture_size)
+    as_stored = has_shape(size, shown_size(video.picture_size, back))
     if as_shown and as_stored and folder is not None and (folder / name).exists():
         return back if is_turned_back(folder / name, decode_frames(video), display) else None
     return back if as_stored and not as_shown else None

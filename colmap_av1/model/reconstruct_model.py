@@ -61,7 +61,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 change=change,
                 progress=lambda done: progress("images", done, len(names)),
             )
-        check_unchanged(run.files)
+        check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)

@@ -35,8 +35,7 @@ from colmap_av1.tracks.video_tracks import (
 )
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.util.stages import Kept, run_stage
-from colmap_av1.video.facts import read_display
-from colmap_av1.video.unchanged import FileState, check_unchanged, file_states
+from colmap_av1.video.unchanged import check_unchanged, file_state
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
@@ -48,7 +47,6 @@ class Run:
 
     Attributes:
         source: the video.
-        files: its files as they were at the start.
         output: the folder that is made.
         stages: the folder in it that holds what later runs resume from.
         options: options of every stage.
@@ -57,7 +55,6 @@ class Run:
     """
 
     source: VideoSource
-    files: dict[Path, FileState]
     output: Path
     stages: Path
     options: ReconstructOptions
@@ -93,7 +90,7 @@ def track_stage(run: Run) -> Kept:
         with (partial / "tracks.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
             np.savez(file, **vars(tracks), names=np.array(chosen.names), frames=chosen.frames)
-        check_unchanged(run.files)
+        check_unchanged(*source.files)
         return {
             "num_frames": tracks.num_frames,
             "num_images": len(chosen.names),
@@ -103,11 +100,11 @@ def track_stage(run: Run) -> Kept:
 
     given = (options.images, options.read, options.tracks, options.refine, options.encode)
     frame_list = options.images.frame_list
-    listed = list(file_states(Path(frame_list)).values()) if frame_list is not None else None
+    listed = [file_state(frame_list).found] if frame_list is not None else None
     return run_stage(
         run.stages,
         "tracks",
-        [*run.files.values(), given, listed],
+        [*(file.found for file in source.files), given, listed],
         into=run.stages,
         products=["tracks.npz"],
         make=make,
@@ -142,9 +139,11 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
         with clock.measure("pairs"):
             sparse = select_tracks(keep_frames(tracks, chosen.frames), density)
         video = run.source.pictures
-        paired = pair_images(video, sparse, chosen, options.match, clock=clock, progress=progress)
+        paired = pair_images(
+            video.path, sparse, chosen, options.match, clock=clock, progress=progress
+        )
         size = (tracks.width, tracks.height)
-        pixel_aspect = read_display(video).pixel_aspect
+        pixel_aspect = video.display.pixel_aspect
         focal_length = shared_focal_length(paired, size, pixel_aspect, options.match, clock=clock)
         camera = make_camera(options.match.camera, *size, pixel_aspect, focal_length)
         matched = verify_images(paired, camera, options.match, clock=clock, progress=progress)

@@ -16,9 +16,9 @@ from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
-from colmap_av1.video.container import VideoStream, open_stream
+from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
-from colmap_av1.video.facts import presented_frames, read_display
+from colmap_av1.video.facts import Video, read_video
 
 _KEY_FRAME, _INTRA_ONLY_FRAME = 0, 2
 
@@ -101,44 +101,44 @@ def inspect(
     structure = counts.structure
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frame: give a video with pictures")
-    presented = presented_frames(video)
-    num_presented = (
-        structure.num_shown if presented is None else int((presented < structure.num_shown).sum())
-    )
-    with open_stream(video) as stream:
-        bytes_per_frame = _num_bytes(stream) / structure.num_shown
-        bits_per_pixel = 8 * bytes_per_frame / max(1, stream.width * stream.height)
-        references = sum(counts.references.values()) + counts.hidden_references
-        median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
-        reasons = structure.reasons(bits_per_pixel)
-        if median_motion < _LEAST_MOTION:
-            reasons += (
-                f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
-                "there is no parallax",
-            )
-        return StreamReport(
-            path=Path(video),
-            container=stream.container,
-            width=stream.width,
-            height=stream.height,
-            display=read_display(video),
-            frame_rate=stream.frame_rate,
-            num_coded=structure.num_coded,
-            num_shown=structure.num_shown,
-            num_cut=structure.num_shown - num_presented,
-            num_hidden=counts.num_hidden,
-            num_key_frames=structure.num_key_frames,
-            inter_share=structure.inter_share,
-            reference_distances={
-                distance: units / references
-                for distance, units in sorted(counts.references.items())
-            },
-            hidden_reference_share=counts.hidden_references / references if references else 0.0,
-            median_motion=median_motion,
-            bytes_per_frame=bytes_per_frame,
-            bits_per_pixel=bits_per_pixel,
-            reasons=reasons,
+    # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
+    opened = read_video(video)
+    num_presented = structure.num_shown
+    if opened.presented is not None:
+        num_presented = int((opened.presented < structure.num_shown).sum())
+    width, height = opened.stored_size
+    bytes_per_frame = _num_bytes(opened) / structure.num_shown
+    bits_per_pixel = 8 * bytes_per_frame / max(1, width * height)
+    references = sum(counts.references.values()) + counts.hidden_references
+    median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
+    reasons = structure.reasons(bits_per_pixel)
+    if median_motion < _LEAST_MOTION:
+        reasons += (
+            f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
+            "there is no parallax",
         )
+    return StreamReport(
+        path=opened.path,
+        container=opened.container,
+        width=width,
+        height=height,
+        display=opened.display,
+        frame_rate=opened.frame_rate,
+        num_coded=structure.num_coded,
+        num_shown=structure.num_shown,
+        num_cut=structure.num_shown - num_presented,
+        num_hidden=counts.num_hidden,
+        num_key_frames=structure.num_key_frames,
+        inter_share=structure.inter_share,
+        reference_distances={
+            distance: units / references for distance, units in sorted(counts.references.items())
+        },
+        hidden_reference_share=counts.hidden_references / references if references else 0.0,
+        median_motion=median_motion,
+        bytes_per_frame=bytes_per_frame,
+        bits_per_pixel=bits_per_pixel,
+        reasons=reasons,
+    )
 
 
 @dataclass
@@ -244,10 +244,10 @@ def _count_references(frame: FrameMotion, counts: _Counts) -> None:
             counts.motion.append(float(np.median(length[valid] / distance[valid])))
 
 
-def _num_bytes(stream: VideoStream) -> int:
+def _num_bytes(video: Video) -> int:
     """Size of the stream up to its end or the first damage, which reading has reported."""
     total = 0
-    with contextlib.suppress(BitstreamError):
+    with open_stream(video) as stream, contextlib.suppress(BitstreamError):
         for packet in stream.packets():
             total += len(packet.data)
     return total

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,11 @@ from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks, show_tracks
 from colmap_av1.util.progress import Clock, Progress
-from colmap_av1.video.container import is_av1, open_stream
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import stream_of
-from colmap_av1.video.facts import frame_times, presented_frames, read_display
+from colmap_av1.video.facts import Video, frame_times, read_video
+from colmap_av1.video.unchanged import FileState
 
 _Image = NDArray[np.uint8]
 
@@ -36,18 +35,18 @@ class VideoSource:
     """Where the motion and the pictures of a video come from.
 
     Attributes:
-        stream: the AV1 file whose motion is read.
-        pictures: the file whose pictures become images.
-        display: how players show the stream's pictures.
-        presented: indices of the stream's frames that players show, where they hide some.
-        num_packets: number of packets of the stream; None where unknown.
+        stream: the AV1 video whose motion is read. One that was made of another holds the frames
+            that the other's edit list hides, too.
+        pictures: the video whose pictures become images: the same, or what it was made of.
     """
 
-    stream: Path
-    pictures: Path
-    display: Display
-    presented: NDArray[np.int32] | None
-    num_packets: int | None
+    stream: Video
+    pictures: Video
+
+    @property
+    def files(self) -> tuple[FileState, ...]:
+        """Its files as they were at the start, each once."""
+        return tuple(dict.fromkeys([self.stream.state, self.pictures.state]))
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class TrackedVideo:
 
 
 def open_source(
-    video: Path, options: MatchOptions, *, clock: Clock, progress: Progress
+    video: Video, options: MatchOptions, *, clock: Clock, progress: Progress
 ) -> VideoSource:
     """Find the AV1 stream of a video, or make it: its motion is read, not its pictures.
 
@@ -77,12 +76,12 @@ def open_source(
         progress: told about the stage "encoding".
 
     Raises:
-        VideoError: the file is missing or no video that can be read.
+        VideoError: the video cannot be converted.
         EncodeError: no AV1 encoder works, or the stream cannot be written.
         OptionError: an option has a value that cannot work.
     """
     stream = video
-    if not is_av1(video) or (options.reencode and inspect(video, options.read).reasons):
+    if video.codec != "av1" or (options.reencode and inspect(video, options.read).reasons):
         with clock.measure("encoding"):
             encoded = stream_of(
                 video,
@@ -91,11 +90,8 @@ def open_source(
                 keep_stream=options.keep_stream,
                 progress=progress,
             )
-        stream = encoded.output
-    with open_stream(stream) as opened:
-        num_packets = opened.num_frames
-    # A stream made of a video holds the frames that its edit list hides, too.
-    return VideoSource(stream, video, read_display(stream), presented_frames(video), num_packets)
+        stream = read_video(encoded.output)
+    return VideoSource(stream, video)
 
 
 def track_video(
@@ -128,7 +124,7 @@ def track_video(
     motion = _counted(clock.iterate("motion", motion), structure)
 
     def count(done: int) -> None:
-        progress("motion", done, source.num_packets)
+        progress("motion", done, source.stream.likely_num_packets)
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -137,7 +133,7 @@ def track_video(
             num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
             tracks = remove_overlays(tracks)
             share_over_picture = 1 - len(tracks.offsets) / num_tracks
-            tracks = show_tracks(tracks, source.display, source.presented)
+            tracks = show_tracks(tracks, source.stream.display, source.pictures.presented)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
@@ -159,9 +155,9 @@ def track_video(
             "logos and dashboards do: they are left out"
         )
     # Of the whole file, so a rate that is found low is even lower.
-    bits = 8 * source.stream.stat().st_size
+    bits = 8 * source.stream.path.stat().st_size
     reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
-    if reasons and source.stream == source.pictures:
+    if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
     return TrackedVideo(tracks, structure.num_coded, tuple(notes))
 
@@ -169,8 +165,9 @@ def track_video(
 def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
     """Times of the frames that players show; None where they are unknown."""
     times = frame_times(source.stream)
-    if times is not None and source.presented is not None:
-        times = times[source.presented[source.presented < len(times)]]
+    presented = source.pictures.presented
+    if times is not None and presented is not None:
+        times = times[presented[presented < len(times)]]
     return None if times is None or len(times) < num_frames else times[:num_frames]
 
 
@@ -184,7 +181,7 @@ def decoded_pictures(source: VideoSource, options: MatchOptions) -> Iterator[tup
 
 
 def decodable_frames(
-    video: Path, num_frames: int, options: MatchOptions, display: Display | None = None
+    video: Video, num_frames: int, options: MatchOptions, display: Display | None = None
 ) -> Iterator[tuple[int, _Image]]:
     """The pictures of the frames that have tracks; those before a damage, with a warning."""
     decoded = decode_frames(

@@ -1,4 +1,4 @@
-"""Packets of an AV1 video; FFmpeg (through PyAV) demuxes."""
+"""What a container says of its video, and the packets of AV1; FFmpeg (through PyAV) demuxes."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ import av.logging
 from av.stream import Disposition
 
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+from colmap_av1.video.unchanged import FileState, file_state
 
 # Edit lists drop or hide samples, but a later frame may reference them: read them all.
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
@@ -44,41 +45,103 @@ class Packet:
     index: int
 
 
+@dataclass(frozen=True)
+class VideoFile:
+    """What a file of any codec says of its video, without decoding.
+
+    It stands for the file's path where one is asked for.
+
+    Attributes:
+        path: the file.
+        state: the file before it was opened, for `unchanged`.
+        container: FFmpeg's name of the container format.
+        codec: FFmpeg's name of the codec.
+        index: number of the video among the streams of the file.
+        stored_size: (width, height) in pixels of the pictures as they are stored.
+        frame_rate: average frames per second; None where unknown.
+        duration: length in seconds; None where unknown.
+        num_packets: packets of the video, usually one a frame; None where the container does
+            not say.
+    """
+
+    path: Path
+    state: FileState
+    container: str
+    codec: str
+    index: int
+    stored_size: tuple[int, int]
+    frame_rate: float | None
+    duration: float | None
+    num_packets: int | None
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def likely_num_packets(self) -> int | None:
+        """The number of packets, or what it comes to by duration and frame rate."""
+        if self.num_packets is not None or self.duration is None or self.frame_rate is None:
+            return self.num_packets
+        return round(self.duration * self.frame_rate) or None
+
+
+def read_file(video: str | os.PathLike[str]) -> VideoFile:
+    """Look into a file of any codec; the same object where that has been done.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    if isinstance(video, VideoFile):
+        return video
+    path, state = Path(video), file_state(video)
+    with open_container(path) as container:
+        return describe(container, find_decodable_stream(container, path), state)
+
+
+def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
+    """What an open container says of a stream.
+
+    Args:
+        container: of PyAV.
+        stream: its stream, of PyAV.
+        state: the file before it was opened.
+    """
+    rate = stream.average_rate or stream.guessed_rate
+    is_timed = not _is_ivf_without_rate(state.path)
+    return VideoFile(
+        path=state.path,
+        state=state,
+        container=container.format.name,
+        codec=_codec_name(stream),
+        index=stream.index,
+        stored_size=(stream.codec_context.width, stream.codec_context.height),
+        frame_rate=float(rate) if rate and is_timed else None,
+        duration=_stream_duration(container, stream) if is_timed else None,
+        num_packets=stream.frames or None,
+    )
+
+
 class VideoStream:
     """The AV1 stream of an open video file; a context manager that closes it.
 
     Attributes:
-        path: the file.
-        container: FFmpeg's name of the container format.
-        codec: always "av1".
-        width: picture width in pixels as the container says, unrotated.
-        height: picture height likewise.
-        frame_rate: average frames per second; None where unknown.
-        duration: length in seconds; None where unknown.
-        num_frames: number of packets as the container says; None where it does not.
+        file: what the container says of it.
         configuration: OBUs that precede the first packet: the configOBUs of the container's
             av1C box, empty where the stream carries its sequence header itself.
     """
 
     def __init__(self, video: str | os.PathLike[str]) -> None:
-        self.path = Path(video)
+        path, state = Path(video), file_state(video)
         self._opened = ExitStack()
-        self._container = self._opened.enter_context(open_container(self.path))
+        self._container = self._opened.enter_context(open_container(path))
         try:
-            self._stream = _find_av1_stream(self._container, self.path)
-            context = self._stream.codec_context
-            self.container: str = self._container.format.name
-            self.codec = "av1"
-            self.width: int = context.width
-            self.height: int = context.height
-            rate = self._stream.average_rate or self._stream.guessed_rate
-            self._is_timed = not _is_ivf_without_rate(self.path)
-            self.frame_rate = float(rate) if rate and self._is_timed else None
-            self.duration = (
-                _stream_duration(self._container, self._stream) if self._is_timed else None
-            )
-            self.num_frames = self._stream.frames or self._estimate_num_frames()
-            self.configuration = _configuration_obus(context.extradata)
+            self._stream = _find_av1_stream(self._container, path)
+            self.file = describe(self._container, self._stream, state)
+            self._is_timed = not _is_ivf_without_rate(path)
+            self.configuration = _configuration_obus(self._stream.codec_context.extradata)
         except BaseException:
             self.close()
             raise
@@ -114,14 +177,14 @@ class VideoStream:
                 packet = next(demuxed, None)
             except (av.error.FFmpegError, OSError) as error:
                 raise BitstreamError(
-                    f"{self.path}: damaged after packet {index}: {reason_of(error)}"
+                    f"{self.file}: damaged after packet {index}: {reason_of(error)}"
                 ) from error
             if packet is None:
                 break
             if packet.size == 0:  # PyAV's end-of-stream marker
                 continue
             if packet.is_corrupt:
-                raise BitstreamError(f"{self.path}: cut off inside packet {index + 1}")
+                raise BitstreamError(f"{self.file}: cut off inside packet {index + 1}")
             is_timed = self._is_timed and packet.pts is not None
             pts = float(packet.pts * packet.time_base) if is_timed else None
             last = packet
@@ -129,37 +192,33 @@ class VideoStream:
             index += 1
         damage = self._missing_end(index, last)
         if damage:
-            raise BitstreamError(f"{self.path}: {damage}")
+            raise BitstreamError(f"{self.file}: {damage}")
         if index == 0:
-            raise VideoError(f"{self.path}: holds no frame: give a video with pictures")
-
-    def _estimate_num_frames(self) -> int | None:
-        if self.duration is None or self.frame_rate is None:
-            return None
-        return round(self.duration * self.frame_rate) or None
+            raise VideoError(f"{self.file}: holds no frame: give a video with pictures")
 
     def _missing_end(self, count: int, last: Any) -> str | None:
         """What shows that the file is cut off, where demuxers end as if it were whole."""
-        if 0 < count < self._stream.frames and "mp4" in self.container:
-            return f"cut off: {count} of {self._stream.frames} packets are there"
+        file = self.file
+        if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
+            return f"cut off: {count} of {file.num_packets} packets are there"
         if count == 0:
             # Tables that point nowhere, or a cut inside the first packet.
-            if self._stream.frames or (self.duration and "matroska" in self.container):
+            if file.num_packets or (file.duration and "matroska" in file.container):
                 return "damaged or cut off before the end of the first packet"
             return None
         size = self._container.size
         if last.pos is not None and last.pos >= 0 and size > 0:
             end = last.pos + last.size
-            if self.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
+            if file.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
                 return f"cut off after packet {count}"
-            if self.container == "obu" and end != size:
+            if file.container == "obu" and end != size:
                 return f"cut off after packet {count}"
-        if "matroska" in self.container and self.duration and last.pts is not None:
-            step = 1 / self.frame_rate if self.frame_rate else 0.0
+        if "matroska" in file.container and file.duration and last.pts is not None:
+            step = 1 / file.frame_rate if file.frame_rate else 0.0
             length = float((last.duration or 0) * last.time_base)
             end_time = float(last.pts * last.time_base) + max(length, step)
-            if end_time + 1.5 * step < self.duration:
-                return f"cut off: {end_time:.2f} of {self.duration:.2f} seconds are there"
+            if end_time + 1.5 * step < file.duration:
+                return f"cut off: {end_time:.2f} of {file.duration:.2f} seconds are there"
         return None
 
 
@@ -180,17 +239,6 @@ def packets(video: str | os.PathLike[str]) -> Iterator[Packet]:
     """Read the packets of a video file: `VideoStream.packets` of a file opened for it."""
     with open_stream(video) as stream:
         yield from stream.packets()
-
-
-def is_av1(video: str | os.PathLike[str]) -> bool:
-    """Whether a video has an AV1 stream.
-
-    Raises:
-        VideoError: as `decode_frames`.
-    """
-    path = Path(video)
-    with open_container(path) as container:
-        return _codec_name(find_video_stream(container, path)) == "av1"
 
 
 class _IvfWithRate(io.FileIO):
@@ -278,6 +326,14 @@ def find_video_stream(container: Any, path: Path) -> Any:
         raise VideoError(f"{path}: holds no video stream, {found}: give a video")
     moving = [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
     return next((s for s in moving if _codec_name(s) == "av1"), moving[0])
+
+
+def find_decodable_stream(container: Any, path: Path) -> Any:
+    """As `find_video_stream`; refuses a codec that FFmpeg does not decode."""
+    stream = find_video_stream(container, path)
+    if stream.codec_context is None:
+        raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
+    return stream
 
 
 def _codec_name(stream: Any) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import BitstreamError
 from colmap_av1.video.display import Display, shown_picture
-from colmap_av1.video.facts import presented_frames, read_display
+from colmap_av1.video.facts import read_video
 from colmap_av1.video.stored_frames import decode
 
 
@@ -28,25 +28,27 @@ def decode_frames(
         video: a file of any codec that FFmpeg decodes.
         operating_point: operating point of a scalable stream.
         num_threads: threads of the decoder; None: as many as it likes.
-        display: how pictures are cut and turned; None: as `read_display` says. Pixels stay as
-            wide as they are stored.
+        display: how pictures are cut and turned; None: as players do. Pixels stay as wide as
+            they are stored.
 
     Yields:
         (index, image) in output order: the index counts the frames that players show, see
-        `presented_frames`; the image is uint8 [height, width, 3] in BGR order.
+        `Video.presented`; the image is uint8 [height, width, 3] in BGR order.
 
     Raises:
         BitstreamError: the stream is damaged; the frames before have been given.
-        VideoError: the file is missing, empty, not a video, or holds no video stream.
+        VideoError: as `read_video`.
     """
-    display = display if display is not None else read_display(video)
-    presented = presented_frames(video)
-    index_of = None if presented is None else {int(f): i for i, f in enumerate(presented)}
+    video = read_video(video, operating_point)
+    how = display if display is not None else video.display
+    index_of = None
+    if video.presented is not None:
+        index_of = {int(f): i for i, f in enumerate(video.presented)}
 
     def shown(number: int, frame: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         index = number if index_of is None else index_of.get(number)
         if index is not None:
-            yield index, shown_picture(frame.to_ndarray(format="bgr24"), display)
+            yield index, shown_picture(frame.to_ndarray(format="bgr24"), how)
 
     count = 0
     try:

@@ -27,7 +27,7 @@ from colmap_av1.options import EncodeOptions
 from colmap_av1.util.files import remove_leftovers, whole_file
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
-from colmap_av1.video.container import open_stream
+from colmap_av1.video.container import VideoFile, open_stream, read_file
 from colmap_av1.video.encoders import (
     ENCODERS,
     KEY_FRAME_DISTANCE,
@@ -36,7 +36,7 @@ from colmap_av1.video.encoders import (
     reason_of,
     settings,
 )
-from colmap_av1.video.facts import VideoFacts, video_facts
+from colmap_av1.video.facts import with_counted_packets
 from colmap_av1.video.stored_frames import count_frames
 from colmap_av1.video.unchanged import unchanged
 
@@ -97,11 +97,11 @@ def encode(
     """
     options = options if options is not None else EncodeOptions()
     progress = progress if progress is not None else no_progress
-    video, output = Path(video), Path(output)
+    path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
     if output.exists():
-        if video.exists() and output.samefile(video):
+        if path.exists() and output.samefile(path):
             raise OptionError(f"{output}: is the video itself: give another output")
         if not overwrite:
             raise OptionError(f"{output}: exists: give another output, or --overwrite")
@@ -110,42 +110,42 @@ def encode(
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
     remove_leftovers(output.parent, output.name)
-    facts = video_facts(video)
+    file = with_counted_packets(read_file(video))
     name, ffmpeg = find_encoder(options)
     encoder = ENCODERS[name]
     quality, speed = settings(encoder, options)
     before = [ffmpeg, *TALK, "-nostdin", "-y", *encoder.before_input]
-    if "mov" in facts.container:
+    if "mov" in file.container:
         # Frames that an edit list hides are frames all the same, and good ones.
         before += ["-ignore_editlist", "1"]
     how = [
-        *("-i", f"file:{video}", "-map", f"0:{facts.index}", "-vf", encoder.upload),
+        *("-i", f"file:{path}", "-map", f"0:{file.index}", "-vf", encoder.upload),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
         *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
     ]
-    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(video)}
+    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
 
     def convert(partial: Path, num_frames: int | None = None) -> int:
-        total = num_frames or facts.num_packets
+        total = num_frames or file.num_packets
         progress("encoding", 0, total)
         command = [*before, *how]
         if num_frames is not None:
             command += ["-frames:v", str(num_frames)]
         words = _mark(mark if num_frames is None else {**mark, "readable": num_frames})
         command += ["-metadata", f"comment={words}", f"file:{partial}"]
-        count = _run(command, video, facts.size, lambda done: progress("encoding", done, total))
+        count = _run(command, file, lambda done: progress("encoding", done, total))
         if count == 0:
             raise VideoError(
-                f"{video}: no frame can be decoded, it is damaged: give another copy of it"
+                f"{path}: no frame can be decoded, it is damaged: give another copy of it"
             )
         _check_stream(partial, count)
         return count
 
     try:
-        with whole_file(output) as partial, unchanged(video):
+        with whole_file(output) as partial, unchanged(file.state):
             count = convert(partial)
-            readable = _readable_frames(video, facts, count, strict)
+            readable = _readable_frames(file, count, strict)
             if readable < count:
                 count = convert(partial, readable)
     except OSError as error:
@@ -182,37 +182,36 @@ def stream_of(
             that is no kept stream.
     """
     options = options if options is not None else EncodeOptions()
-    video = Path(video)
-    output = Path(keep_stream) if keep_stream is not None else video.with_suffix(".av1.mp4")
+    path = Path(video)
+    output = Path(keep_stream) if keep_stream is not None else path.with_suffix(".av1.mp4")
     if output.suffix.lower() not in _KEPT_FORMATS:
         raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
-    facts = video_facts(video)
+    file = with_counted_packets(read_file(video))
     if output.exists():
         mark = _mark_of(output)
         if mark is None:
             raise OptionError(
-                f"{output}: exists and is no stream that was kept of {video.name}: give another "
+                f"{output}: exists and is no stream that was kept of {path.name}: give another "
                 "--keep_stream, or remove it"
             )
-        if _fits(mark, video, options) and output.stat().st_mtime_ns >= video.stat().st_mtime_ns:
+        if _fits(mark, path, options) and output.stat().st_mtime_ns >= path.stat().st_mtime_ns:
             kept = _count_packets(output)
             readable = int(mark.get("readable", 0))
             if kept and not (strict and readable):
                 if readable:
-                    _warn_of_damage(video, readable, facts, f"{output} was made of what is before")
+                    _warn_of_damage(file, readable, f"{output} was made of what is before")
                 return EncodeReport(output, ENCODERS[mark["encoder"]].ffmpeg_name, kept, True)
     if not os.access(output.resolve().parent, os.W_OK | os.X_OK):
         raise EncodeError(
-            f"{output.resolve().parent}: the AV1 stream of {video.name} cannot be written there: "
+            f"{output.resolve().parent}: the AV1 stream of {path.name} cannot be written there: "
             "say where with --keep_stream"
         )
-    return encode(video, output, overwrite=True, strict=strict, options=options, progress=progress)
+    return encode(file, output, overwrite=True, strict=strict, options=options, progress=progress)
 
 
-def _run(
-    command: Sequence[str], video: Path, size: tuple[int, int], report: Callable[[int], None]
-) -> int:
-    """Run ffmpeg on a video of a size and return the number of frames it wrote."""
+def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]) -> int:
+    """Run ffmpeg on a video and return the number of frames it wrote."""
+    size = video.stored_size
     count = dropped = doubled = 0
     with tempfile.TemporaryFile() as words, _process(command, words) as process:
         for line in process.stdout or ():
@@ -272,12 +271,12 @@ def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen
             process.stdout.close()
 
 
-def _readable_frames(video: Path, facts: VideoFacts, count: int, strict: bool) -> int:
+def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
     """How many frames are the same to ffmpeg, which wrote `count`, and to who reads pictures.
 
     ffmpeg goes on after damage, and the frames it leaves out shift those that follow.
     """
-    if count == facts.num_packets:
+    if count == video.num_packets:
         return count
     readable, damage = count_frames(video)
     if damage is None and readable == count:
@@ -291,13 +290,13 @@ def _readable_frames(video: Path, facts: VideoFacts, count: int, strict: bool) -
         raise VideoError(f"{video}: no frame can be decoded: {damage}: give another copy of it")
     if strict:
         raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
-    _warn_of_damage(video, readable, facts, damage)
+    _warn_of_damage(video, readable, damage)
     return readable
 
 
-def _warn_of_damage(video: Path, readable: int, facts: VideoFacts, reason: str) -> None:
+def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:
     warnings.warn(
-        f"{video}: damaged after {readable} of {facts.num_packets} frames, which are used: "
+        f"{video}: damaged after {readable} of {video.num_packets} frames, which are used: "
         f"{reason}",
         stacklevel=3,
     )

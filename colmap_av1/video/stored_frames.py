@@ -11,8 +11,8 @@ import av
 import av.error
 import av.logging
 
-from colmap_av1.errors import BitstreamError, VideoError
-from colmap_av1.video.container import find_video_stream, open_container, reason_of
+from colmap_av1.errors import BitstreamError
+from colmap_av1.video.container import find_decodable_stream, open_container, reason_of
 
 
 def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
@@ -36,32 +36,35 @@ def decode(
     """Decode all frames as they are stored; those before a damage come first."""
     path = Path(video)
     with open_container(path) as container:
-        stream = find_video_stream(container, path)
-        context = stream.codec_context
-        if context is None:
-            raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
-        context.thread_type = "AUTO"
-        context.thread_count = num_threads or 0
-        options = {"oppoint": str(operating_point)} if operating_point else {}
-        # Grain is noise laid over the picture the motion was coded for.
-        context.options = {"export_side_data": "film_grain", **options}
-        damage: Exception | None = None
-        try:
-            for packet in container.demux(stream):
-                if packet.size == 0:  # PyAV's end-of-stream marker
-                    break
-                if packet.is_corrupt:
-                    damage = EOFError("cut off inside a packet")
-                    break
-                yield from context.decode(packet)
-        except (av.error.FFmpegError, OSError) as error:
-            damage = error
-        # The decoder holds frames back; those before the damage are still good.
-        try:
-            yield from context.decode(None)
-        except (av.error.FFmpegError, OSError) as error:
-            damage = damage or error
-        if damage is not None:
-            raise BitstreamError(
-                f"{path}: cannot be decoded further: {reason_of(damage)}"
-            ) from damage
+        stream = find_decodable_stream(container, path)
+        yield from decode_stream(container, stream, path, operating_point, num_threads)
+
+
+def decode_stream(
+    container: Any, stream: Any, path: Path, operating_point: int, num_threads: int | None
+) -> Generator[Any, None, None]:
+    """As `decode`, of a file that is open: PyAV's container and a stream of it."""
+    context = stream.codec_context
+    context.thread_type = "AUTO"
+    context.thread_count = num_threads or 0
+    options = {"oppoint": str(operating_point)} if operating_point else {}
+    # Grain is noise laid over the picture the motion was coded for.
+    context.options = {"export_side_data": "film_grain", **options}
+    damage: Exception | None = None
+    try:
+        for packet in container.demux(stream):
+            if packet.size == 0:  # PyAV's end-of-stream marker
+                break
+            if packet.is_corrupt:
+                damage = EOFError("cut off inside a packet")
+                break
+            yield from context.decode(packet)
+    except (av.error.FFmpegError, OSError) as error:
+        damage = error
+    # The decoder holds frames back; those before the damage are still good.
+    try:
+        yield from context.decode(None)
+    except (av.error.FFmpegError, OSError) as error:
+        damage = damage or error
+    if damage is not None:
+        raise BitstreamError(f"{path}: cannot be decoded further: {reason_of(damage)}") from damage

@@ -18,7 +18,7 @@ from colmap_av1.tracks.tracks import Tracks, build_tracks, order_by_frame, show_
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.facts import presented_frames, read_display
+from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 from colmap_av1.view.pictures import Image, bgr, open_pictures, side_by_side
 
@@ -76,23 +76,25 @@ def view_video(
     report = progress if progress is not None else no_progress
     path, operating_point = Path(output), read.operating_point if read is not None else 0
     count = 0
-    with unchanged(Path(video)) as check_video:
-        with open_stream(video) as stream:
-            num_packets = stream.num_frames
-            frame_rate = stream.frame_rate or _DEFAULT_FRAME_RATE
+    with open_stream(video) as stream:
+        file = stream.file
+    with unchanged(file.state) as check_video:
         if path.suffix and path.suffix.lower() != ".mp4" and not path.is_dir():
             raise OptionError(
                 f"{path}: give an output that ends in .mp4, or a folder for PNG files"
             )
+        total = file.likely_num_packets
         chained = build_tracks(
-            read_motion(video, read), tracks, lambda done: report("tracks", done, num_packets)
+            read_motion(video, read), tracks, lambda done: report("tracks", done, total)
         )
-        chained = show_tracks(chained, read_display(video), presented_frames(video))
+        # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
+        opened = read_video(video, operating_point)
+        chained = show_tracks(chained, opened.display, opened.presented)
         drawing = _prepare(chained, options)
         draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
         check_video()
-        with open_pictures(path, frame_rate) as write:
-            for index, picture in decode_frames(video, operating_point=operating_point):
+        with open_pictures(path, opened.frame_rate or _DEFAULT_FRAME_RATE) as write:
+            for index, picture in decode_frames(opened, operating_point=operating_point):
                 if index >= chained.num_frames:
                     break
                 write(side_by_side([panel(picture, drawing, index) for panel in draw]))

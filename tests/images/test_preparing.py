@@ -19,6 +19,7 @@ from colmap_av1.options import EncodeOptions, ImageOptions, MatchOptions, ReadOp
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import stream_of
+from colmap_av1.video.facts import read_video
 
 OPTIONS = MatchOptions()
 LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
@@ -31,14 +32,19 @@ def prepared(
     listed: Mapping[str, tuple[int, int]] | None = None,
 ) -> PreparedImages:
     return prepare_images(
-        video, folder, options, listed=listed or {}, clock=Clock(), progress=no_progress
+        read_video(video, options.read.operating_point),
+        folder,
+        options,
+        listed=listed or {},
+        clock=Clock(),
+        progress=no_progress,
     )
 
 
 def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
     clock, told = Clock(), set()
     found = prepare_images(
-        clip,
+        read_video(clip),
         None,
         replace(OPTIONS, images=ImageOptions(num_images=5)),
         listed={},

@@ -22,13 +22,14 @@ from colmap_av1.tracks.video_tracks import (
 )
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.facts import read_video
 
 OPTIONS = MatchOptions()
 STRICT = MatchOptions(read=ReadOptions(strict=True))
 
 
 def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
-    return open_source(video, options, clock=Clock(), progress=no_progress)
+    return open_source(read_video(video), options, clock=Clock(), progress=no_progress)
 
 
 def tracked(source: VideoSource, options: MatchOptions = OPTIONS) -> TrackedVideo:
@@ -43,16 +44,17 @@ def trimmed(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
 
 def test_an_av1_video_is_its_own_stream(clip: Path) -> None:
     source = opened(clip)
-    assert source.stream == source.pictures == clip
-    assert source.num_packets == 16
-    assert source.presented is None
+    assert source.stream is source.pictures
+    assert source.stream.path == clip
+    assert source.stream.num_packets == 16
+    assert source.pictures.presented is None
 
 
 def test_frames_that_are_not_shown_are_in_the_stream(trimmed: Path) -> None:
     source = opened(trimmed)
-    assert source.num_packets == 16
-    assert source.presented is not None
-    assert source.presented.tolist() == list(range(5, 16))
+    assert source.stream.num_packets == 16
+    assert source.pictures.presented is not None
+    assert source.pictures.presented.tolist() == list(range(5, 16))
     found = tracked(source)
     assert found.num_coded_frames == 16
     assert found.tracks.num_frames == 11
@@ -83,7 +85,7 @@ def test_a_poor_stream_is_told_of_where_it_could_be_converted(
     assert note.startswith("a key frame every 4.0 frames")
     assert note.endswith("; or let --reencode 1 convert the video first")
     video = ffmpeg("-i", often, "-c:v", "libx264", tmp_path / "video.mp4")
-    assert tracked(replace(source, pictures=video)).warnings == ()
+    assert tracked(replace(source, pictures=read_video(video))).warnings == ()
 
 
 def test_what_lies_over_the_picture_is_told_of(encode: Encode, tmp_path: Path) -> None:
@@ -126,18 +128,18 @@ def hurt(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
 
 def test_pictures_end_before_the_damage(hurt: Path) -> None:
     with pytest.warns(UserWarning, match=r"cut\.ivf: .*; tracks are refined in (\d+) frames only"):
-        count = len(list(decodable_frames(hurt, 16, OPTIONS)))
+        count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS)))
     assert 4 < count < 16
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the frames that are asked for are whole
-        whole = list(decodable_frames(hurt, count, OPTIONS))
+        whole = list(decodable_frames(read_video(hurt), count, OPTIONS))
     assert [index for index, _ in whole] == list(range(count))
     with pytest.raises(BitstreamError, match=r"cut\.ivf: cannot be decoded further"):
-        list(decodable_frames(hurt, 16, STRICT))
+        list(decodable_frames(read_video(hurt), 16, STRICT))
 
 
 def test_pictures_are_those_of_the_frames_with_tracks(clip: Path) -> None:
-    asked = list(decodable_frames(clip, 3, OPTIONS))
+    asked = list(decodable_frames(read_video(clip), 3, OPTIONS))
     assert [index for index, _ in asked] == [0, 1, 2]
     for (_, picture), (_, whole) in zip(asked, decode_frames(clip), strict=False):
         np.testing.assert_array_equal(picture, whole)

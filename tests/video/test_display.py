@@ -28,7 +28,7 @@ from colmap_av1.video.display import (
     shown_size,
     turn_of_matrix,
 )
-from colmap_av1.video.facts import presented_frames, read_display
+from colmap_av1.video.facts import read_video
 
 # The presets choose tracks by cells of the picture, which are not those of a cut or scaled one.
 ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"))
@@ -124,7 +124,7 @@ def test_pictures_and_keypoints_are_where_ffmpeg_shows_them(
 ) -> None:
     how = ["-display_rotation", str(angle), *flip]
     turned = ffmpeg(*how, "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
-    display = read_display(turned)
+    display = read_video(turned).display
     assert display.is_mirrored == bool(flip)
     assert angle == (display.rotation if not flip else angle)
     stored = next(decode_frames(clip))[1]
@@ -190,7 +190,7 @@ def test_cropped_by_the_container(
         if angle:
             pytest.skip("FFmpeg writes no display matrix to Matroska")
         cropped = ffmpeg("-i", cropped, "-c", "copy", tmp_path / "cropped.mkv")
-    assert read_display(cropped).crop == crop
+    assert read_video(cropped).display.crop == crop
     assert inspect(cropped).display.crop == crop
     first, *_ = cut_by_ffmpeg(ffmpeg, cropped, tmp_path / "cut", "-frames:v", "1")
     shown = next(decode_frames(cropped))[1]
@@ -217,13 +217,13 @@ def test_metadata_that_looks_like_cropping(clip: Path, ffmpeg: Ffmpeg, tmp_path:
     odd = ffmpeg(
         *("-i", clip, "-c", "copy", "-metadata:s:v", f"handler_name={words}"), tmp_path / "odd.mp4"
     )
-    assert read_display(odd).crop == (0, 0, 0, 0)
+    assert read_video(odd).display.crop == (0, 0, 0, 0)
 
 
 def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     trimmed = ffmpeg("-ss", "0.2", "-i", clip, "-c", "copy", tmp_path / "trimmed.mp4")
-    assert presented_frames(clip) is None
-    presented = presented_frames(trimmed)
+    assert read_video(clip).presented is None
+    presented = read_video(trimmed).presented
     assert presented is not None
     assert presented.tolist() == list(range(5, 16))
     assert inspect(trimmed).num_cut == 5
@@ -290,7 +290,7 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
     clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
     turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
     aspect = 1.5 if angle == 0 else 1 / 1.5
-    assert read_display(turned).pixel_aspect == pytest.approx(aspect)
+    assert read_video(turned).display.pixel_aspect == pytest.approx(aspect)
     assert "pixel aspect" in dict(info_rows(turned))
 
     report = match(tmp_path / "a.db", turned, image_path=tmp_path / "images")
@@ -354,4 +354,4 @@ def test_superres(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     (first,) = cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-frames:v", "1")
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
     assert written.shape == first.shape == (128, 256, 3)
-    assert read_display(clip).pixel_aspect == pytest.approx(1, abs=5e-3)
+    assert read_video(clip).display.pixel_aspect == pytest.approx(1, abs=5e-3)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from colmap_av1.errors import ImageError, OptionError, VideoError
-from colmap_av1.video.unchanged import unchanged
+from colmap_av1.video.unchanged import file_state, unchanged
 
 
 def write_on(video: Path) -> None:
@@ -38,14 +38,14 @@ def video(tmp_path: Path) -> Path:
 
 
 def test_what_stays_is_accepted(video: Path) -> None:
-    with unchanged(video) as check:
+    with unchanged(file_state(video)) as check:
         video.read_bytes()
         check()
 
 
 def read(video: Path, change: Callable[[Path], None], error: Exception | None = None) -> None:
     """Read a video that changes; the error where its check notices."""
-    with unchanged(video) as check:
+    with unchanged(file_state(video)) as check:
         change(video)
         try:
             check()
@@ -66,12 +66,13 @@ def test_what_changes_is_refused_at_once(video: Path) -> None:
 
 
 def test_errors_that_come_of_a_change_say_so(video: Path) -> None:
-    with pytest.raises(ImageError, match="of its own"), unchanged(video):
+    with pytest.raises(ImageError, match="of its own"), unchanged(file_state(video)):
         raise ImageError("of its own")
     with pytest.raises(VideoError, match="changed or went"):
         read(video, write_on, ImageError("no frame 7"))
 
 
 def test_a_video_that_was_never_there(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="no such file"), unchanged(tmp_path / "none.mp4"):
+    none = file_state(tmp_path / "none.mp4")
+    with pytest.raises(OptionError, match="no such file"), unchanged(none):
         raise OptionError("no such file")

@@ -16,9 +16,9 @@ from conftest import AV1, SHARED, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
-from colmap_av1.video.container import is_av1, open_stream, packets
+from colmap_av1.video.container import open_stream, packets
 from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.facts import read_video
 
 TEMPORAL_DELIMITER = 2
 KIT = SHARED / "conformance"
@@ -161,11 +161,13 @@ def test_cut_files_give_a_prefix_and_are_reported(
 
 def test_stream_facts(clip: Path) -> None:
     with open_stream(clip) as stream:
-        assert (stream.width, stream.height) == (192, 128)
-        assert stream.frame_rate == 25
-        assert stream.duration == pytest.approx(16 / 25)
-        assert stream.num_frames == 16
-        assert "mp4" in stream.container
+        file = stream.file
+        assert (file.path, file.codec) == (clip, "av1")
+        assert file.stored_size == (192, 128)
+        assert file.frame_rate == 25
+        assert file.duration == pytest.approx(16 / 25)
+        assert file.num_packets == file.likely_num_packets == 16
+        assert "mp4" in file.container
         times = [p.pts for p in stream.packets()]
     assert times == pytest.approx(np.arange(16) / 25)
 
@@ -190,9 +192,11 @@ def test_pictures_are_turned_as_ffmpeg_turns_them(
     turned = ffmpeg(
         "-display_rotation", str(angle), "-i", plain, "-c", "copy", tmp_path / "turned.mp4"
     )
-    assert is_av1(turned) == (codec == "av1")
-    assert read_display(turned).rotation == angle
-    assert picture_size(turned) == ((64, 96) if angle in (90, 270) else (96, 64))
+    video = read_video(turned)
+    assert video.codec == codec
+    assert video.display.rotation == angle
+    assert video.stored_size == (96, 64)
+    assert video.picture_size == ((64, 96) if angle in (90, 270) else (96, 64))
     ffmpeg("-i", turned, tmp_path / "%d.png")
     decoded = list(decode_frames(turned))
     assert [index for index, _ in decoded] == [0, 1, 2]
@@ -296,7 +300,7 @@ def test_ivf_without_a_frame_rate_is_read(
     path = tmp_path / "zero.ivf"
     path.write_bytes(data)
     with open_stream(path) as stream:
-        assert (stream.frame_rate, stream.duration) == (None, None)
+        assert (stream.file.frame_rate, stream.file.duration) == (None, None)
         read = list(stream.packets())
     assert [p.data for p in read] == [p.data for p in packets(whole)]
     assert {p.pts for p in read} == {None}

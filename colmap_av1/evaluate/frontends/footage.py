@@ -24,7 +24,7 @@ from colmap_av1.options import (
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import keep_frames
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.video.facts import picture_size, read_display
+from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
 
 
@@ -76,20 +76,21 @@ def prepare_footage(
         ImageError: the video has fewer frames.
     """
     frames = tuple(range(0, num_frames, image_step))
+    opened = read_video(video)
     footage = Footage(
         video=video,
         image_path=folder / "images",
         names=image_names(ImageOptions().image_name, frames),
         frames=frames,
         num_frames=num_frames,
-        size=picture_size(video),
-        pixel_aspect=read_display(video).pixel_aspect,
+        size=opened.picture_size,
+        pixel_aspect=opened.display.pixel_aspect,
         camera=camera,
     )
 
     def work() -> dict[str, Any]:
         footage.image_path.mkdir()
-        write_images(video, footage.image_path, footage.names, frames)
+        write_images(opened, footage.image_path, footage.names, frames)
         return {}
 
     kept(folder, (content_of(video), frames), work)
@@ -97,7 +98,7 @@ def prepare_footage(
 
 
 def choose_footage(
-    video: Path,
+    video: Video,
     folder: Path,
     *,
     options: MatchOptions,
@@ -121,7 +122,7 @@ def choose_footage(
     def work() -> dict[str, Any]:
         clock = Clock()
         existed = bool(existing_images(images, options.images.image_name))
-        with unchanged(video) as check_video:
+        with unchanged(video.state) as check_video:
             prepared = prepare_images(
                 video, images, options, listed={}, clock=clock, progress=progress
             )
@@ -135,14 +136,14 @@ def choose_footage(
             "num_frames": prepared.tracks.num_frames,
             "size": prepared.size,
             "pixel_aspect": prepared.pixel_aspect,
-            "forward_motion": _is_forward_motion(prepared, video, options),
+            "forward_motion": _is_forward_motion(prepared, video.path, options),
             "warnings": prepared.tracked.warnings,
             "existed": existed,
         }
 
     listed = options.images.frame_list
     key = (
-        content_of(video),
+        content_of(video.path),
         (options.images, options.camera, options.read, options.encode, options.tracks),
         content_of(Path(listed)) if listed is not None and Path(listed).is_file() else None,
         str(images),
@@ -156,7 +157,7 @@ def choose_footage(
         facts = kept(folder, key, work)
     for name in ("frames", "size", "warnings"):
         facts[name] = tuple(facts[name])
-    return Footage(video=video, image_path=images, camera=options.camera, **facts)
+    return Footage(video=video.path, image_path=images, camera=options.camera, **facts)
 
 
 def frame_list(footage: Footage, path: Path, names: Collection[str] | None = None) -> str:
