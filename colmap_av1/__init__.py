@@ -19,6 +19,7 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
+from colmap_av1.map import MapReport, map_database
 from colmap_av1.match import MatchReport, match
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import StreamReport, inspect
@@ -31,6 +32,7 @@ from colmap_av1.options import (
     EncodeOptions,
     ExportOptions,
     ImageOptions,
+    MapOptions,
     MapperOptions,
     MatchOptions,
     PairOptions,
@@ -64,6 +66,8 @@ __all__ = [
     "ImageError",
     "ImageOptions",
     "LimitError",
+    "MapOptions",
+    "MapReport",
     "MapperOptions",
     "MatchOptions",
     "MatchReport",
@@ -88,6 +92,7 @@ __all__ = [
     "export_hloc",
     "export_motion",
     "inspect",
+    "map_database",
     "match",
     "read_hloc",
     "read_motion",

@@ -21,19 +21,15 @@ from colmap_av1.evaluate.frontends.frontends import (
     run_frontend,
 )
 from colmap_av1.evaluate.frontends.learned import check_learned_options
-from colmap_av1.evaluate.frontends.mapping import (
-    MapperSettings,
-    densify_model,
-    map_database,
-    model_figures,
-)
+from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.evaluate.metrics.sequence import read_poses
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
 from colmap_av1.model.colmap_model import read_model
-from colmap_av1.options import CompareOptions, DensifyOptions
+from colmap_av1.model.figures import model_figures
+from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
@@ -121,8 +117,8 @@ def compare(
             progress=progress,
         )
         given = _read_reference(Path(reference), footage) if reference is not None else None
-        settings = MapperSettings(
-            fixed_intrinsics=footage.camera.camera_params is not None,
+        settings = MapOptions(
+            refine_intrinsics=footage.camera.camera_params is None,
             forward_motion=footage.forward_motion,
         )
         columns: list[Column] = []
@@ -146,7 +142,7 @@ def compare(
             num_frames=footage.num_frames,
             num_images=len(footage.names),
             size=footage.size,
-            fixed_intrinsics=settings.fixed_intrinsics,
+            fixed_intrinsics=not settings.refine_intrinsics,
             forward_motion=settings.forward_motion,
             cloud_reference=found.cloud_source,
             pose_reference=found.pose_source,
@@ -215,7 +211,7 @@ def _run_column(
     footage: Footage,
     folder: Path,
     *,
-    settings: MapperSettings,
+    settings: MapOptions,
     options: CompareOptions,
     progress: Progress,
 ) -> list[Column]:
@@ -233,7 +229,7 @@ def _run_column(
             peak_memory=run.peak_memory,
         )
         progress(name, 1, total)
-        mapped = map_database(run.database, footage.image_path, folder / "mapped", settings)
+        mapped = measure_mapper(run.database, footage.image_path, folder / "mapped", settings)
         column = replace(
             column,
             seconds={**run.seconds, "mapping": mapped.seconds},

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, ModelError, OptionError, cannot_write
+from colmap_av1.errors import ImageError, ModelError, cannot_write
 from colmap_av1.images.choosing import choose_images
 from colmap_av1.images.files import size_of_images
 from colmap_av1.model.colmap_model import (
@@ -39,7 +39,7 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
-from colmap_av1.util.files import remove_leftovers, whole_folder
+from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
@@ -109,7 +109,7 @@ def densify(
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
-    _check_output(output)
+    check_new_folder(output)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
@@ -201,16 +201,6 @@ def _agreement(model: Path, points: TriangulatedPoints) -> float:
             "and see that their names count its frames (--first_number, --frame_list)"
         )
     return agreeing
-
-
-def _check_output(output: Path) -> None:
-    """Refuse a folder that cannot be made, or is no new one."""
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise OptionError(f"{output}: is there and not empty: give a new folder")
-    above = next(folder for folder in output.absolute().parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{output}: cannot be made in {above}: give another folder")
-    remove_leftovers(output.parent, output.name)
 
 
 def _check_input(

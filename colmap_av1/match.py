@@ -89,7 +89,7 @@ class MatchReport:
 
     @property
     def next_commands(self) -> tuple[str, str]:
-        """Shell lines that map the database: with COLMAP, and with pycolmap."""
+        """Shell lines that map the database: with COLMAP, and with this package."""
         database = _no_option(self.database)
         output = _no_option(self.database.with_name(f"{self.database.stem}_model"))
         images = _no_option(self.image_path) if self.image_path is not None else "IMAGES"
@@ -103,13 +103,13 @@ class MatchReport:
                 *("--Mapper.ba_refine_focal_length", "0"),
                 *("--Mapper.ba_refine_extra_params", "0"),
             ]
-        script = [
-            *("python", "examples/map_with_pycolmap.py", "--database", database),
+        ours = [
+            *("colmap-av1", "map", "--database", database),
             *("--image_path", images, "--output", output),
         ]
         if self.forward_motion:
-            script.append("--forward_motion")
-        return f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}", shlex.join(script)
+            ours.append("--forward_motion")
+        return f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}", shlex.join(ours)
 
 
 def match(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 OnExisting = Literal["error", "append", "replace"]
+Mapper = Literal["incremental", "global"]
 
 
 @dataclass(frozen=True)
@@ -228,6 +229,24 @@ class TriangulateOptions:
     max_depth_error: float | None = 0.07
     # observations a point needs
     min_observations: int = 3
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a database is mapped."""
+
+    # which of COLMAP's mappers: 'incremental' or 'global'
+    mapper: Mapper = "incremental"
+    # the camera moves along its axis: let the incremental mapper start with such a pair
+    forward_motion: bool = False
+    # refine focal length and distortion; None: unless the camera moves along its axis, which leaves
+    # them undetermined
+    refine_intrinsics: bool | None = None
+    # the mapper's random seed
+    seed: int = 0
+    # threads of the mapper; with several, the last digits of its results change from run to run;
+    # None: one per CPU
+    num_threads: int | None = None
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(compare_module, "map_database", stop)
+        patch.setattr(compare_module, "measure_mapper", stop)
         with pytest.raises(KeyboardInterrupt):
             run_again(video, output, truth)
     assert times(output) == kept

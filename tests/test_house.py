@@ -19,7 +19,7 @@ AT_THE_TOP = {"errors": "errors", "options": "options", "compare": "compare"}
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES = 14, 450, 60
 # Long for a reason: each says one thing in order.
 LONG_FUNCTIONS: dict[str, int] = {}
-LONG_FILES = {"cli.commands": 542}
+LONG_FILES = {"cli.commands": 581}
 CLIMBS = ["images.preparing imports option_checks"]
 
 

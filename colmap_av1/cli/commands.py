@@ -14,6 +14,7 @@ from colmap_av1.cli.reports import (
     compare_rows,
     densify_rows,
     info_rows,
+    map_rows,
     match_rows,
     reconstruct_rows,
 )
@@ -27,6 +28,7 @@ from colmap_av1.database.check import check
 from colmap_av1.database.hloc import export_hloc
 from colmap_av1.densify import densify
 from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.map import map_database
 from colmap_av1.match import match
 from colmap_av1.motion.info import inspect as inspect_stream
 from colmap_av1.motion.motion_file import export_motion
@@ -39,6 +41,7 @@ from colmap_av1.options import (
     ExportOptions,
     ImageOptions,
     LearnedOptions,
+    MapOptions,
     MapperOptions,
     MatchOptions,
     PairOptions,
@@ -186,6 +189,42 @@ def _run_match(namespace: argparse.Namespace) -> None:
     _print_result(namespace, match_rows(result), result.warnings)
     if not namespace.quiet:
         print_next(result)
+
+
+def add_map(commands: Any) -> None:
+    """Add `map`."""
+    command = _add_command(
+        commands,
+        "map",
+        _run_map,
+        "make a model of a COLMAP database with one of COLMAP's mappers",
+        "--database PATH --image_path PATH --output PATH",
+    )
+    _add_database(command)
+    command.add_argument(
+        "--image_path", required=True, metavar="PATH", help="folder of the database's images"
+    )
+    _add_output(command, "new folder for the models; 0 is the one with the most images")
+    command.add_argument(
+        "--forward_motion",
+        action="store_true",
+        help="the camera moves along its axis: start with such a pair, keep the intrinsics",
+    )
+    add_options(command, {MapOptions: "mapper"}, without=("forward_motion",))
+    _add_quiet(command)
+
+
+def _run_map(namespace: argparse.Namespace) -> None:
+    options = given(namespace, MapOptions, forward_motion=namespace.forward_motion)
+    with progress_bars(namespace.quiet) as report:
+        result = map_database(
+            namespace.database,
+            namespace.image_path,
+            namespace.output,
+            options=options,
+            progress=report,
+        )
+    _print_result(namespace, map_rows(result))
 
 
 def add_reconstruct(commands: Any) -> None:

@@ -17,6 +17,7 @@ from colmap_av1.cli.commands import (
     add_encode,
     add_export,
     add_info,
+    add_map,
     add_match,
     add_motion,
     add_reconstruct,
@@ -97,7 +98,7 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for add in (
-        *(add_match, add_reconstruct, add_densify, add_compare, add_encode),
+        *(add_match, add_map, add_reconstruct, add_densify, add_compare, add_encode),
         *(add_info, add_check, add_motion, add_export, add_view),
     ):
         add(commands)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from colmap_av1.database.check import CheckReport
 from colmap_av1.densify import DensifyReport
+from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
 from colmap_av1.motion.info import StreamReport
 from colmap_av1.reconstruct import ReconstructReport
@@ -45,6 +46,22 @@ def match_rows(report: MatchReport) -> Rows:
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def map_rows(report: MapReport) -> Rows:
+    """Figures of the model with the most images."""
+    figures = report.figures
+    rows = [
+        ("images registered", f"{figures.num_registered} of {report.num_images}"),
+        ("points", str(figures.num_points)),
+        ("mean reprojection error", f"{figures.mean_error:.3f} px"),
+        ("mean track length", f"{figures.mean_track_length:.2f}"),
+        ("focal length", f"{figures.focal_length:.2f} px"),
+    ]
+    if len(report.num_registered) > 1:
+        others = ", ".join(map(str, report.num_registered[1:]))
+        rows.append(("further models", f"of {others} images, beside it"))
+    return [*rows, ("model written to", str(report.model))]
 
 
 def reconstruct_rows(report: ReconstructReport) -> Rows:

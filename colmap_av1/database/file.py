@@ -112,6 +112,20 @@ def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Conn
     return _connect(path, "mode=ro" if busy else "mode=ro&immutable=1", path)
 
 
+def copy_database(path: Path, copy: Path) -> None:
+    """Copy a database with all that was committed to it, without a trace in it or beside it.
+
+    Args:
+        path: the database.
+        copy: file that is made.
+    """
+    with (
+        open_unaltered(path) as source,
+        contextlib.closing(sqlite3.connect(copy)) as target,
+    ):
+        source.backup(target)
+
+
 @contextlib.contextmanager
 def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
     """Open a file with the given words of SQLite's URI; its errors become ours."""

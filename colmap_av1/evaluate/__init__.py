@@ -10,11 +10,8 @@ from colmap_av1.evaluate.frontends.frontends import (
 )
 from colmap_av1.evaluate.frontends.mapping import (
     MapperRun,
-    MapperSettings,
-    ModelFigures,
     densify_model,
-    map_database,
-    model_figures,
+    measure_mapper,
 )
 from colmap_av1.evaluate.frontends.measure import Measured, run_measured
 from colmap_av1.evaluate.metrics.database_tracks import database_tracks
@@ -33,6 +30,7 @@ from colmap_av1.evaluate.training.splatting import (
     split_images,
     train_gaussians,
 )
+from colmap_av1.model.figures import ModelFigures, model_figures
 
 __all__ = [
     "FRONTENDS",
@@ -41,7 +39,6 @@ __all__ = [
     "Frontend",
     "FrontendRun",
     "MapperRun",
-    "MapperSettings",
     "Measured",
     "Milestone",
     "ModelFigures",
@@ -54,7 +51,7 @@ __all__ = [
     "epipolar_errors",
     "exact_errors",
     "make_frontends",
-    "map_database",
+    "measure_mapper",
     "model_figures",
     "model_poses",
     "pairs_at_span",

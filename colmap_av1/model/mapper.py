@@ -9,12 +9,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any
 
 from colmap_av1.errors import ModelError
+from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import MapOptions
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
@@ -31,62 +33,47 @@ run_child(json.loads(sys.argv[1]))
 """
 
 
-@dataclass(frozen=True)
-class MapperRun:
-    """The models that a mapper made.
-
-    Attributes:
-        num_images: images with a pose in each model, the most first; empty where none came out.
-    """
-
-    num_images: tuple[int, ...]
-
-
 def map_poses(
     database: Path,
     output: Path,
+    options: MapOptions,
     *,
-    mapper: Literal["incremental", "global"],
-    refine_intrinsics: bool,
-    forward_motion: bool,
-    seed: int,
-    num_threads: int,
+    image_path: Path | None,
     log: Path,
     num_images: int,
     progress: Progress,
-) -> MapperRun:
-    """Map a database; the model with the most images is written.
+) -> tuple[int, ...]:
+    """Map a database in a process of its own, see `run_mapper`.
 
     Args:
         database: COLMAP database with verified matches; pycolmap brings it to its own layout.
-        output: folder that gets the model; made here.
-        mapper: which of COLMAP's mappers.
-        refine_intrinsics: refine focal length and distortion.
-        forward_motion: let the incremental mapper start with images behind each other.
-        seed: the random seed.
-        num_threads: threads; the result is the same from run to run with one only.
+        output: folder that gets the models; made where it is missing.
+        options: which mapper, and how.
+        image_path: folder of the images; None: the points stay black.
         log: file that gets what the mapper prints.
         num_images: number of images, for the progress.
-        progress: told about the stage "poses" with the number of images placed so far.
+        progress: called in the stage "poses" with the number of images placed so far.
+
+    Returns:
+        Images with a pose in each model, the most first; empty where none came out.
 
     Raises:
         ModelError: the mapper failed; the log says more.
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = {
-        "task": mapper,
+        "task": "mapping",
         "database": str(database),
         "model": str(output),
-        "refine_intrinsics": refine_intrinsics,
-        "forward_motion": forward_motion,
-        "seed": seed,
-        "num_threads": num_threads,
+        "image_path": str(image_path) if image_path is not None else None,
+        "options": asdict(options),
+        "seed": options.seed,
     }
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
 
-    def told(word: str, value: str) -> None:
+    def hear(word: str, value: str) -> None:
         nonlocal placed, sizes
         if word == "placed":
             placed += 1
@@ -94,13 +81,71 @@ def map_poses(
         elif word == "models":
             sizes = json.loads(value)
 
-    _run_apart(
-        settings, told, log, failed=f"COLMAP's {mapper} mapper", hint="try the other --mapper"
-    )
+    failed = f"COLMAP's {options.mapper} mapper"
+    _run_apart(settings, hear, log, failed=failed, hint="try the other --mapper")
     if sizes:
-        _check_whole(output)
+        _check_whole(output / "0")
     progress("poses", num_images, num_images)
-    return MapperRun(tuple(sizes))
+    return tuple(sizes)
+
+
+def run_mapper(
+    database: Path,
+    output: Path,
+    options: MapOptions,
+    *,
+    image_path: Path | None = None,
+    placed: Callable[[], None] | None = None,
+) -> list[int]:
+    """Map a database in this process.
+
+    Args:
+        database: COLMAP database with verified matches; pycolmap brings it to its own layout.
+        output: an existing folder; gets a folder for each model, numbered from 0, the model with
+            the most images first: a mapper may make one of two images beside the real one.
+        options: which mapper, and how.
+        image_path: folder of the images; None: the points stay black.
+        placed: called at each image that the incremental mapper places.
+
+    Returns:
+        Images with a pose in each model.
+    """
+    import numpy as np  # noqa: F401, PLC0415 - before pycolmap
+    import pycolmap  # noqa: PLC0415 - after what a process of its own does first
+
+    refine = options.refine_intrinsics
+    if refine is None:
+        refine = not options.forward_motion
+    num_threads = options.num_threads if options.num_threads is not None else -1
+    common = {"random_seed": options.seed, "num_threads": num_threads}
+    pycolmap.set_random_seed(options.seed)
+    each = output / "each"
+    each.mkdir()
+    if options.mapper == "incremental":
+        how = pycolmap.IncrementalPipelineOptions(**common)
+        how.extract_colors = False
+        how.ba_refine_focal_length = refine
+        how.ba_refine_extra_params = refine
+        how.mapper.abs_pose_refine_focal_length = refine
+        how.mapper.abs_pose_refine_extra_params = refine
+        if options.forward_motion:
+            how.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
+        callbacks = {"initial_image_pair_callback": placed, "next_image_callback": placed}
+        models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
+    else:
+        how = pycolmap.GlobalPipelineOptions(**common)
+        how.mapper.bundle_adjustment.refine_focal_length = refine
+        how.mapper.bundle_adjustment.refine_extra_params = refine
+        models = pycolmap.global_mapping(database, each, each, options=how)
+    shutil.rmtree(each)
+    found = sorted(models.values(), key=lambda m: -m.num_reg_images())
+    for number, model in enumerate(found):
+        if image_path is not None:
+            model.extract_colors_for_all_images(image_path)
+        folder = output / str(number)
+        folder.mkdir()
+        model.write_binary(folder)
+    return [model.num_reg_images() for model in found]
 
 
 def adjust_model(
@@ -151,13 +196,13 @@ def _check_whole(model: Path) -> None:
 
 def _run_apart(
     settings: dict[str, Any],
-    told: Callable[[str, str], None] | None,
+    hear: Callable[[str, str], None] | None,
     log: Path,
     *,
     failed: str,
     hint: str,
 ) -> None:
-    """Do what the settings say in a process; `told` gets the words and values it prints."""
+    """Do what the settings say in a process; `hear` gets the words and values it prints."""
     # The package is found where this one was.
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *sys.path])
     done, reason = False, ""
@@ -178,19 +223,19 @@ def _run_apart(
                 done = word == "done"
                 if word == "failed":
                     reason = f" ({value})"
-                elif told is not None:
-                    told(word, value)
+                elif hear is not None:
+                    hear(word, value)
         except BaseException:
             process.kill()
             raise
     if not done:
         raise ModelError(
-            f"{failed} stopped with status {process.returncode}{reason}: {log} tells where; {hint}"
+            f"{failed} stopped with status {process.returncode}{reason}: {log} says where; {hint}"
         )
 
 
 def run_child(settings: dict[str, Any]) -> None:
-    """Map or adjust in this process; what happens is told on standard output."""
+    """Map or adjust in this process; what happens is said on standard output."""
     # The interrupt of a terminal reaches the parent, too, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = os.fdopen(os.dup(1), "w", buffering=1)
@@ -200,56 +245,24 @@ def run_child(settings: dict[str, Any]) -> None:
     import pycolmap  # noqa: PLC0415
 
     pycolmap.set_random_seed(settings["seed"])
+    image_path = settings.get("image_path")
     try:
         if settings["task"] == "adjustment":
             _adjust(settings)
         else:
-            _map(settings, channel)
+            found = run_mapper(
+                Path(settings["database"]),
+                Path(settings["model"]),
+                MapOptions(**settings["options"]),
+                image_path=Path(image_path) if image_path is not None else None,
+                placed=lambda: print("placed", file=channel),
+            )
+            print("models", json.dumps(found), file=channel)
     except Exception as error:
         channel.write(f"failed {' '.join(str(error).split())}\n")
         raise
     channel.write("done\n")
     channel.close()
-
-
-def _map(settings: dict[str, Any], channel: TextIO) -> None:
-    import pycolmap  # noqa: PLC0415 - after what run_child does first
-
-    def placed() -> None:
-        channel.write("placed\n")
-
-    database, output = settings["database"], settings["model"]
-    each = Path(output) / "each"
-    each.mkdir()
-    refine = settings["refine_intrinsics"]
-    common = {"random_seed": settings["seed"], "num_threads": settings["num_threads"]}
-    if settings["task"] == "incremental":
-        options = pycolmap.IncrementalPipelineOptions(**common)
-        options.extract_colors = False
-        options.ba_refine_focal_length = refine
-        options.ba_refine_extra_params = refine
-        options.mapper.abs_pose_refine_focal_length = refine
-        options.mapper.abs_pose_refine_extra_params = refine
-        if settings["forward_motion"]:
-            options.mapper.init_max_forward_motion = 1.0
-        models = pycolmap.incremental_mapping(
-            database,
-            each,
-            each,
-            options=options,
-            initial_image_pair_callback=placed,
-            next_image_callback=placed,
-        )
-    else:
-        options = pycolmap.GlobalPipelineOptions(**common)
-        options.mapper.bundle_adjustment.refine_focal_length = refine
-        options.mapper.bundle_adjustment.refine_extra_params = refine
-        models = pycolmap.global_mapping(database, each, each, options=options)
-    found = sorted(models.values(), key=lambda m: -m.num_reg_images())
-    if found:
-        found[0].write_binary(output)
-    shutil.rmtree(each)
-    channel.write(f"models {json.dumps([m.num_reg_images() for m in found])}\n")
 
 
 def _adjust(settings: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from colmap_av1.model.mapper import adjust_model, map_poses
 from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run
 from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.model.triangulate import TriangulatedPoints
-from colmap_av1.options import DensityOptions, ReconstructOptions, TriangulateOptions
+from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.progress import Progress, no_progress
@@ -44,40 +44,41 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
     mapper = mapping.mapper
     if mapper == "auto":
         mapper = "incremental" if matched.facts["guessed"] else "global"
-    refine = _refines_intrinsics(options)
+    how = MapOptions(
+        mapper=mapper,
+        forward_motion=forward,
+        refine_intrinsics=_refines_intrinsics(options),
+        seed=options.match.verify.seed,
+        num_threads=mapping.mapper_threads,
+    )
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("poses"):
             # pycolmap brings a database to its own layout.
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
-            mapped = map_poses(
+            sizes = map_poses(
                 copy,
                 partial / "poses",
-                mapper=mapper,
-                refine_intrinsics=refine,
-                forward_motion=forward,
-                seed=options.match.verify.seed,
-                num_threads=mapping.mapper_threads,
+                how,
+                image_path=None,
                 log=run.stages / "mapper.log",
                 num_images=num_images,
                 progress=progress,
             )
-        if max(mapped.num_images, default=0) < LEAST_IMAGES:
+        if max(sizes, default=0) < LEAST_IMAGES:
             raise ModelError(_why_no_start(matched.facts, mapper))
         return {
-            "num_registered": mapped.num_images[0],
-            "other_models": [n for n in mapped.num_images[1:] if n >= LEAST_IMAGES],
+            "num_registered": sizes[0],
+            "other_models": [n for n in sizes[1:] if n >= LEAST_IMAGES],
             "mapper": mapper,
-            "poses": "poses",
+            "poses": "poses/0",
         }
 
-    how = (mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
-    given = (mapper, refine, forward, *how)
     return run_stage(
         run.stages,
         "poses",
-        [matched.key, given],
+        [matched.key, how, pycolmap.__version__],
         into=run.stages,
         products=["poses"],
         make=make,

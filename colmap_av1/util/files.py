@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from colmap_av1.errors import OptionError
+
 try:
     import fcntl
 except ImportError:  # there is none on Windows
@@ -50,6 +52,20 @@ def whole_folder(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_new_folder(path: Path) -> None:
+    """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
+
+    Raises:
+        OptionError: it is there and not empty, or nothing can be made where it is to be.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise OptionError(f"{path}: is there and not empty: give a new folder")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise OptionError(f"{path}: cannot be made in {above}: give another folder")
+    remove_leftovers(path.parent, path.name)
 
 
 def _partial(path: Path) -> Path:

@@ -27,13 +27,13 @@ from colmap_av1 import (
     ColmapAv1Error,
     EncodeError,
     EncodeOptions,
+    MapOptions,
     build_tracks,
     read_motion,
 )
 from colmap_av1.evaluate import (
-    MapperSettings,
     epipolar_errors,
-    map_database,
+    measure_mapper,
     model_figures,
     prepare_footage,
     run_frontend,
@@ -117,8 +117,8 @@ def measure_clip(
         params = ",".join(map(str, material.camera.params))
         camera = CameraOptions(camera_model=material.camera.model.name, camera_params=params)
     how = {"num_frames": material.num_frames, "image_step": case.image_step, "camera": camera}
-    mapper = MapperSettings(
-        fixed_intrinsics=material.camera is not None, forward_motion=case.forward_motion
+    mapper = MapOptions(
+        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
     )
     truth = ruler.known_truth(material)
     if truth.poses is None:
@@ -135,7 +135,7 @@ def measure_clip(
             stream, encoding = encoded(source, where / "stream", setting)
             footage = prepare_footage(stream, where / "footage", **how)
             sparse = run_frontend("av1-sparse", footage, where / "sparse")
-            mapped = map_database(sparse.database, footage.image_path, where / "model", mapper)
+            mapped = measure_mapper(sparse.database, footage.image_path, where / "model", mapper)
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {name}: {error}", markup=False)
             continue

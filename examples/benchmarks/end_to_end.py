@@ -39,6 +39,7 @@ from colmap_av1 import (
     ColmapAv1Error,
     DensifyOptions,
     ImageOptions,
+    MapOptions,
     MatchOptions,
     ReconstructOptions,
     densify,
@@ -48,9 +49,8 @@ from colmap_av1.evaluate import (
     Footage,
     FrontendRun,
     MapperRun,
-    MapperSettings,
     Measured,
-    map_database,
+    measure_mapper,
     model_figures,
     model_poses,
     pose_errors,
@@ -152,8 +152,8 @@ def measure_case(
         image_step=case.image_step,
         camera=camera,
     )
-    settings = MapperSettings(
-        fixed_intrinsics=material.camera is not None, forward_motion=case.forward_motion
+    settings = MapOptions(
+        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
     )
     truth = known_truth(material)
     if truth.poses is None:
@@ -173,11 +173,11 @@ def measure_case(
         made = step_of(run_measured(run_reconstruct, footage, case, where / "dense", log=log))
         add("reconstruct: dense model", made, where / "dense" / "sparse" / "0")
         sift = step_of_frontend(run_frontend("sift-sequential", footage, where / "sift"))
-        mapped = map_database(
+        mapped = measure_mapper(
             where / "sift" / "database.db", footage.image_path, where / "sift-model", settings
         )
         ours = step_of_frontend(run_frontend("av1", footage, where / "match"))
-        our_model = map_database(
+        our_model = measure_mapper(
             where / "match" / "database.db", footage.image_path, where / "match-model", settings
         )
         add(SIFT_DATABASE, sift)

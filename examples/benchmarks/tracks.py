@@ -32,6 +32,7 @@ from colmap_av1 import (
     CameraOptions,
     ColmapAv1Error,
     DensifyOptions,
+    MapOptions,
     MatchOptions,
     RefineOptions,
     Tracks,
@@ -42,7 +43,6 @@ from colmap_av1.evaluate import (
     Footage,
     FrontendRun,
     MapperRun,
-    MapperSettings,
     ModelFigures,
     PoseErrors,
     TrackStatistics,
@@ -50,7 +50,7 @@ from colmap_av1.evaluate import (
     densify_model,
     epipolar_errors,
     exact_errors,
-    map_database,
+    measure_mapper,
     model_figures,
     model_poses,
     pose_errors,
@@ -220,8 +220,8 @@ def measure_case(
         image_step=case.image_step,
         camera=intrinsics,
     )
-    settings = MapperSettings(
-        fixed_intrinsics=material.camera is not None, forward_motion=case.forward_motion
+    settings = MapOptions(
+        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
     )
     truth = known_truth(material)
     if mapping and truth.geometry is None:
@@ -241,7 +241,7 @@ def measure_case(
             mapper = dense = None
             if mapping:
                 where = folder / f"{name}-model"
-                mapper = map_database(run.database, given.image_path, where, settings)
+                mapper = measure_mapper(run.database, given.image_path, where, settings)
                 if mapper.model is not None and name in ALL_TRACKS:
                     where = folder / f"{name}-all-tracks"
                     made = densify_model(mapper.model, footage, where, ALL_TRACKS[name])
@@ -348,14 +348,12 @@ def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
     return Truth(geometry, truth.poses, f"true poses; epipolar error against {REFERENCE}'s model")
 
 
-def reference_model(
-    footage: Footage, folder: Path, settings: MapperSettings, console: Console
-) -> Any:
+def reference_model(footage: Footage, folder: Path, settings: MapOptions, console: Console) -> Any:
     """The model that stands for the truth where that is not known."""
     console.print(f"{folder.name}: {REFERENCE} as the reference", markup=False)
     run = run_frontend(REFERENCE, footage, folder / REFERENCE)
     where = folder / f"{REFERENCE}-model"
-    mapper = map_database(run.database, footage.image_path, where, settings)
+    mapper = measure_mapper(run.database, footage.image_path, where, settings)
     if mapper.model is None:
         raise ColmapAv1Error(f"{REFERENCE} makes no model, so there is no reference: see {where}")
     return read_model(mapper.model)

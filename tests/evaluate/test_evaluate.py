@@ -16,10 +16,9 @@ from conftest import PROJECT
 from colmap_av1 import build_tracks, match, read_motion
 from colmap_av1.errors import DatabaseError, EvaluationError, OptionError, VideoError
 from colmap_av1.evaluate import (
-    MapperSettings,
     database_tracks,
     densify_model,
-    map_database,
+    measure_mapper,
     model_figures,
     model_poses,
     pose_errors,
@@ -29,7 +28,7 @@ from colmap_av1.evaluate import (
     track_statistics,
 )
 from colmap_av1.evaluate.resume import kept
-from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, TrackOptions
+from colmap_av1.options import CameraOptions, DensityOptions, MapOptions, MatchOptions, TrackOptions
 
 EXAMPLES = PROJECT / "examples"
 
@@ -216,11 +215,10 @@ def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     assert statistics.num_tracks > 1000
     assert statistics.coverage[0] > 0.5
 
-    settings = MapperSettings(fixed_intrinsics=True)
-    mapper = map_database(run.database, scene_footage.image_path, tmp_path / "model", settings)
-    assert (
-        map_database(run.database, scene_footage.image_path, tmp_path / "model", settings) == mapper
-    )
+    settings = MapOptions(refine_intrinsics=False)
+    given = (run.database, scene_footage.image_path, tmp_path / "model", settings)
+    mapper = measure_mapper(*given)
+    assert measure_mapper(*given) == mapper
     figures = model_figures(mapper.model)
     assert figures.num_registered == 8
     assert figures.num_points > 1000
@@ -250,7 +248,7 @@ def test_a_database_that_makes_no_model(clip, tmp_path):
     run = run_frontend("sift-exhaustive", footage, tmp_path / "run")
     with pycolmap.Database.open(run.database) as database:
         database.clear_two_view_geometries()
-    mapper = map_database(run.database, footage.image_path, tmp_path / "model")
+    mapper = measure_mapper(run.database, footage.image_path, tmp_path / "model")
     assert (mapper.model, mapper.num_models) == (None, 0)
 
 

@@ -13,19 +13,17 @@ from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.model import mapper as mapper_module
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import MapOptions, Mapper
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.progress import Progress, no_progress
 
 
-def run_mapper(folder: Path, database: Path, mapper: str, progress: Progress) -> None:
+def run_mapper(folder: Path, database: Path, mapper: Mapper, progress: Progress) -> None:
     mapper_module.map_poses(
         database,
         folder / "poses",
-        mapper=mapper,
-        refine_intrinsics=True,
-        forward_motion=False,
-        seed=0,
-        num_threads=1,
+        MapOptions(mapper=mapper, num_threads=1),
+        image_path=None,
         log=folder / "log",
         num_images=NUM_IMAGES,
         progress=progress,
@@ -41,12 +39,12 @@ def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> Non
     copy.write_bytes(made.database.read_bytes())
     with pytest.raises(KeyboardInterrupt):
         run_mapper(tmp_path, copy, "incremental", interrupt)
-    assert not list((tmp_path / "poses").glob("*.bin"))
+    assert not list((tmp_path / "poses").rglob("*.bin"))
 
 
 def test_mapper_that_fails(tmp_path: Path) -> None:
     (tmp_path / "no.db").write_bytes(b"no database")
-    with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log tells where"):
+    with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log says where"):
         run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
     assert (tmp_path / "log").stat().st_size > 0
 

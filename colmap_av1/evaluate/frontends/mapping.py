@@ -1,4 +1,4 @@
-"""COLMAP's incremental mapper on a database, dense points on its poses, figures of models."""
+"""COLMAP's mappers on the database of a front-end, dense points on its poses, measured."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
 from colmap_av1.densify import densify
@@ -15,22 +14,8 @@ from colmap_av1.evaluate.frontends.footage import Footage, frame_list
 from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.model.colmap_model import posed_images, read_model
-from colmap_av1.options import DensifyOptions, ImageOptions
-
-
-@dataclass(frozen=True)
-class MapperSettings:
-    """How a database is mapped.
-
-    Attributes:
-        fixed_intrinsics: keep the intrinsics of the database.
-        forward_motion: start with images that lie behind each other if need be.
-        seed: the mapper's random seed.
-    """
-
-    fixed_intrinsics: bool = False
-    forward_motion: bool = False
-    seed: int = 0
+from colmap_av1.model.mapper import run_mapper
+from colmap_av1.options import DensifyOptions, ImageOptions, MapOptions
 
 
 @dataclass(frozen=True)
@@ -52,49 +37,30 @@ class MapperRun:
     peak_memory: int | None
 
 
-@dataclass(frozen=True)
-class ModelFigures:
-    """Figures of a model.
-
-    Attributes:
-        num_registered: images with a pose.
-        num_points: 3D points.
-        mean_track_length: images that see a point, on average.
-        mean_error: mean of the points' reprojection errors in pixels, as COLMAP states it.
-        median_error: their median.
-        focal_length: in pixels, on average over the cameras.
-    """
-
-    num_registered: int
-    num_points: int
-    mean_track_length: float
-    mean_error: float
-    median_error: float
-    focal_length: float
-
-
-def map_database(
-    database: Path, image_path: Path, folder: Path, settings: MapperSettings | None = None
+def measure_mapper(
+    database: Path, image_path: Path, folder: Path, options: MapOptions | None = None
 ) -> MapperRun:
-    """Map a database with pycolmap's incremental mapper; a finished run is not repeated.
+    """Map a database in a process whose time and memory are measured.
+
+    A finished run is not repeated.
 
     Args:
         database: COLMAP database with verified matches; a copy of it is mapped.
         image_path: folder of its images, for the points' colours.
-        folder: gets the model, `log.txt` and the figures.
-        settings: how to map; the defaults of MapperSettings if None.
+        folder: gets the models, `log.txt` and the figures.
+        options: which mapper, and how; the defaults of MapOptions if None.
 
     Raises:
         EvaluationError: the mapper failed.
     """
-    settings = settings if settings is not None else MapperSettings()
+    options = options if options is not None else MapOptions()
     model = folder / "model"
 
     def work() -> dict[str, Any]:
         # pycolmap brings a database to its own layout.
         copy = folder / "mapped.db"
         shutil.copyfile(database, copy)
-        measured = run_measured(_map, copy, image_path, model, settings, log=folder / "log.txt")
+        measured = run_measured(_map, copy, image_path, model, options, log=folder / "log.txt")
         copy.unlink()
         return {
             "num_models": measured.result,
@@ -103,9 +69,9 @@ def map_database(
             "peak_memory": measured.peak_memory,
         }
 
-    key = (content_of(database), asdict(settings), pycolmap.__version__)
+    key = (content_of(database), asdict(options), pycolmap.__version__)
     result = kept(folder, key, work)
-    return MapperRun(model if result["num_models"] else None, **result)
+    return MapperRun(model / "0" if result["num_models"] else None, **result)
 
 
 def densify_model(
@@ -146,40 +112,9 @@ def densify_model(
     return MapperRun(output, **kept(folder, key, work))
 
 
-def model_figures(model: Any) -> ModelFigures:
-    """Figures of a pycolmap.Reconstruction, or of the model in a folder.
-
-    Raises:
-        ModelError: the folder holds no readable model with poses.
-    """
-    if isinstance(model, Path):
-        model = read_model(model)
-    errors = np.array([p.error for p in model.points3D.values()], dtype=np.float64)
-    focal_lengths = [camera.mean_focal_length() for camera in model.cameras.values()]
-    return ModelFigures(
-        num_registered=model.num_reg_images(),
-        num_points=len(errors),
-        mean_track_length=model.compute_mean_track_length(),
-        mean_error=float(errors.mean()) if len(errors) else float("nan"),
-        median_error=float(np.median(errors)) if len(errors) else float("nan"),
-        focal_length=float(np.mean(focal_lengths)),
-    )
-
-
-def _map(database: Path, image_path: Path, output: Path, settings: MapperSettings) -> int:
-    pycolmap.set_random_seed(settings.seed)
-    options = pycolmap.IncrementalPipelineOptions(random_seed=settings.seed)
-    if settings.fixed_intrinsics:
-        options.ba_refine_focal_length = False
-        options.ba_refine_extra_params = False
-    if settings.forward_motion:
-        options.mapper.init_max_forward_motion = 1.0
+def _map(database: Path, image_path: Path, output: Path, options: MapOptions) -> int:
     output.mkdir()
-    models = pycolmap.incremental_mapping(database, image_path, output, options=options)
-    if models:
-        # The mapper may leave a bogus model of two images beside the real one.
-        max(models.values(), key=lambda m: m.num_reg_images()).write(output)
-    return len(models)
+    return len(run_mapper(database, output, options, image_path=image_path))
 
 
 def _densify(model: Path, video: Path, output: Path, options: DensifyOptions) -> None:

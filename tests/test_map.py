@@ -1,0 +1,181 @@
+"""A database mapped by COLMAP's mappers, through the function and the command."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from dense_scene import NUM_IMAGES, Truth
+
+from colmap_av1 import (
+    DatabaseError,
+    ImageError,
+    MapOptions,
+    MapReport,
+    ModelError,
+    OptionError,
+    map_database,
+)
+from colmap_av1.cli import main
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import Mapper
+from colmap_av1.reconstruct import ReconstructReport
+
+
+@pytest.fixture(scope="module")
+def database(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("mapped") / "a.db"
+    shutil.copyfile(made.database, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def images(made: ReconstructReport) -> Path:
+    return made.output / "images"
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_model(database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_path: Path) -> None:
+    before = database.read_bytes()
+    placed: list[tuple[str, int, int | None]] = []
+    report = map_database(
+        database,
+        images,
+        tmp_path / "model",
+        options=MapOptions(mapper=mapper),
+        progress=lambda *told: placed.append(told),
+    )
+    assert database.read_bytes() == before
+    assert sorted(p.name for p in database.parent.iterdir()) == ["a.db"]
+    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == ["0", "mapper.log"]
+    assert (report.num_images, report.num_registered) == (NUM_IMAGES, (NUM_IMAGES,))
+    assert placed[-1] == ("poses", NUM_IMAGES, NUM_IMAGES)
+    model = read_model(report.model)
+    assert report.figures.num_points == model.num_points3D() > 300
+    assert report.figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())
+    assert pose_errors(model_poses(model, 60), truth.cam_from_world).rotation < 1
+    # The clip is in colour.
+    colours = np.array([point.color for point in model.points3D.values()])
+    assert 50 < colours.mean() < 200
+    assert colours.std() > 10
+
+
+def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) -> None:
+    """Where the images fall apart into two models, folder 0 is the larger one."""
+    apart = tmp_path / "apart.db"
+    shutil.copyfile(database, apart)
+    num_first = 7
+    with sqlite3.connect(apart) as connection:
+        ids = [row[0] for row in connection.execute("SELECT image_id FROM images ORDER BY name")]
+        for table in ("matches", "two_view_geometries"):
+            connection.executemany(
+                f"DELETE FROM {table} WHERE pair_id = ?",
+                [(2147483647 * i + j,) for i in ids[:num_first] for j in ids[num_first:]],
+            )
+    connection.close()
+    options = MapOptions(mapper="global")
+    report = map_database(apart, images, tmp_path / "model", options=options)
+    sizes = [read_model(tmp_path / "model" / str(i)).num_reg_images() for i in range(2)]
+    assert report.num_registered == tuple(sizes) == (NUM_IMAGES - num_first, num_first)
+
+
+def test_intrinsics_are_kept_in_forward_motion(
+    database: Path, images: Path, tmp_path: Path
+) -> None:
+    def focal_lengths(report: MapReport) -> tuple[float, float]:
+        given = pycolmap.Database.open(copy)
+        (camera,) = given.read_all_cameras()
+        given.close()
+        return camera.mean_focal_length(), report.figures.focal_length
+
+    copy = tmp_path / "copy.db"
+    shutil.copyfile(database, copy)
+    forward = MapOptions(forward_motion=True)
+    given, kept = focal_lengths(map_database(database, images, tmp_path / "a", options=forward))
+    assert kept == given
+    given, refined = focal_lengths(map_database(database, images, tmp_path / "b"))
+    assert refined != given
+
+
+def test_bad_input(database: Path, images: Path, tmp_path: Path) -> None:
+    output = tmp_path / "model"
+    with pytest.raises(DatabaseError, match="no such file"):
+        map_database(tmp_path / "no.db", images, output)
+    (tmp_path / "empty.db").write_bytes(b"")
+    with pytest.raises(DatabaseError, match="is an empty file"):
+        map_database(tmp_path / "empty.db", images, output)
+    unmatched = tmp_path / "unmatched.db"
+    shutil.copyfile(database, unmatched)
+    with sqlite3.connect(unmatched) as connection:
+        connection.execute("DELETE FROM two_view_geometries")
+    connection.close()
+    with pytest.raises(DatabaseError, match="no pair has 15 verified matches"):
+        map_database(unmatched, images, output)
+    with pytest.raises(ImageError, match="no such folder"):
+        map_database(database, tmp_path / "nowhere", output)
+    (tmp_path / "some").mkdir()
+    with pytest.raises(ImageError, match=r"frame_000000.png: is missing, but the database lists"):
+        map_database(database, tmp_path / "some", output)
+    for path in images.iterdir():
+        cv2.imwrite(str(tmp_path / "some" / path.name), np.zeros((8, 16, 3), np.uint8))
+    with pytest.raises(ImageError, match="is 16x8, but its camera in the database 640x360"):
+        map_database(database, tmp_path / "some", output)
+    for options, what in (
+        (MapOptions(mapper="auto"), "give incremental or global"),  # type: ignore[arg-type]
+        (MapOptions(mapper="global", forward_motion=True), "give --mapper incremental"),
+        (MapOptions(seed=-1), "give 0 or more"),
+        (MapOptions(num_threads=0), "give 1 or more"),
+    ):
+        with pytest.raises(OptionError, match=what):
+            map_database(database, images, output, options=options)
+    assert not list(tmp_path.glob("*model*"))
+    with pytest.raises(OptionError, match="is there and not empty"):
+        map_database(database, images, tmp_path / "some")
+
+
+def test_no_model(database: Path, images: Path, tmp_path: Path) -> None:
+    """Pairs enough for a start, but none wide enough: nothing is left but the log."""
+    flat = tmp_path / "flat.db"
+    shutil.copyfile(database, flat)
+    with sqlite3.connect(flat) as connection:
+        # No pair has the inliers to start with, nor the images the points to follow.
+        connection.execute("DELETE FROM two_view_geometries WHERE rows > 100")
+        connection.execute("DELETE FROM matches WHERE rows > 100")
+        left = connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
+    connection.close()
+    assert left > 0
+    with pytest.raises(ModelError, match="finds no model, its images share too few"):
+        map_database(flat, images, tmp_path / "model")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["flat.db", "model.log"]
+
+
+def test_interrupt_leaves_nothing(database: Path, images: Path, tmp_path: Path) -> None:
+    def interrupt(stage: str, done: int, total: int | None) -> None:
+        if done >= 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_database(database, images, tmp_path / "model", progress=interrupt)
+    assert [p.name for p in tmp_path.iterdir()] == ["model.log"]
+
+
+def test_command(
+    database: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["map", "--database_path", str(database), "--image_path", str(images)]
+    words += ["--output_path", str(tmp_path / "model")]
+    assert main(words) == 0
+    rows = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
+    assert rows["images registered"] == f"{NUM_IMAGES} of {NUM_IMAGES}"
+    assert int(rows["points"]) > 300
+    assert rows["model written to"] == str(tmp_path / "model" / "0")
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("colmap-av1: error: ")
+    assert error.count("\n") == 1
