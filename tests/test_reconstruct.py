@@ -355,7 +355,7 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     options = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)
     assert plain.resumed == ("tracks", "matches", "poses")
-    mapped = read_model(plain.output / ".stages" / "poses")
+    mapped = read_model(plain.output / ".stages" / "poses" / "0")
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
     np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
     adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
