@@ -40,7 +40,7 @@ struct BlockInfo {
   bool interintra = false;
   bool use_intrabc = false;
   std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
-  std::int32_t warp_index = -1;      // index of the frame's LocalWarp, -1 without a valid one
+  std::int32_t warp_index = -1;  // index of the frame's LocalWarp, -1 without a valid one
   std::uint16_t mi_row = 0;
   std::uint16_t mi_col = 0;
   std::uint8_t uv_mode = kAbsent;
@@ -65,8 +65,8 @@ struct BlockInfo {
   std::uint8_t num_samples = 0;
   std::int16_t current_q_index = 0;
   std::array<std::int8_t, FRAME_LF_COUNT> delta_lf{};
-  std::int32_t local_warp = -1;      // index of the tile's LocalWarp, -1 without
-  std::int32_t num_coefficients = 0; // coded positions (eob) of all transform blocks
+  std::int32_t local_warp = -1;       // index of the tile's LocalWarp, -1 without
+  std::int32_t num_coefficients = 0;  // coded positions (eob) of all transform blocks
 };
 
 // LocalWarpParams and LocalValid of one block (7.11.3.8)
@@ -91,8 +91,8 @@ struct FrameState {
   int subsampling_x = 1;
   int subsampling_y = 1;
   CdfContext cdfs;
-  std::vector<SavedMotion> saved_motion;   // [mi_rows / 2][mi_cols / 2]
-  std::vector<std::uint8_t> segment_ids;   // [mi_rows][mi_cols]; empty: all 0
+  std::vector<SavedMotion> saved_motion;  // [mi_rows / 2][mi_cols / 2]
+  std::vector<std::uint8_t> segment_ids;  // [mi_rows][mi_cols]; empty: all 0
 };
 
 // An entry of the projected motion field (7.9): the saved vector and the distance it covers;
@@ -118,14 +118,14 @@ inline BlockBuffer make_block_buffer(std::size_t size) {
 struct FrameContext {
   const SequenceHeader* seq = nullptr;
   const FrameHeader* header = nullptr;
-  CdfContext cdfs;                                 // at the start of each tile
-  std::vector<BlockInfo*> grid;                    // [mi_rows][mi_cols], null: not decoded yet
-  BlockBuffer blocks;                              // room for as many as units
+  CdfContext cdfs;               // at the start of each tile
+  std::vector<BlockInfo*> grid;  // [mi_rows][mi_cols], null: not decoded yet
+  BlockBuffer blocks;            // room for as many as units
   std::size_t blocks_capacity = 0;
   std::vector<MotionFieldEntry> motion_field;      // [mi_rows / 2][mi_cols / 2]
   const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0
   std::array<bool, TOTAL_REFS_PER_FRAME> ref_present{};
-  std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};  // is_scaled( )
+  std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};   // is_scaled( )
   std::array<int, TOTAL_REFS_PER_FRAME> ref_distance{};  // this frame's OrderHint less theirs
 
   BlockInfo*& at(int row, int col) {

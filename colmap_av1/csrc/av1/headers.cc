@@ -113,8 +113,8 @@ void FrameHeaderReader::uncompressed_header() {
   if (seq_.frame_id_numbers_present_flag) {
     id_len = seq_.additional_frame_id_length_minus_1 + seq_.delta_frame_id_length_minus_2 + 3;
   }
-  const bool has_temporal_point = seq_.decoder_model_info_present_flag &&
-                                  !seq_.equal_picture_interval;
+  const bool has_temporal_point =
+      seq_.decoder_model_info_present_flag && !seq_.equal_picture_interval;
   if (seq_.reduced_still_picture_header) {
     h.frame_type = KEY_FRAME;
     h.frame_is_intra = true;
@@ -152,14 +152,12 @@ void FrameHeaderReader::uncompressed_header() {
     }
   }
   h.disable_cdf_update = r.flag();
-  h.allow_screen_content_tools =
-      seq_.seq_force_screen_content_tools == SELECT_SCREEN_CONTENT_TOOLS
-          ? r.flag()
-          : seq_.seq_force_screen_content_tools != 0;
+  h.allow_screen_content_tools = seq_.seq_force_screen_content_tools == SELECT_SCREEN_CONTENT_TOOLS
+                                     ? r.flag()
+                                     : seq_.seq_force_screen_content_tools != 0;
   if (h.allow_screen_content_tools) {
-    h.force_integer_mv = seq_.seq_force_integer_mv == SELECT_INTEGER_MV
-                             ? r.flag()
-                             : seq_.seq_force_integer_mv != 0;
+    h.force_integer_mv =
+        seq_.seq_force_integer_mv == SELECT_INTEGER_MV ? r.flag() : seq_.seq_force_integer_mv != 0;
   }
   if (h.frame_is_intra) h.force_integer_mv = true;
   if (seq_.frame_id_numbers_present_flag) {
@@ -224,8 +222,7 @@ void FrameHeaderReader::uncompressed_header() {
       if (!h.frame_refs_short_signaling) h.ref_frame_idx[i] = r.literal(3);
       if (seq_.frame_id_numbers_present_flag) {
         const int delta_frame_id = r.literal(seq_.delta_frame_id_length_minus_2 + 2) + 1;
-        const int expected =
-            (h.current_frame_id + (1 << id_len) - delta_frame_id) % (1 << id_len);
+        const int expected = (h.current_frame_id + (1 << id_len) - delta_frame_id) % (1 << id_len);
         const ReferenceInfo& ref = refs_[h.ref_frame_idx[i]];
         if (ref.frame_id != expected || !ref.valid) {
           throw BitstreamError("reference has not the frame id that the header expects");
@@ -242,8 +239,7 @@ void FrameHeaderReader::uncompressed_header() {
     h.allow_high_precision_mv = h.force_integer_mv ? false : r.flag();
     h.interpolation_filter = r.flag() ? SWITCHABLE : r.literal(2);
     h.is_motion_mode_switchable = r.flag();
-    h.use_ref_frame_mvs =
-        h.error_resilient_mode || !seq_.enable_ref_frame_mvs ? false : r.flag();
+    h.use_ref_frame_mvs = h.error_resilient_mode || !seq_.enable_ref_frame_mvs ? false : r.flag();
     for (int i = 0; i < REFS_PER_FRAME; ++i) {
       const int ref_frame = LAST_FRAME + i;
       const int hint = refs_[h.ref_frame_idx[i]].order_hint;
@@ -322,8 +318,8 @@ void FrameHeaderReader::set_frame_refs(int last_frame_idx, int gold_frame_idx) {
     for (int i = 0; i < NUM_REF_FRAMES; ++i) {
       const bool backward = hints[i] >= current;
       if (used[i] || backward == (pick == Pick::kLatestForward)) continue;
-      const bool better =
-          ref < 0 || (pick == Pick::kEarliestBackward ? hints[i] < hints[ref] : hints[i] >= hints[ref]);
+      const bool better = ref < 0 || (pick == Pick::kEarliestBackward ? hints[i] < hints[ref]
+                                                                      : hints[i] >= hints[ref]);
       if (better) ref = i;
     }
     return ref;
@@ -472,8 +468,7 @@ void FrameHeaderReader::tile_info() {
       starts[i] = end;
       return i;
     };
-    h.tile_cols =
-        read_sizes(sb_cols, max_tile_width_sb, MAX_TILE_COLS, h.mi_cols, h.mi_col_starts);
+    h.tile_cols = read_sizes(sb_cols, max_tile_width_sb, MAX_TILE_COLS, h.mi_cols, h.mi_col_starts);
     h.tile_cols_log2 = tile_log2(1, h.tile_cols);
     max_tile_area_sb = sb_rows * sb_cols;
     if (min_log2_tiles > 0) max_tile_area_sb >>= min_log2_tiles + 1;
@@ -579,8 +574,8 @@ void FrameHeaderReader::loop_filter_params() {
     h.loop_filter_level[2] = r.literal(6);
     h.loop_filter_level[3] = r.literal(6);
   }
-  r.literal(3);                  // loop_filter_sharpness
-  if (r.flag() && r.flag()) {    // loop_filter_delta_enabled, loop_filter_delta_update
+  r.literal(3);                // loop_filter_sharpness
+  if (r.flag() && r.flag()) {  // loop_filter_delta_enabled, loop_filter_delta_update
     for (auto& delta : h.loop_filter_ref_deltas) {
       if (r.flag()) delta = static_cast<std::int8_t>(r.su(7));
     }
@@ -596,8 +591,8 @@ void FrameHeaderReader::cdef_params() {
   r.literal(2);  // cdef_damping_minus_3
   h.cdef_bits = r.literal(2);
   for (int i = 0; i < (1 << h.cdef_bits); ++i) {
-    r.literal(6);                            // cdef_y_pri_strength, cdef_y_sec_strength
-    if (seq_.num_planes > 1) r.literal(6);   // cdef_uv_pri_strength, cdef_uv_sec_strength
+    r.literal(6);                           // cdef_y_pri_strength, cdef_y_sec_strength
+    if (seq_.num_planes > 1) r.literal(6);  // cdef_uv_pri_strength, cdef_uv_sec_strength
   }
 }
 
@@ -622,8 +617,7 @@ void FrameHeaderReader::lr_params() {
     lr_unit_shift += r.bit();
   }
   h.loop_restoration_size[0] = RESTORATION_TILESIZE_MAX >> (2 - lr_unit_shift);
-  const int lr_uv_shift =
-      seq_.subsampling_x && seq_.subsampling_y && uses_chroma_lr ? r.bit() : 0;
+  const int lr_uv_shift = seq_.subsampling_x && seq_.subsampling_y && uses_chroma_lr ? r.bit() : 0;
   h.loop_restoration_size[1] = h.loop_restoration_size[0] >> lr_uv_shift;
   h.loop_restoration_size[2] = h.loop_restoration_size[1];
 }
@@ -674,8 +668,8 @@ void FrameHeaderReader::global_motion_params() {
                                 : reference(h.primary_ref_frame).gm_params;
   for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
     int type = IDENTITY;
-    if (r.flag()) {                                                   // is_global
-      type = r.flag() ? ROTZOOM : r.flag() ? TRANSLATION : AFFINE;    // is_rot_zoom, is_translation
+    if (r.flag()) {                                                 // is_global
+      type = r.flag() ? ROTZOOM : r.flag() ? TRANSLATION : AFFINE;  // is_rot_zoom, is_translation
     }
     h.gm_type[ref] = type;
     if (type >= ROTZOOM) {
@@ -738,15 +732,16 @@ int FrameHeaderReader::decode_signed_subexp_with_ref(int low, int high, int refe
     return v & 1 ? center - ((v + 1) >> 1) : center + (v >> 1);
   };
   const int v = decode_subexp(mx);
-  const int x = (rr << 1) <= mx ? inverse_recenter(rr, v) : mx - 1 - inverse_recenter(mx - 1 - rr, v);
+  const int x =
+      (rr << 1) <= mx ? inverse_recenter(rr, v) : mx - 1 - inverse_recenter(mx - 1 - rr, v);
   return x + low;
 }
 
 // 5.9.30 Film grain params syntax; the values do not affect parsing and are dropped
 void FrameHeaderReader::film_grain_params() {
   if (!seq_.film_grain_params_present || (!h.show_frame && !h.showable_frame)) return;
-  if (!r.flag()) return;  // apply_grain
-  r.f(16);                // grain_seed
+  if (!r.flag()) return;                           // apply_grain
+  r.f(16);                                         // grain_seed
   if (h.frame_type == INTER_FRAME && !r.flag()) {  // update_grain
     r.literal(3);                                  // film_grain_params_ref_idx
     return;

@@ -168,9 +168,9 @@ struct FrameHeader {
 
 // What a header may refer to of the frame in one reference slot (section 7.20).
 struct ReferenceInfo {
-  bool valid = false;      // RefValid
-  int frame_id = 0;        // RefFrameId
-  int order_hint = 0;      // RefOrderHint
+  bool valid = false;                   // RefValid
+  int frame_id = 0;                     // RefFrameId
+  int order_hint = 0;                   // RefOrderHint
   const FrameHeader* header = nullptr;  // null for an empty slot
   int bit_depth = 0;
   int subsampling_x = 0;

@@ -67,8 +67,7 @@ void TileParser::intra_segment_id() {
 void TileParser::read_segment_id() {
   const int prev_u = above_ ? above_->segment_id : -1;
   const int prev_l = left_ ? left_->segment_id : -1;
-  const int prev_ul =
-      above_ && left_ ? frame_->at(b_->mi_row - 1, b_->mi_col - 1)->segment_id : -1;
+  const int prev_ul = above_ && left_ ? frame_->at(b_->mi_row - 1, b_->mi_col - 1)->segment_id : -1;
   int pred;
   if (prev_u == -1) {
     pred = prev_l == -1 ? 0 : prev_l;
@@ -168,9 +167,9 @@ int TileParser::predicted_segment_id() const {
   const int cols = std::min(header_->mi_cols - b_->mi_col, bw4_);
   int seg = 7;
   for (int y = 0; y < rows; ++y) {
-    const std::uint8_t* ids =
-        frame_->prev_segment_ids +
-        static_cast<std::ptrdiff_t>(b_->mi_row + y) * header_->mi_cols + b_->mi_col;
+    const std::uint8_t* ids = frame_->prev_segment_ids +
+                              static_cast<std::ptrdiff_t>(b_->mi_row + y) * header_->mi_cols +
+                              b_->mi_col;
     for (int x = 0; x < cols; ++x) seg = std::min<int>(seg, ids[x]);
   }
   return seg;
@@ -227,23 +226,23 @@ void TileParser::intra_block_mode_info() {
 void TileParser::intra_modes_after_y_mode() {
   const bool has_angles = b_->mi_size >= BLOCK_8X8;
   if (has_angles && is_directional_mode(b_->y_mode)) {
-    b_->angle_delta_y = static_cast<std::int8_t>(read(cdf_.angle_delta[b_->y_mode - V_PRED]) -
-                                                 MAX_ANGLE_DELTA);
+    b_->angle_delta_y =
+        static_cast<std::int8_t>(read(cdf_.angle_delta[b_->y_mode - V_PRED]) - MAX_ANGLE_DELTA);
   }
   if (b_->has_chroma) {
     const int width = kBlockWidth[b_->mi_size];
     const int height = kBlockHeight[b_->mi_size];
     const bool cfl_allowed =
-        lossless_ ? kSubsampledSize[b_->mi_size][seq_->subsampling_x][seq_->subsampling_y] ==
-                        BLOCK_4X4
-                  : std::max(width, height) <= 32;
-    b_->uv_mode = static_cast<std::uint8_t>(cfl_allowed
-                                                ? read(cdf_.uv_mode_cfl_allowed[b_->y_mode])
-                                                : read(cdf_.uv_mode_cfl_not_allowed[b_->y_mode]));
+        lossless_
+            ? kSubsampledSize[b_->mi_size][seq_->subsampling_x][seq_->subsampling_y] == BLOCK_4X4
+            : std::max(width, height) <= 32;
+    b_->uv_mode =
+        static_cast<std::uint8_t>(cfl_allowed ? read(cdf_.uv_mode_cfl_allowed[b_->y_mode])
+                                              : read(cdf_.uv_mode_cfl_not_allowed[b_->y_mode]));
     if (b_->uv_mode == UV_CFL_PRED) read_cfl_alphas();
     if (has_angles && is_directional_mode(b_->uv_mode)) {
-      b_->angle_delta_uv = static_cast<std::int8_t>(
-          read(cdf_.angle_delta[b_->uv_mode - V_PRED]) - MAX_ANGLE_DELTA);
+      b_->angle_delta_uv =
+          static_cast<std::int8_t>(read(cdf_.angle_delta[b_->uv_mode - V_PRED]) - MAX_ANGLE_DELTA);
     }
   }
   if (b_->mi_size >= BLOCK_8X8 && kBlockWidth[b_->mi_size] <= 64 &&
@@ -370,8 +369,7 @@ void TileParser::read_interp_filters() {
 // 5.11.27 Read motion mode syntax
 void TileParser::read_motion_mode(bool is_compound) {
   if (b_->skip_mode || !header_->is_motion_mode_switchable || min_block_edge(*b_) < 8) return;
-  if (!header_->force_integer_mv &&
-      (b_->y_mode == GLOBALMV || b_->y_mode == GLOBAL_GLOBALMV) &&
+  if (!header_->force_integer_mv && (b_->y_mode == GLOBALMV || b_->y_mode == GLOBAL_GLOBALMV) &&
       header_->gm_type[b_->ref_frame[0]] > TRANSLATION) {
     return;
   }
@@ -435,8 +433,8 @@ void TileParser::read_compound_type(bool is_compound) {
   if (b_->comp_group_idx == 0) {
     if (seq_->enable_jnt_comp) {
       const auto distance = [&](int list) {
-        return std::abs(seq_->relative_dist(header_->order_hints[b_->ref_frame[list]],
-                                            header_->order_hint));
+        return std::abs(
+            seq_->relative_dist(header_->order_hints[b_->ref_frame[list]], header_->order_hint));
       };
       const int ctx = (distance(0) == distance(1) ? 3 : 0) + context(false);
       b_->compound_idx = read_flag(cdf_.compound_idx[ctx]);

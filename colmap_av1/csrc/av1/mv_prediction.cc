@@ -125,8 +125,7 @@ void TileParser::scan_row(int delta_row, bool is_compound) {
     const int col = b_->mi_col + delta_col + i;
     if (!is_inside(row, col)) break;
     const BlockInfo& candidate = *frame_->at(row, col);
-    const int len =
-        std::max(min_len, std::min<int>(bw4_, kNum4x4BlocksWide[candidate.mi_size]));
+    const int len = std::max(min_len, std::min<int>(bw4_, kNum4x4BlocksWide[candidate.mi_size]));
     add_ref_mv_candidate(candidate, is_compound, len * 2);
     i += len;
   }
@@ -149,8 +148,7 @@ void TileParser::scan_col(int delta_col, bool is_compound) {
     if (!is_inside(row, col)) break;
     const BlockInfo* candidate = frame_->at(row, col);
     if (candidate == nullptr) break;
-    const int len =
-        std::max(min_len, std::min<int>(bh4_, kNum4x4BlocksHigh[candidate->mi_size]));
+    const int len = std::max(min_len, std::min<int>(bh4_, kNum4x4BlocksHigh[candidate->mi_size]));
     add_ref_mv_candidate(*candidate, is_compound, len * 2);
     i += len;
   }
@@ -331,7 +329,8 @@ void TileParser::extra_search(bool is_compound) {
       if (!is_inside(row, col)) break;
       const BlockInfo& candidate = *frame_->at(row, col);
       add_candidate(candidate);
-      idx += pass == 0 ? kNum4x4BlocksWide[candidate.mi_size] : kNum4x4BlocksHigh[candidate.mi_size];
+      idx +=
+          pass == 0 ? kNum4x4BlocksWide[candidate.mi_size] : kNum4x4BlocksHigh[candidate.mi_size];
     }
   }
   if (!is_compound) {
@@ -341,7 +340,8 @@ void TileParser::extra_search(bool is_compound) {
   std::array<std::array<Mv, 2>, 2> combined{};
   for (int list = 0; list < 2; ++list) {
     int count = 0;
-    for (int idx = 0; idx < ref_id_count[list]; ++idx) combined[count++][list] = ref_id_mvs[list][idx];
+    for (int idx = 0; idx < ref_id_count[list]; ++idx)
+      combined[count++][list] = ref_id_mvs[list][idx];
     for (int idx = 0; idx < ref_diff_count[list] && count < 2; ++idx) {
       combined[count++][list] = ref_diff_mvs[list][idx];
     }

@@ -91,9 +91,7 @@ void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
       if (!in_temporal_layer || !in_spatial_layer) continue;
     }
     switch (obu_type) {
-      case OBU_SEQUENCE_HEADER:
-        sequence_header_obu(payload, obu_size);
-        break;
+      case OBU_SEQUENCE_HEADER: sequence_header_obu(payload, obu_size); break;
       case OBU_TEMPORAL_DELIMITER:
         finish();
         start_temporal_unit();
@@ -109,9 +107,7 @@ void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
         tile_group_obu(payload + bytes, obu_size - bytes);
         break;
       }
-      case OBU_TILE_GROUP:
-        tile_group_obu(payload, obu_size);
-        break;
+      case OBU_TILE_GROUP: tile_group_obu(payload, obu_size); break;
       default:  // metadata, tile lists, padding and reserved types do not affect motion
         break;
     }
@@ -146,8 +142,8 @@ std::size_t Parser::frame_header_obu(const std::uint8_t* data, std::size_t size,
     }
   }
   BitReader reader(data, size);
-  header_ = read_frame_header(reader, *seq_, infos, temporal_id, spatial_id,
-                              options_.max_frame_size);
+  header_ =
+      read_frame_header(reader, *seq_, infos, temporal_id, spatial_id, options_.max_frame_size);
   for (int i = 0; i < NUM_REF_FRAMES; ++i) {
     slots_[i].valid = infos[i].valid;
     slots_[i].order_hint = infos[i].order_hint;
@@ -203,20 +199,17 @@ void Parser::start_frame() {
     if (refs[ref] == nullptr) continue;
     const FrameHeader& reference = refs[ref]->header;
     // is_scaled( ) of 5.11.27, and the limits on scaling of 7.11.3.3
-    const int x_scale =
-        ((reference.upscaled_width << REF_SCALE_SHIFT) + header_.frame_width / 2) /
-        header_.frame_width;
-    const int y_scale =
-        ((reference.frame_height << REF_SCALE_SHIFT) + header_.frame_height / 2) /
-        header_.frame_height;
+    const int x_scale = ((reference.upscaled_width << REF_SCALE_SHIFT) + header_.frame_width / 2) /
+                        header_.frame_width;
+    const int y_scale = ((reference.frame_height << REF_SCALE_SHIFT) + header_.frame_height / 2) /
+                        header_.frame_height;
     constexpr int kNoScale = 1 << REF_SCALE_SHIFT;
     context_.ref_scaled[ref] = x_scale != kNoScale || y_scale != kNoScale;
     context_.ref_present[ref] = 2 * header_.frame_width >= reference.upscaled_width &&
                                 2 * header_.frame_height >= reference.frame_height &&
                                 header_.frame_width <= 16 * reference.upscaled_width &&
                                 header_.frame_height <= 16 * reference.frame_height;
-    context_.ref_distance[ref] =
-        seq_->relative_dist(header_.order_hint, header_.order_hints[ref]);
+    context_.ref_distance[ref] = seq_->relative_dist(header_.order_hint, header_.order_hints[ref]);
     event_->ref_decode_index[ref] = refs[ref]->decode_index;
     event_->ref_size[ref] = {reference.upscaled_width, reference.frame_height};
   }
@@ -230,8 +223,7 @@ void Parser::start_frame() {
     context_.cdfs.init_coeff_cdfs(header_.base_q_idx);
   } else {
     // load_cdfs( ) and load_previous_segment_ids( ); the header checked that the frame is there
-    const FrameState& previous =
-        *slots_[header_.ref_frame_idx[header_.primary_ref_frame]].frame;
+    const FrameState& previous = *slots_[header_.ref_frame_idx[header_.primary_ref_frame]].frame;
     context_.cdfs = previous.cdfs;
     if (header_.segmentation_enabled && previous.header.mi_rows == header_.mi_rows &&
         previous.header.mi_cols == header_.mi_cols && !previous.segment_ids.empty()) {
@@ -254,8 +246,9 @@ void Parser::start_frame() {
   for (int row = 0; row < header_.tile_rows; ++row) {
     for (int col = 0; col < header_.tile_cols; ++col) {
       tile_first_block_[static_cast<std::size_t>(row * header_.tile_cols + col)] = first;
-      first += static_cast<std::size_t>(header_.mi_row_starts[row + 1] - header_.mi_row_starts[row]) *
-               static_cast<std::size_t>(header_.mi_col_starts[col + 1] - header_.mi_col_starts[col]);
+      first +=
+          static_cast<std::size_t>(header_.mi_row_starts[row + 1] - header_.mi_row_starts[row]) *
+          static_cast<std::size_t>(header_.mi_col_starts[col + 1] - header_.mi_col_starts[col]);
     }
   }
 }

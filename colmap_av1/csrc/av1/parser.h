@@ -30,7 +30,7 @@ struct Event {
   FrameHeader header;
   int decode_index = 0;  // number of this event
   int temporal_unit = 0;
-  int obu_offset = 0;    // of the frame's first OBU in its temporal unit, in bytes
+  int obu_offset = 0;  // of the frame's first OBU in its temporal unit, in bytes
   int num_tile_groups = 0;
   int shown_decode_index = -1;  // show_existing_frame: the event that decoded the frame
   // By RefFrame; -1 and 0 where there is none.

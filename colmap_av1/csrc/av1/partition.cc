@@ -72,10 +72,8 @@ void TileParser::decode_partition(int r, int c, int b_size) {
   int partition = PARTITION_NONE;
   if (b_size >= BLOCK_8X8) {
     const int bsl = kMiWidthLog2[b_size];
-    const bool above =
-        is_inside(r - 1, c) && kMiWidthLog2[frame_->at(r - 1, c)->mi_size] < bsl;
-    const bool left =
-        is_inside(r, c - 1) && kMiHeightLog2[frame_->at(r, c - 1)->mi_size] < bsl;
+    const bool above = is_inside(r - 1, c) && kMiWidthLog2[frame_->at(r - 1, c)->mi_size] < bsl;
+    const bool left = is_inside(r, c - 1) && kMiHeightLog2[frame_->at(r, c - 1)->mi_size] < bsl;
     const int ctx = left * 2 + above;
     if (has_rows && has_cols) {
       partition = bsl == 1   ? read(cdf_.partition_w8[ctx])
@@ -123,9 +121,7 @@ void TileParser::decode_partition(int r, int c, int b_size) {
   }
   const auto block = [&](int row, int col, int size) { decode_block(row, col, size, partition); };
   switch (partition) {
-    case PARTITION_NONE:
-      block(r, c, sub_size);
-      break;
+    case PARTITION_NONE: block(r, c, sub_size); break;
     case PARTITION_HORZ:
       block(r, c, sub_size);
       if (has_rows) block(r + half, c, sub_size);
@@ -183,8 +179,7 @@ void TileParser::decode_block(int r, int c, int sub_size, int partition) {
   b_->partition = static_cast<std::uint8_t>(partition);
   bw4_ = kNum4x4BlocksWide[sub_size];
   bh4_ = kNum4x4BlocksHigh[sub_size];
-  b_->has_chroma = seq_->num_planes > 1 &&
-                   !(bh4_ == 1 && seq_->subsampling_y && (r & 1) == 0) &&
+  b_->has_chroma = seq_->num_planes > 1 && !(bh4_ == 1 && seq_->subsampling_y && (r & 1) == 0) &&
                    !(bw4_ == 1 && seq_->subsampling_x && (c & 1) == 0);
   above_ = is_inside(r - 1, c) ? frame_->at(r - 1, c) : nullptr;
   left_ = is_inside(r, c - 1) ? frame_->at(r, c - 1) : nullptr;

@@ -100,7 +100,7 @@ void TileParser::read_ref_frames() {
   const int ctx_bwd_or_alt = ref_count_ctx(bwd + alt2, alt);                // comp_bwdref
   const int ctx_bwd = ref_count_ctx(bwd, alt2);                             // comp_bwdref_p1
   const int ctx_direction =
-      ref_count_ctx(last + last2 + last3 + gold, bwd + alt2 + alt);         // single_ref_p1
+      ref_count_ctx(last + last2 + last3 + gold, bwd + alt2 + alt);  // single_ref_p1
 
   const bool may_be_compound = header_->reference_select && std::min(bw4_, bh4_) >= 2;
   if (may_be_compound && read_flag(cdf_.comp_mode[comp_mode_context()])) {

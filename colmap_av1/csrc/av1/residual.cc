@@ -72,9 +72,9 @@ void set_contexts(std::uint8_t* p, int count, int visible, std::uint8_t value) {
 
 // What the levels loop needs of one scan position.
 struct ScanEntry {
-  std::uint16_t index;      // into TileParser::levels_
-  std::uint8_t base_offset; // added to the context of coeff_base
-  std::uint8_t br_offset;   // added to the context of coeff_br
+  std::uint16_t index;       // into TileParser::levels_
+  std::uint8_t base_offset;  // added to the context of coeff_base
+  std::uint8_t br_offset;    // added to the context of coeff_br
 };
 
 // The scans of all transform sizes and classes with the parts of the contexts that depend on the
@@ -220,12 +220,12 @@ void TileParser::read_tx_size(bool allow_select) {
     int above_w = 0;
     int left_h = 0;
     if (above_) {
-      above_w = above_->is_inter ? kBlockWidth[above_->mi_size]
-                                 : above_tx_width(b_->mi_row, b_->mi_col);
+      above_w =
+          above_->is_inter ? kBlockWidth[above_->mi_size] : above_tx_width(b_->mi_row, b_->mi_col);
     }
     if (left_) {
-      left_h = left_->is_inter ? kBlockHeight[left_->mi_size]
-                               : left_tx_height(b_->mi_row, b_->mi_col);
+      left_h =
+          left_->is_inter ? kBlockHeight[left_->mi_size] : left_tx_height(b_->mi_row, b_->mi_col);
     }
     const int ctx =
         (above_w >= kTxWidth[max_rect_tx_size]) + (left_h >= kTxHeight[max_rect_tx_size]);
@@ -476,8 +476,8 @@ void TileParser::coeffs(int plane, int x4, int y4, int tx_size) {
 
 int TileParser::read_eob(int tx_size, int tx_size_ctx, int ptype, int tx_class) {
   const int ctx = tx_class == TX_CLASS_2D ? 0 : 1;
-  const int eob_multisize = std::min<int>(kTxWidthLog2[tx_size], 5) +
-                            std::min<int>(kTxHeightLog2[tx_size], 5) - 4;
+  const int eob_multisize =
+      std::min<int>(kTxWidthLog2[tx_size], 5) + std::min<int>(kTxHeightLog2[tx_size], 5) - 4;
   int eob_pt;
   switch (eob_multisize) {
     case 0: eob_pt = read(cdf_.eob_pt_16[ptype][ctx]) + 1; break;
@@ -570,10 +570,9 @@ std::uint8_t TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, in
   const int dc = levels_[0] & kLevelMask;
   // levels_ is all 0 between transform blocks.
   const int end = scan[last].index;
-  const int num_rows = kTxClass == TX_CLASS_2D
-                           ? std::min<int>(kTxHeight[kAdjustedTxSize[tx_size]],
-                                           end / kStride + end % kStride + 1)
-                           : kTxHeight[tx_size];
+  const int num_rows = kTxClass == TX_CLASS_2D ? std::min<int>(kTxHeight[kAdjustedTxSize[tx_size]],
+                                                               end / kStride + end % kStride + 1)
+                                               : kTxHeight[tx_size];
   std::memset(levels_.data(), 0, static_cast<std::size_t>(num_rows * kStride));
   const auto golomb = [&] {
     int length = 1;

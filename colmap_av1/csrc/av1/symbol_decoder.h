@@ -117,9 +117,7 @@ class SymbolDecoder {
   }
 
   // Whether more bits were taken than a valid tile takes from behind its end (8.2.4).
-  bool is_past_end() const {
-    return 8 * (end_ - data_) + available_ - padding_bits_ < -14;
-  }
+  bool is_past_end() const { return 8 * (end_ - data_) + available_ - padding_bits_ < -14; }
 
   // 8.2.4 Exit process for symbol decoder: whether the bits after the last symbol are the
   // trailing bits that the specification demands.
@@ -163,7 +161,9 @@ class SymbolDecoder {
 
   // Entries that find_symbol writes: whole vectors, of 4 lanes at least.
   template <int N>
-  static constexpr int kLanes = N <= 4 ? 4 : N <= 8 ? 8 : 16;
+  static constexpr int kLanes = N <= 4   ? 4
+                                : N <= 8 ? 8
+                                         : 16;
 
   // The counter stops at 32.
   static int adaptation_rate(int count, int n) {
@@ -192,8 +192,8 @@ class SymbolDecoder {
     for (int k = 0; k < kParts; ++k) {
       f[k] = load<N>(icdf + 8 * k);
       const __m128i scaled = _mm_slli_epi16(_mm_srli_epi16(f[k], 6), 7);
-      const __m128i least = _mm_slli_epi16(
-          _mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
+      const __m128i least =
+          _mm_slli_epi16(_mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
       const __m128i bound = _mm_add_epi16(_mm_mulhi_epu16(scaled, r), least);
       store<N>(bounds + 8 * k, bound);
       // bound <= value, unsigned. It holds in the last lane, where the bound is 0.
@@ -209,8 +209,8 @@ class SymbolDecoder {
         // v + 1 + ((-1 - v) >> rate). Entries stay between 1 and 32767.
         const __m128i target =
             _mm_or_si128(from_symbol[k], _mm_set1_epi16(static_cast<short>(0x8000)));
-        __m128i step = _mm_sub_epi16(_mm_sra_epi16(_mm_sub_epi16(target, f[k]), rate),
-                                     from_symbol[k]);
+        __m128i step =
+            _mm_sub_epi16(_mm_sra_epi16(_mm_sub_epi16(target, f[k]), rate), from_symbol[k]);
         if constexpr (N != 4 && N != 8 && N != 16) {
           const __m128i used =
               _mm_cmplt_epi16(lane, _mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)));

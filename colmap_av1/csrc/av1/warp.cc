@@ -22,10 +22,12 @@ struct Divisor {
 
 // 7.11.3.7 Resolve divisor process
 Divisor resolve_divisor(std::int64_t d) {
-  const std::uint64_t magnitude = d < 0 ? 0 - static_cast<std::uint64_t>(d) : static_cast<std::uint64_t>(d);
+  const std::uint64_t magnitude =
+      d < 0 ? 0 - static_cast<std::uint64_t>(d) : static_cast<std::uint64_t>(d);
   const int n = static_cast<int>(std::bit_width(magnitude)) - 1;
   const std::int64_t e = static_cast<std::int64_t>(magnitude - (std::uint64_t{1} << n));
-  const std::int64_t f = n > DIV_LUT_BITS ? round2_signed(e, n - DIV_LUT_BITS) : e << (DIV_LUT_BITS - n);
+  const std::int64_t f =
+      n > DIV_LUT_BITS ? round2_signed(e, n - DIV_LUT_BITS) : e << (DIV_LUT_BITS - n);
   const std::int64_t factor = kDivLut[f];
   return {n + DIV_LUT_PREC_BITS, d < 0 ? -factor : factor};
 }
