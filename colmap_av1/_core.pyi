@@ -1,9 +1,11 @@
-"""Types of the C++ core (csrc/bindings.cc)."""
+"""Types of the C++ core (csrc/bindings)."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from colmap_av1.motion.frame_motion import FrameMotion
 
 class BitstreamError(Exception): ...
 class LimitError(Exception): ...
@@ -41,25 +43,25 @@ class Parser:
     def take_events(self) -> list[Event]: ...
     def sequence_header(self) -> dict[str, int] | None: ...
 
+class TrackBuilderOptions:
+    min_length: int
+    cosine: float | None
+    cosine_relative_to_dominant: bool
+    cosine_scale: float
+    max_interval: int | None
+    max_block_area: int | None
+    max_uncoded_block_area: int | None
+    smoothness: float | None
+    border: float | None
+    interpolation: float | None
+    bridge: float | None
+    cells: int
+    seeding: int
+    def __init__(self) -> None: ...
+
 class TrackBuilder:
-    def __init__(
-        self,
-        *,
-        min_length: int,
-        cosine: float,
-        cosine_relative_to_dominant: bool,
-        cosine_scale: float,
-        max_interval: int,
-        max_block_area: int,
-        max_uncoded_block_area: int,
-        smoothness: float,
-        border: float,
-        interpolation: float,
-        bridge: float,
-        cells: int = 1,
-        seeding: int = 1,
-    ) -> None: ...
-    def add(self, **frame: Any) -> None: ...
+    def __init__(self, options: TrackBuilderOptions) -> None: ...
+    def add(self, frame: FrameMotion) -> None: ...
     def finish(
         self,
     ) -> tuple[
@@ -83,22 +85,4 @@ def select_spread(
     max_tracks_per_image: int,
     min_length: int,
 ) -> NDArray[np.uint8]: ...
-def displacement(
-    list_index: int,
-    mv: NDArray[np.int16],
-    ref_frame: NDArray[np.int8],
-    is_inter: NDArray[np.uint8],
-    use_intrabc: NDArray[np.uint8],
-    motion_mode: NDArray[np.uint8],
-    interintra: NDArray[np.uint8],
-    mi_size: NDArray[np.uint8],
-    warp_index: NDArray[np.int32],
-    local_warp_params: NDArray[np.int32],
-    gm_type: NDArray[np.int32],
-    gm_params: NDArray[np.int32],
-    y_mode: NDArray[np.uint8],
-    ref_size: NDArray[np.int32],
-    width: int,
-    height: int,
-    force_integer_mv: bool = False,
-) -> NDArray[np.float32]: ...
+def displacement(frame: FrameMotion, list_index: int) -> NDArray[np.float32]: ...

@@ -86,24 +86,4 @@ class FrameMotion:
             super-resolution), local and
             global warp applied; NaN where the unit has no reference in this list.
         """
-        return np.asarray(
-            _core.displacement(
-                list_index,
-                self.mv,
-                self.ref_frame,
-                self.is_inter,
-                self.use_intrabc,
-                self.motion_mode,
-                self.interintra,
-                self.mi_size,
-                self.warp_index,
-                self.local_warp_params,
-                self.header["gm_type"],
-                self.header["gm_params"],
-                self.y_mode,
-                self.ref_size,
-                self.header["frame_width"],
-                self.height,
-                bool(self.header["force_integer_mv"]),
-            )
-        )
+        return _core.displacement(self, list_index)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,49 +88,9 @@ def build_tracks(
     """
     options = options if options is not None else TrackOptions()
     _check_options(options)
-    cell = options.cell or _UNIT
-    builder = _core.TrackBuilder(
-        min_length=least_length(options),
-        cosine=-2.0 if options.cosine is None else options.cosine,
-        cosine_relative_to_dominant=options.cosine_relative_to == "dominant",
-        cosine_scale=options.cosine_scale,
-        max_interval=_or_off(options.max_interval),
-        max_block_area=_or_off(options.max_block_area),
-        max_uncoded_block_area=_or_off(options.max_uncoded_block_area),
-        smoothness=_or_off(options.smoothness),
-        border=_or_off(options.border),
-        interpolation=_or_off(options.interpolation),
-        bridge=_or_off(options.bridge),
-        cells=_UNIT // cell,
-        seeding=options.seeding // cell,
-    )
+    builder = _core.TrackBuilder(_core_options(options))
     for count, frame in enumerate(motion, start=1):
-        builder.add(
-            decode_index=frame.decode_index,
-            display_index=frame.display_index,
-            show_frame=bool(frame.header["show_frame"]),
-            width=frame.width,
-            height=frame.height,
-            coded_width=int(frame.header["frame_width"]),
-            ref_decode_index=frame.ref_decode_index,
-            ref_display_index=frame.ref_display_index,
-            slot_decode_index=frame.slot_decode_index,
-            mv=frame.mv,
-            ref_frame=frame.ref_frame,
-            is_inter=frame.is_inter,
-            use_intrabc=frame.use_intrabc,
-            motion_mode=frame.motion_mode,
-            interintra=frame.interintra,
-            mi_size=frame.mi_size,
-            skip=frame.skip,
-            warp_index=frame.warp_index,
-            local_warp_params=frame.local_warp_params,
-            gm_type=frame.header["gm_type"],
-            gm_params=frame.header["gm_params"],
-            y_mode=frame.y_mode,
-            ref_size=frame.ref_size,
-            force_integer_mv=bool(frame.header["force_integer_mv"]),
-        )
+        builder.add(frame)
         if progress is not None:
             progress(count)
     num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
@@ -237,12 +197,24 @@ def least_length(options: TrackOptions) -> int:
     return _MIN_LENGTH if options.min_length is None else options.min_length
 
 
-_Limit = TypeVar("_Limit", int, float)
-
-
-def _or_off(limit: _Limit | None) -> _Limit | int:
-    """The core's spelling of a limit that is switched off."""
-    return -1 if limit is None else limit
+def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:
+    """The options as the core counts: cells instead of their widths."""
+    cell = options.cell or _UNIT
+    core = _core.TrackBuilderOptions()
+    core.min_length = least_length(options)
+    core.cosine = options.cosine
+    core.cosine_relative_to_dominant = options.cosine_relative_to == "dominant"
+    core.cosine_scale = options.cosine_scale
+    core.max_interval = options.max_interval
+    core.max_block_area = options.max_block_area
+    core.max_uncoded_block_area = options.max_uncoded_block_area
+    core.smoothness = options.smoothness
+    core.border = options.border
+    core.interpolation = options.interpolation
+    core.bridge = options.bridge
+    core.cells = _UNIT // cell
+    core.seeding = options.seeding // cell
+    return core
 
 
 def _check_options(options: TrackOptions) -> None:

@@ -25,6 +25,7 @@ from colmap_av1.errors import BitstreamError, ColmapAv1Error, LimitError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
+from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.video.container import packets
 
 _DATA = PROJECT / "tests" / "data" / "conformance"
@@ -74,6 +75,7 @@ from test_damaged import digest
 from colmap_av1.errors import ColmapAv1Error
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
+from colmap_av1.tracks.tracks import build_tracks
 
 def peak():
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -422,33 +424,54 @@ def test_damage_before_the_first_frame_is_an_error(tmp_path: Path) -> None:
         list(read_motion(file))
 
 
-def unit_arrays(units: tuple[int, int]) -> dict[str, Any]:
-    arrays: dict[str, Any] = {
+def blank_frame(units: tuple[int, int], width: int, height: int) -> FrameMotion:
+    """A frame of still inter blocks whose width and height need not fit its units."""
+    arrays: dict[str, NDArray[Any]] = {
         name: np.zeros(units, dtype=np.uint8)
-        for name in ("is_inter", "use_intrabc", "motion_mode", "interintra", "mi_size", "y_mode")
+        for name in _UNIT_FIELDS
+        if name not in ("mv", "ref_frame")
     }
     arrays |= {
         "mv": np.zeros((*units, 2, 2), dtype=np.int16),
         "ref_frame": np.zeros((*units, 2), dtype=np.int8),
         "warp_index": np.full(units, -1, dtype=np.int32),
         "local_warp_params": np.zeros((0, 6), dtype=np.int32),
+    }
+    header = {
+        "show_frame": 1,
+        "frame_width": width,
+        "force_integer_mv": 0,
         "gm_type": np.zeros(7, dtype=np.int32),
         "gm_params": np.zeros((7, 6), dtype=np.int32),
-        "ref_size": np.zeros((8, 2), dtype=np.int32),
     }
-    return arrays
+    indices = np.full(8, -1, dtype=np.int32)
+    return FrameMotion(
+        decode_index=0,
+        display_index=0,
+        width=width,
+        height=height,
+        header=header,
+        ref_decode_index=indices,
+        ref_display_index=indices,
+        ref_size=np.zeros((8, 2), dtype=np.int32),
+        slot_decode_index=indices,
+        **arrays,
+    )
 
 
-@pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537])
+@pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537, 0, -1])
 def test_sizes_no_frame_has_are_refused(size: int) -> None:
-    arguments = unit_arrays((2, 2))
-    with pytest.raises(ValueError, match="1 to 65536"):
-        _core.displacement(0, **arguments, width=size, height=8)
-    with pytest.raises(ValueError, match="1 to 65536"):
-        _core.displacement(0, **arguments, width=8, height=size)
+    for frame in (blank_frame((2, 2), size, 8), blank_frame((2, 2), 8, size)):
+        with pytest.raises(ValueError, match="1 to 65536"):
+            frame.displacement(0)
+        with pytest.raises(ValueError, match="1 to 65536"):
+            build_tracks([frame])
 
 
 @pytest.mark.parametrize("units", [(0, 0), (1, 2), (2, 1)])
 def test_a_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
+    frame = blank_frame(units, 8, 8)
     with pytest.raises(ValueError, match="larger than its 4x4 units"):
-        _core.displacement(0, **unit_arrays(units), width=8, height=8)
+        frame.displacement(0)
+    with pytest.raises(ValueError, match="larger than its 4x4 units"):
+        build_tracks([frame])

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from colmap_av1 import _core
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
@@ -131,25 +130,7 @@ def low_delay(motions: Sequence[Motion], **keywords: Any) -> list[FrameMotion]:
 
 
 def displacement(motion: FrameMotion, list_index: int = 0) -> NDArray[np.float32]:
-    return _core.displacement(
-        list_index,
-        motion.mv,
-        motion.ref_frame,
-        motion.is_inter,
-        motion.use_intrabc,
-        motion.motion_mode,
-        motion.interintra,
-        motion.mi_size,
-        motion.warp_index,
-        motion.local_warp_params,
-        motion.header["gm_type"],
-        motion.header["gm_params"],
-        motion.y_mode,
-        motion.ref_size,
-        motion.header["frame_width"],
-        motion.height,
-        bool(motion.header["force_integer_mv"]),
-    )
+    return motion.displacement(list_index)
 
 
 def split(tracks: Tracks) -> list[tuple[NDArray[np.int32], NDArray[np.float32]]]:
@@ -268,6 +249,22 @@ def test_displacement_refuses_indices_outside_its_tables() -> None:
         displacement(replace(motion, ref_frame=np.full_like(motion.ref_frame, 8)))
     with pytest.raises(ValueError, match="y_mode"):
         displacement(replace(motion, y_mode=motion.y_mode[:-1].copy()))
+
+
+def test_arrays_of_any_memory_layout_are_read_and_of_another_kind_refused() -> None:
+    motion = global_warp(BLOCK_8X8)
+    mv = np.asfortranarray(motion.mv)
+    assert not mv.flags.c_contiguous
+    laid_out = replace(motion, mv=mv, mi_size=np.repeat(motion.mi_size, 2, axis=1)[:, ::2])
+    assert (displacement(laid_out) == displacement(motion)).all()
+    with pytest.raises(TypeError, match=r"mv is not an array int16 \[mi_rows, mi_cols, 2, 2\]"):
+        displacement(replace(motion, mv=motion.mv[0]))
+    with pytest.raises(TypeError, match=r"gm_type is not an array int32 \[7\]"):
+        displacement(replace(motion, header=motion.header | {"gm_type": None}))
+    with pytest.raises(TypeError, match="frame_width is not an integer"):
+        displacement(replace(motion, header=motion.header | {"frame_width": "wide"}))
+    with pytest.raises(KeyError, match="force_integer_mv"):
+        displacement(replace(motion, header={"show_frame": 1, "frame_width": 64}))
 
 
 # chaining

@@ -1,7 +1,5 @@
 // The fuzzers' input: bytes that say how to run, then temporal units.
-
-#ifndef COLMAP_AV1_FUZZ_INPUT_H_
-#define COLMAP_AV1_FUZZ_INPUT_H_
+#pragma once
 
 #include <algorithm>
 #include <cstddef>
@@ -45,5 +43,3 @@ class Input {
 };
 
 }  // namespace colmap_av1::fuzz
-
-#endif  // COLMAP_AV1_FUZZ_INPUT_H_

@@ -27,7 +27,7 @@ using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
 using colmap_av1::fuzz::Input;
-using colmap_av1::tracks::CodedFrame;
+using colmap_av1::tracks::FrameMotion;
 using colmap_av1::tracks::TrackArrays;
 using colmap_av1::tracks::TrackBuilder;
 using colmap_av1::tracks::TrackBuilderOptions;
@@ -44,7 +44,7 @@ void check(bool promise, const char* what) {
 
 // Fields of a frame, owned.
 struct Frame {
-  CodedFrame coded;
+  FrameMotion motion;
   std::vector<std::int8_t> ref_frame;
   std::vector<std::int16_t> mv;
   std::vector<std::uint8_t> mi_size, y_mode, is_inter, use_intrabc, motion_mode, interintra, skip;
@@ -54,27 +54,26 @@ struct Frame {
   std::array<std::int32_t, 16> ref_size{};
   std::array<std::int32_t, 8> ref_decode_index{}, ref_display_index{}, slot_decode_index{};
 
-  const CodedFrame& view() {
-    auto& field = coded.field;
-    field.ref_frame = ref_frame.data();
-    field.mv = mv.data();
-    field.mi_size = mi_size.data();
-    field.y_mode = y_mode.data();
-    field.is_inter = is_inter.data();
-    field.use_intrabc = use_intrabc.data();
-    field.motion_mode = motion_mode.data();
-    field.interintra = interintra.data();
-    field.warp_index = warp_index.data();
-    field.local_warp_params = warps.data();
-    field.num_local_warps = static_cast<int>(warps.size() / 6);
-    field.gm_type = gm_type.data();
-    field.gm_params = gm_params.data();
-    field.ref_size = ref_size.data();
-    coded.skip = skip.data();
-    coded.ref_decode_index = ref_decode_index.data();
-    coded.ref_display_index = ref_display_index.data();
-    coded.slot_decode_index = slot_decode_index.data();
-    return coded;
+  const FrameMotion& view() {
+    motion.ref_frame = ref_frame.data();
+    motion.mv = mv.data();
+    motion.mi_size = mi_size.data();
+    motion.y_mode = y_mode.data();
+    motion.is_inter = is_inter.data();
+    motion.use_intrabc = use_intrabc.data();
+    motion.motion_mode = motion_mode.data();
+    motion.interintra = interintra.data();
+    motion.warp_index = warp_index.data();
+    motion.local_warp_params = warps.data();
+    motion.num_local_warps = static_cast<int>(warps.size() / 6);
+    motion.gm_type = gm_type.data();
+    motion.gm_params = gm_params.data();
+    motion.ref_size = ref_size.data();
+    motion.skip = skip.data();
+    motion.ref_decode_index = ref_decode_index.data();
+    motion.ref_display_index = ref_display_index.data();
+    motion.slot_decode_index = slot_decode_index.data();
+    return motion;
   }
 };
 
@@ -82,28 +81,28 @@ TrackBuilderOptions read_options(Input& input) {
   const unsigned choice = input.byte();
   TrackBuilderOptions options;
   options.min_length = 1 + static_cast<int>(choice & 3);
-  options.cosine = (choice & 4) != 0 ? 0.3 : -2;
+  if ((choice & 4) != 0) options.cosine = 0.3;
   options.cosine_relative_to_dominant = (choice & 8) != 0;
   options.cosine_scale = (choice & 8) != 0 ? 1 : 0;
-  options.max_interval = (choice & 16) != 0 ? 4 : -1;
-  options.max_block_area = (choice & 32) != 0 ? 1024 : -1;
-  options.max_uncoded_block_area = (choice & 32) != 0 ? 256 : -1;
-  options.smoothness = (choice & 64) != 0 ? 2.5 : -1;
-  options.border = (choice & 128) != 0 ? 16 : -1;
-  options.interpolation = (choice & 2) != 0 ? 2 : -1;
-  options.bridge = (choice & 1) != 0 ? 2 : -1;
+  if ((choice & 16) != 0) options.max_interval = 4;
+  if ((choice & 32) != 0) options.max_block_area = 1024;
+  if ((choice & 32) != 0) options.max_uncoded_block_area = 256;
+  if ((choice & 64) != 0) options.smoothness = 2.5;
+  if ((choice & 128) != 0) options.border = 16;
+  if ((choice & 2) != 0) options.interpolation = 2;
+  if ((choice & 1) != 0) options.bridge = 2;
   options.cells = 1 << (((choice >> 3) & 1) + ((choice >> 5) & 1));
   options.seeding = (choice & 64) != 0 ? options.cells : 1;
   return options;
 }
 
 // Displacements and tracks of a frame. False where it contradicts itself.
-bool add(TrackBuilder& builder, const CodedFrame& frame) {
+bool add(TrackBuilder& builder, const FrameMotion& frame) {
   try {
-    colmap_av1::tracks::check_motion_field(frame.field);
-    std::vector<float> out(2 * static_cast<std::size_t>(frame.field.num_units()));
+    colmap_av1::tracks::check_frame_motion(frame);
+    std::vector<float> out(2 * static_cast<std::size_t>(frame.num_units()));
     for (int list = 0; list < 2; ++list) {
-      colmap_av1::tracks::displacement(frame.field, list, out.data());
+      colmap_av1::tracks::displacement(frame, list, out.data());
     }
     builder.add(frame);
   } catch (const std::invalid_argument&) {
@@ -136,8 +135,7 @@ void check_tracks(const TrackArrays& tracks, const TrackBuilderOptions& options)
   }
 }
 
-std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only,
-                                          std::size_t max_events) {
+std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only, std::size_t max_events) {
   ParserOptions options;
   options.headers_only = headers_only;
   options.max_frame_size = kMaxFrameSize;
@@ -153,7 +151,7 @@ std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only,
   return std::move(parser.events());
 }
 
-// What `read_motion` makes of the events (motion.py)
+// What `read_motion` makes of the events (motion/reading.py)
 void run_parsed(Input input, TrackBuilder& builder) {
   std::vector<int> shown;
   int last_unit = -1;
@@ -178,16 +176,15 @@ void run_parsed(Input input, TrackBuilder& builder) {
     if (header.show_existing_frame) continue;
     Frame frame;
     auto& units = event->units;
-    frame.coded.field.mi_rows = header.mi_rows;
-    frame.coded.field.mi_cols = header.mi_cols;
-    frame.coded.field.width = header.frame_width;
-    frame.coded.field.height = header.frame_height;
-    frame.coded.field.force_integer_mv = header.force_integer_mv;
-    frame.coded.decode_index = event->decode_index;
-    frame.coded.display_index = displayed(event->decode_index);
-    frame.coded.show_frame = header.show_frame;
-    frame.coded.width = header.upscaled_width;
-    frame.coded.height = header.frame_height;
+    frame.motion.mi_rows = header.mi_rows;
+    frame.motion.mi_cols = header.mi_cols;
+    frame.motion.frame_width = header.frame_width;
+    frame.motion.force_integer_mv = header.force_integer_mv;
+    frame.motion.decode_index = event->decode_index;
+    frame.motion.display_index = displayed(event->decode_index);
+    frame.motion.show_frame = header.show_frame;
+    frame.motion.width = header.upscaled_width;
+    frame.motion.height = header.frame_height;
     const auto copy = [](auto& to, const auto& from) { to.assign(from.begin(), from.end()); };
     for (const auto& refs : units.ref_frame) {
       frame.ref_frame.insert(frame.ref_frame.end(), refs.begin(), refs.end());
@@ -234,10 +231,8 @@ std::int32_t wrong_number(Input& input) {
       return std::numeric_limits<std::int32_t>::max() - static_cast<std::int32_t>(choice >> 6);
     case 1:
       return std::numeric_limits<std::int32_t>::min() + static_cast<std::int32_t>(choice >> 6);
-    case 2:
-      return input.number<std::int32_t>();
-    default:
-      return static_cast<std::int32_t>(choice >> 3) - 1;
+    case 2: return input.number<std::int32_t>();
+    default: return static_cast<std::int32_t>(choice >> 3) - 1;
   }
 }
 
@@ -248,23 +243,20 @@ void run_made_up(Input input, TrackBuilder& builder) {
     Frame frame;
     const unsigned choice = input.byte();
     const int number = static_cast<int>(count);
-    auto& field = frame.coded.field;
-    field.mi_rows = input.byte() % 17;
-    field.mi_cols = input.byte() % 17;
+    auto& motion = frame.motion;
+    motion.mi_rows = input.byte() % 17;
+    motion.mi_cols = input.byte() % 17;
     const bool wild = (choice & 1) != 0;  // frame-wide numbers that no stream holds
     const bool wild_units = (choice & 0x82) == 0x82;
-    field.width = wild ? wrong_number(input) : 4 * field.mi_cols;
-    field.height = wild ? wrong_number(input) : 4 * field.mi_rows;
-    frame.coded.width = wild ? wrong_number(input) : field.width;
-    frame.coded.height = field.height;
-    // What the Python module refuses (bind_tracks.cc)
-    if (field.width <= 0 || field.height <= 0 || frame.coded.width <= 0) continue;
-    field.force_integer_mv = (choice & 2) != 0;
-    frame.coded.show_frame = (choice & 4) == 0;
-    frame.coded.decode_index = wild ? wrong_number(input) : number;
+    motion.frame_width = wild ? wrong_number(input) : 4 * motion.mi_cols;
+    motion.height = wild ? wrong_number(input) : 4 * motion.mi_rows;
+    motion.width = wild ? wrong_number(input) : motion.frame_width;
+    motion.force_integer_mv = (choice & 2) != 0;
+    motion.show_frame = (choice & 4) == 0;
+    motion.decode_index = wild ? wrong_number(input) : number;
     const bool hidden = (choice & 8) != 0;
-    frame.coded.display_index = wild ? wrong_number(input) : hidden ? -1 : num_shown++;
-    const auto n = static_cast<std::size_t>(field.num_units());
+    motion.display_index = wild ? wrong_number(input) : hidden ? -1 : num_shown++;
+    const auto n = static_cast<std::size_t>(motion.num_units());
     const unsigned num_warps = input.byte() % 4;
     for (std::size_t i = 0; i < 6 * num_warps; ++i) {
       frame.warps.push_back(input.number<std::int32_t>() >> (choice >> 4 & 15));
@@ -295,8 +287,8 @@ void run_made_up(Input input, TrackBuilder& builder) {
         frame.mv.push_back(static_cast<std::int16_t>(input.number<std::int16_t>() >> (flags >> 6)));
         frame.mv.push_back(input.number<std::int16_t>());
       }
-      frame.warp_index.push_back(
-          wild_units ? wrong_number(input) : input.byte() % static_cast<int>(num_warps + 1) - 1);
+      frame.warp_index.push_back(wild_units ? wrong_number(input)
+                                            : input.byte() % static_cast<int>(num_warps + 1) - 1);
     }
     for (std::size_t i = 0; i < 7; ++i) frame.gm_type[i] = input.byte() % 4;
     for (auto& value : frame.gm_params) value = input.number<std::int32_t>() >> (choice >> 4 & 15);

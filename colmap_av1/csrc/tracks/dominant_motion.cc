@@ -9,10 +9,10 @@ namespace {
 
 constexpr std::size_t kMinSamples = 64;
 constexpr int kIterations = 6;
-constexpr double kTukey = 4.685;      // 95 % efficiency on Gaussian residuals
+constexpr double kTukey = 4.685;  // 95 % efficiency on Gaussian residuals
 constexpr double kMadToSigma = 1.4826;
-constexpr double kMinSigma = 0.25;    // px, the grain of the vectors themselves
-constexpr double kRidge = 1e-4;       // keeps the slopes of a one-sided sample small
+constexpr double kMinSigma = 0.25;  // px, the grain of the vectors themselves
+constexpr double kRidge = 1e-4;     // keeps the slopes of a one-sided sample small
 
 double median(std::vector<float>& values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);

@@ -1,7 +1,5 @@
 // The motion that most of a frame shares: what the camera did, shake included.
-
-#ifndef COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_
-#define COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_
+#pragma once
 
 #include <span>
 #include <vector>
@@ -39,5 +37,3 @@ DominantMotion fit_dominant_motion(std::span<const MotionSample> samples, double
                                    double height, std::vector<float>& scratch);
 
 }  // namespace colmap_av1::tracks
-
-#endif  // COLMAP_AV1_TRACKS_DOMINANT_MOTION_H_

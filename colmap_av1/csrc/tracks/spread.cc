@@ -10,18 +10,18 @@ namespace {
 
 constexpr double kMaxSide = 1 << 17;  // px; no picture is larger
 
-void check(const TrackView& tracks, std::span<const int64_t> order) {
+void check(const TrackView& tracks, std::span<const std::int64_t> order) {
   const std::size_t total = tracks.frame.size();
   if (tracks.offsets.empty() || tracks.offsets.front() != 0 ||
-      tracks.offsets.back() != static_cast<int64_t>(total) || tracks.xy.size() != 2 * total ||
+      tracks.offsets.back() != static_cast<std::int64_t>(total) || tracks.xy.size() != 2 * total ||
       !std::is_sorted(tracks.offsets.begin(), tracks.offsets.end())) {
     throw std::invalid_argument("offsets, frame and xy do not fit each other");
   }
-  const auto num_tracks = static_cast<int64_t>(tracks.offsets.size()) - 1;
-  for (const int64_t track : order) {
+  const auto num_tracks = static_cast<std::int64_t>(tracks.offsets.size()) - 1;
+  for (const std::int64_t track : order) {
     if (track < 0 || track >= num_tracks) throw std::invalid_argument("order names no track");
   }
-  for (const int32_t frame : tracks.frame) {
+  for (const std::int32_t frame : tracks.frame) {
     if (frame < 0 || frame >= tracks.num_frames) {
       throw std::invalid_argument("a frame is not one of the video's");
     }
@@ -35,17 +35,18 @@ void check(const TrackView& tracks, std::span<const int64_t> order) {
 
 }  // namespace
 
-std::vector<uint8_t> select_spread(const TrackView& tracks, std::span<const int64_t> order,
-                                   const SpreadOptions& options) {
+std::vector<std::uint8_t> select_spread(const TrackView& tracks,
+                                        std::span<const std::int64_t> order,
+                                        const SpreadOptions& options) {
   check(tracks, order);
   const std::size_t total = tracks.frame.size();
   // The grid of every picture ends at the outermost observation.
-  int64_t cols = 1;
-  int64_t rows = 1;
+  std::int64_t cols = 1;
+  std::int64_t rows = 1;
   const auto cell_at = [&](float value) {
-    return static_cast<int64_t>(static_cast<double>(value) / options.spacing);
+    return static_cast<std::int64_t>(static_cast<double>(value) / options.spacing);
   };
-  std::vector<int64_t> cell;
+  std::vector<std::int64_t> cell;
   if (options.spacing > 0) {
     for (std::size_t i = 0; i < total; ++i) {
       cols = std::max(cols, cell_at(tracks.xy[2 * i]) + 1);
@@ -57,27 +58,29 @@ std::vector<uint8_t> select_spread(const TrackView& tracks, std::span<const int6
                 cell_at(tracks.xy[2 * i]);
     }
   }
-  std::vector<uint8_t> taken(cell.empty() ? 0 : static_cast<std::size_t>(tracks.num_frames) *
-                                                    static_cast<std::size_t>(rows * cols));
-  std::vector<int32_t> count(static_cast<std::size_t>(tracks.num_frames));
-  std::vector<uint8_t> kept(total);
-  const auto is_full = [&](int32_t frame) {
+  std::vector<std::uint8_t> taken(cell.empty() ? 0
+                                               : static_cast<std::size_t>(tracks.num_frames) *
+                                                     static_cast<std::size_t>(rows * cols));
+  std::vector<std::int32_t> count(static_cast<std::size_t>(tracks.num_frames));
+  std::vector<std::uint8_t> kept(total);
+  const auto is_full = [&](std::int32_t frame) {
     return options.max_tracks_per_image > 0 &&
            count[static_cast<std::size_t>(frame)] >= options.max_tracks_per_image;
   };
-  for (const int64_t track : order) {
+  for (const std::int64_t track : order) {
     const auto first = static_cast<std::size_t>(tracks.offsets[static_cast<std::size_t>(track)]);
     const auto last = static_cast<std::size_t>(tracks.offsets[static_cast<std::size_t>(track) + 1]);
-    int64_t usable = 0;
-    int64_t useful = 0;
+    std::int64_t usable = 0;
+    std::int64_t useful = 0;
     for (std::size_t i = first; i < last; ++i) {
       if (is_full(tracks.frame[i])) continue;
       ++usable;
       if (cell.empty() || taken[static_cast<std::size_t>(cell[i])] == 0) ++useful;
     }
-    if (usable < std::max(1, options.min_length) || 2 * useful < static_cast<int64_t>(last - first)) {
+    if (usable < std::max(1, options.min_length) ||
+        2 * useful < static_cast<std::int64_t>(last - first)) {
       continue;
-    };
+    }
     for (std::size_t i = first; i < last; ++i) {
       if (is_full(tracks.frame[i])) continue;
       kept[i] = 1;

@@ -1,7 +1,5 @@
 // How far the bitstream's motion can be trusted.
-
-#ifndef COLMAP_AV1_TRACKS_TRUST_H_
-#define COLMAP_AV1_TRACKS_TRUST_H_
+#pragma once
 
 namespace colmap_av1::tracks {
 
@@ -12,7 +10,7 @@ struct StepTraits {
   bool coded = false;  // has a residual
   bool warped = false;
   bool overlapped = false;  // OBMC
-  float length = 0.F;  // of the displacement, px
+  float length = 0.F;       // of the displacement, px
   // Mean distance in px to the displacements of the units around the block; negative where there
   // are none.
   float disagreement = -1.F;
@@ -23,5 +21,3 @@ struct StepTraits {
 float step_sigma(const StepTraits& traits);
 
 }  // namespace colmap_av1::tracks
-
-#endif  // COLMAP_AV1_TRACKS_TRUST_H_

@@ -1,6 +1,5 @@
-#include "bind_av1.h"
+#include "bindings/av1.h"
 
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
 #include <cstddef>
@@ -11,6 +10,7 @@
 
 #include "av1/error.h"
 #include "av1/parser.h"
+#include "bindings/arrays.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -25,22 +25,6 @@ using av1::Parser;
 using av1::ParserOptions;
 using av1::RestartPoint;
 using av1::SequenceHeader;
-
-// Hands a vector's memory to NumPy without a copy.
-template <typename T, typename U, typename A>
-nb::object adopt(std::vector<U, A>&& data, std::initializer_list<std::size_t> shape) {
-  static_assert(sizeof(U) % sizeof(T) == 0);
-  using Vector = std::vector<U, A>;
-  auto* owner = new Vector(std::move(data));
-  nb::capsule capsule(owner, [](void* p) noexcept { delete static_cast<Vector*>(p); });
-  return nb::cast(nb::ndarray<nb::numpy, T>(reinterpret_cast<T*>(owner->data()), shape, capsule));
-}
-
-template <typename T>
-nb::object adopt(std::vector<T>&& data) {
-  const std::size_t size = data.size();
-  return adopt<T>(std::move(data), {size});
-}
 
 template <typename Array>
 nb::object int32_array(const Array& values, std::size_t first = 0) {
@@ -284,13 +268,11 @@ void bind_av1(nb::module_& m) {
       .def_ro("decode_index", &Event::decode_index)
       .def_ro("shown_decode_index", &Event::shown_decode_index)
       .def_ro("temporal_unit", &Event::temporal_unit)
-      .def_prop_ro("num_units",
-                   [](const Event& e) { return e.header.mi_rows * e.header.mi_cols; })
+      .def_prop_ro("num_units", [](const Event& e) { return e.header.mi_rows * e.header.mi_cols; })
       .def_prop_ro("is_repeated", [](const Event& e) { return e.header.show_existing_frame; })
-      .def_prop_ro("is_shown",
-                   [](const Event& e) {
-                     return e.header.show_frame || e.header.show_existing_frame;
-                   })
+      .def_prop_ro(
+          "is_shown",
+          [](const Event& e) { return e.header.show_frame || e.header.show_existing_frame; })
       .def_prop_ro("is_shown_key_frame",
                    [](const Event& e) {
                      return e.header.frame_type == av1::KEY_FRAME && e.header.show_frame &&
@@ -303,7 +285,8 @@ void bind_av1(nb::module_& m) {
       .def("ref_size",
            [](const Event& e) {
              std::vector<std::int32_t> sizes;
-             for (const auto& size : e.ref_size) sizes.insert(sizes.end(), size.begin(), size.end());
+             for (const auto& size : e.ref_size)
+               sizes.insert(sizes.end(), size.begin(), size.end());
              return adopt<std::int32_t>(std::move(sizes), {8, 2});
            })
       .def("slot_decode_index", [](const Event& e) { return int32_array(e.slot_decode_index); });
@@ -315,8 +298,8 @@ void bind_av1(nb::module_& m) {
           "__init__",
           [](Parser* self, int operating_point, bool headers_only, bool keep_blocks,
              int num_threads, std::int64_t max_frame_size) {
-            new (self) Parser(ParserOptions{operating_point, headers_only, keep_blocks,
-                                            num_threads, max_frame_size});
+            new (self) Parser(ParserOptions{operating_point, headers_only, keep_blocks, num_threads,
+                                            max_frame_size});
           },
           "operating_point"_a = 0, "headers_only"_a = false, "keep_blocks"_a = false,
           "num_threads"_a = 1, "max_frame_size"_a = std::int64_t{1} << 28)

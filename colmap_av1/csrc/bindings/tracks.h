@@ -1,10 +1,10 @@
 // Bindings of the tracks core.
-
-#ifndef COLMAP_AV1_BIND_TRACKS_H_
-#define COLMAP_AV1_BIND_TRACKS_H_
+#pragma once
 
 #include <nanobind/nanobind.h>
 
+namespace colmap_av1 {
+
 void bind_tracks(nanobind::module_& m);
 
-#endif  // COLMAP_AV1_BIND_TRACKS_H_
+}  // namespace colmap_av1

@@ -1,0 +1,13 @@
+// Python bindings of the core; only this folder knows Python.
+#include <nanobind/nanobind.h>
+
+#include "bindings/av1.h"
+#include "bindings/frame_motion.h"
+#include "bindings/tracks.h"
+
+NB_MODULE(_core, m) {
+  m.doc() = "AV1 motion parser and track builder";
+  colmap_av1::bind_av1(m);
+  colmap_av1::bind_frame_motion(m);
+  colmap_av1::bind_tracks(m);
+}

@@ -1,0 +1,301 @@
+#include "tracks/chaining.h"
+
+#include <algorithm>
+#include <cstddef>
+#include <utility>
+
+namespace colmap_av1::tracks {
+
+Chainer::Chainer(const TrackBuilderOptions& options, const CellGrid& grid)
+    : grid_(grid), bridge_(static_cast<float>(options.bridge.value_or(0))), cosine_(options) {}
+
+void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& store) {
+  current_ = &current;
+  store_ = &store;
+  cosine_.start_frame(current);
+  note_open_units(links);
+  for (Link& link : links) {
+    cosine_.prepare(current, link);
+    if (link.forward) {
+      for (int list = 0; list < link.other->motion.num_lists; ++list) chain_forward(link, list);
+      continue;
+    }
+    const int num_lists = current.motion.num_lists;
+    for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kOwn);
+    if (bridge_ <= 0.F) continue;
+    for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
+  }
+}
+
+// The units that may move a track into the current frame.
+void Chainer::note_open_units(std::span<const Link> links) {
+  open_units_.clear();
+  if (std::all_of(links.begin(), links.end(), [](const Link& link) { return link.forward; })) {
+    return;
+  }
+  const TrustedMotion& motion = current_->motion;
+  for (int row = 0; row < motion.visible_rows; ++row) {
+    for (int col = 0; col < motion.visible_cols; ++col) {
+      if (motion.moves(row * motion.cols + col)) open_units_.push_back({row, col});
+    }
+  }
+}
+
+// Whether a cell of the current frame's unit holds no track yet.
+bool Chainer::is_open(OpenUnit unit) const {
+  const int size = grid_.cells;
+  const Cell* first = current_->cells.data() +
+                      static_cast<std::ptrdiff_t>(size) * unit.row * current_->cell_cols +
+                      static_cast<std::ptrdiff_t>(size) * unit.col;
+  for (int row = 0; row < size; ++row, first += current_->cell_cols) {
+    for (int col = 0; col < size; ++col) {
+      if (first[col].track < 0) return true;
+    }
+  }
+  return false;
+}
+
+// By the current frame's displacements: every free cell asks for the longest track that it
+// finds, every track goes to the cell that puts it nearest to its centre (a stable
+// matching, so the order of cells does not matter).
+void Chainer::chain_backward(const Link& link, int list, Reach reach) {
+  const auto& motion = current_->motion.lists[list];
+  claims_.resize(link.other->cells.size());
+  // A cell as large as its unit is searched in no more time than the unit is judged.
+  const bool judges_units = grid_.cells > 1;
+  bool noted = false;
+  std::size_t num_open = 0;
+  for (const OpenUnit open : open_units_) {
+    if (!is_open(open)) continue;
+    open_units_[num_open++] = open;
+    const int unit = open.row * current_->motion.cols + open.col;
+    if (!link.refs[motion[unit].ref]) continue;
+    if (judges_units) {
+      if (!noted) note_unplaced_units(*link.other);
+      noted = true;
+      if (!may_find_track(link, unit, motion[unit], reach)) continue;
+    }
+    for (int part = 0; part < grid_.cells * grid_.cells; ++part) {
+      const int row = grid_.cells * open.row + (part >> grid_.log_cells);
+      const int col = grid_.cells * open.col + (part & (grid_.cells - 1));
+      const int cell = row * current_->cell_cols + col;
+      if (current_->cells[cell].track >= 0) continue;
+      claim_track(link, list, reach, {cell, unit, grid_.centre(row, col)});
+    }
+  }
+  open_units_.resize(num_open);
+  for (const std::int32_t cell : claimed_) {
+    const Claim claim = std::exchange(claims_[cell], Claim{});
+    carry_on(*link.other, cell, claim.cell, claim);
+  }
+  claimed_.clear();
+}
+
+// The units of a frame with tracks that have no place in the current frame yet.
+void Chainer::note_unplaced_units(const ChainedFrame& other) {
+  unplaced_units_.assign(other.motion.mi_size.size(), 0);
+  const Cell* cell = other.cells.data();
+  for (int row = 0; row < other.cell_rows; ++row) {
+    std::uint8_t* unit = unplaced_units_.data() +
+                         static_cast<std::ptrdiff_t>(row >> grid_.log_cells) * other.motion.cols;
+    for (int col = 0; col < other.motion.cols; ++col, ++unit) {
+      for (const Cell* end = cell + grid_.cells; cell < end; ++cell) {
+        if (store_->is_unplaced(*cell, *current_)) *unit = 1;
+      }
+    }
+  }
+}
+
+// Whether the cells of a unit can find any track, to search them only then.
+bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motion,
+                             Reach reach) const {
+  // A valid warp stretches a unit by less than half its size; beside it motion is alike.
+  float pixels = 0.75F * kUnit;
+  if (reach == Reach::kBeside) {
+    if (bridge_ > kUnit) return true;
+    pixels += bridge_;
+  }
+  const Point centre = current_->motion.unit_centre(unit);
+  const Window window = around(link, {centre.x + motion.dx, centre.y + motion.dy}, pixels);
+  if (window.bottom < window.top || window.right < window.left) return false;
+  const int shift = grid_.log_cells;
+  for (int row = window.top >> shift; row <= window.bottom >> shift; ++row) {
+    for (int col = window.left >> shift; col <= window.right >> shift; ++col) {
+      if (unplaced_units_[row * link.other->motion.cols + col] != 0) return true;
+    }
+  }
+  return false;
+}
+
+// A cell that loses its claim to the asker looks for another track in turn.
+void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) {
+  while (true) {
+    Found best;
+    if (reach == Reach::kOwn) {
+      find_track(link, asker, current_->motion.lists[list][asker.unit], &best);
+    } else {
+      find_track_beside(link, list, asker, &best);
+    }
+    if (best.cell < 0) return;
+    if (claims_[best.cell].cell < 0) claimed_.push_back(best.cell);
+    const int cell = std::exchange(claims_[best.cell], best.claim).cell;
+    if (cell < 0) return;
+    asker = {cell, current_->unit_of(grid_, cell),
+             grid_.centre(cell / current_->cell_cols, cell % current_->cell_cols)};
+  }
+}
+
+// The longest track that a cell has a better claim on than the cell that holds it, by the motion
+// of a unit; what `best` holds already is kept where it is longer.
+void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
+                         Found* best) const {
+  const ChainedFrame& other = *link.other;
+  const Point centre = asker.centre;
+  // A valid warp stretches a unit by less than half its size, about the unit's centre.
+  const float reach = motion.warp < 0 ? grid_.half_cell : grid_.half_cell + kUnit / 4.F;
+  const Window window = around(link, {centre.x + motion.dx, centre.y + motion.dy}, reach);
+  for (int row = window.top; row <= window.bottom; ++row) {
+    for (int col = window.left; col <= window.right; ++col) {
+      const int index = row * other.cell_cols + col;
+      const Cell& found = other.cells[index];
+      if (found.track == kNoTrack) continue;
+      const Point target{found.position.x * link.from_picture_x,
+                         found.position.y * link.from_picture_y};
+      Point position;
+      if (!move_back(current_->motion, motion, target, &position) ||
+          !grid_.is_in_cell(position, centre)) {
+        continue;
+      }
+      Claim claim;
+      claim.position = position;
+      claim.cell = asker.cell;
+      claim.cost = distance(position, centre);
+      claim.variance = found.variance + motion.variance;
+      if ((best->cell >= 0 && !is_preferred(other, index, claim, best->cell, best->claim)) ||
+          !current_->motion.contains(position) || !is_better(claim, claims_[index]) ||
+          !store_->is_unplaced(found, *current_) ||
+          !cosine_.passes(link, index, position, target, &claim.velocity)) {
+        continue;
+      }
+      *best = {index, claim};
+    }
+  }
+}
+
+// The same by the displacements of the units beside the cell's: where these point apart, tracks lie
+// in the gap that their blocks leave.
+void Chainer::find_track_beside(const Link& link, int list, const Asker& asker, Found* best) const {
+  const TrustedMotion& frame = current_->motion;
+  const int row = asker.unit / frame.cols;
+  const int col = asker.unit % frame.cols;
+  const auto& motion = frame.lists[list];
+  const UnitMotion& own = motion[asker.unit];
+  for (int r = std::max(0, row - 1); r <= std::min(frame.visible_rows - 1, row + 1); ++r) {
+    for (int c = std::max(0, col - 1); c <= std::min(frame.visible_cols - 1, col + 1); ++c) {
+      const UnitMotion& other = motion[r * frame.cols + c];
+      if (!link.refs[other.ref] || !moves_alike(other, own, bridge_)) continue;
+      // The cell has looked there already.
+      if (other.dx == own.dx && other.dy == own.dy && other.warp == own.warp) continue;
+      find_track(link, asker, other, best);
+    }
+  }
+}
+
+// The vectors of small blocks are the better ones.
+bool Chainer::is_better(const Claim& claim, const Claim& holder) const {
+  if (holder.cell < 0) return true;
+  if (claim.cost != holder.cost) return claim.cost < holder.cost;
+  const auto area = [this](const Claim& c) {
+    return current_->motion.block_area(current_->unit_of(grid_, c.cell));
+  };
+  return area(claim) != area(holder) ? area(claim) < area(holder) : claim.cell < holder.cell;
+}
+
+// The other frame's cells within reach of a position in coded pixels of the current one, the reach
+// itself left out on the right and below.
+Chainer::Window Chainer::around(const Link& link, Point position, float reach) {
+  // Far outside there are no cells; the clamp keeps the cast defined.
+  const auto first = [](float cell, int count) {
+    return static_cast<int>(std::clamp(cell, 0.F, static_cast<float>(count)));
+  };
+  const auto last = [](float cell, int count) {
+    const float clamped = std::clamp(cell, 0.F, static_cast<float>(count));
+    const int floor = static_cast<int>(clamped);
+    return (static_cast<float>(floor) == clamped ? floor : floor + 1) - 1;
+  };
+  const ChainedFrame& other = *link.other;
+  return {first((position.y - reach) * link.to_cells_y, other.cell_rows),
+          last((position.y + reach) * link.to_cells_y, other.cell_rows),
+          first((position.x - reach) * link.to_cells_x, other.cell_cols),
+          last((position.x + reach) * link.to_cells_x, other.cell_cols)};
+}
+
+// By the other frame's displacements: every track moves with the unit it lies in, and a
+// free cell takes the longest one that lands in it.
+void Chainer::chain_forward(const Link& link, int list) {
+  ChainedFrame& other = *link.other;
+  const auto& motion = other.motion.lists[list];
+  claims_.resize(current_->cells.size());
+  for (int row = 0; row < grid_.cells * other.motion.visible_rows; ++row) {
+    for (int col = 0; col < grid_.cells * other.motion.visible_cols; ++col) {
+      const int cell = row * other.cell_cols + col;
+      const int unit = (row >> grid_.log_cells) * other.motion.cols + (col >> grid_.log_cells);
+      if (link.refs[motion[unit].ref] && store_->is_unplaced(other.cells[cell], *current_)) {
+        push_track(link, cell, motion[unit]);
+      }
+    }
+  }
+  for (const std::int32_t cell : claimed_) {
+    const Claim claim = std::exchange(claims_[cell], Claim{});
+    carry_on(other, claim.cell, cell, claim);
+  }
+  claimed_.clear();
+}
+
+// Claims the current frame's cell that a track of the other one lands in.
+void Chainer::push_track(const Link& link, int cell, const UnitMotion& motion) {
+  const ChainedFrame& other = *link.other;
+  const Cell& source = other.cells[cell];
+  const Point from{source.position.x / other.motion.upscale, source.position.y};
+  const Point moved = move(other.motion, motion, from);
+  const float scale_x = current_->motion.coded_width / other.motion.coded_width;
+  const float scale_y = current_->motion.height / other.motion.height;
+  Claim claim;
+  claim.cell = cell;
+  claim.position = {moved.x * scale_x, moved.y * scale_y};
+  claim.variance = source.variance + motion.variance;
+  if (!current_->motion.contains(claim.position)) return;
+  const float size = 2.F * grid_.half_cell;
+  const int target_row = static_cast<int>(claim.position.y / size);
+  const int target_col = static_cast<int>(claim.position.x / size);
+  const int target = target_row * current_->cell_cols + target_col;
+  if (current_->cells[target].track >= 0) return;
+  claim.cost = distance(claim.position, grid_.centre(target_row, target_col));
+  const Claim& holder = claims_[target];
+  if ((holder.cell >= 0 && !is_preferred(other, cell, claim, holder.cell, holder)) ||
+      !cosine_.passes(link, cell, from, moved, &claim.velocity)) {
+    return;
+  }
+  if (holder.cell < 0) claimed_.push_back(target);
+  claims_[target] = claim;
+}
+
+// Of two tracks that want one cell the longer goes on: another one can start at any time.
+bool Chainer::is_preferred(const ChainedFrame& frame, int cell, const Claim& claim, int other_cell,
+                           const Claim& other_claim) const {
+  const std::int32_t own_length = store_->length(frame, frame.cells[cell]);
+  const std::int32_t other_length = store_->length(frame, frame.cells[other_cell]);
+  return own_length != other_length ? own_length > other_length : claim.cost < other_claim.cost;
+}
+
+// Gives the track of another frame's cell its place in a cell of the current frame.
+void Chainer::carry_on(ChainedFrame& other, int other_cell, int cell, const Claim& claim) {
+  std::int32_t track = other.cells[other_cell].track;
+  if (track == kSeed) track = store_->start(other, static_cast<std::size_t>(other_cell));
+  current_->cells[cell] = {
+      track, {claim.position.x * current_->motion.upscale, claim.position.y}, claim.variance};
+  if (cosine_.is_on()) current_->velocity[cell] = claim.velocity;
+  store_->hold(track, *current_);
+}
+
+}  // namespace colmap_av1::tracks

@@ -1,0 +1,30 @@
+// What can be chosen about tracks.
+#pragma once
+
+#include <cstdlib>
+#include <optional>
+
+namespace colmap_av1::tracks {
+
+// A limit without a value is off. Meaning and units: TrackOptions in the package's options.py.
+struct TrackBuilderOptions {
+  int min_length = 4;
+  std::optional<double> cosine;
+  bool cosine_relative_to_dominant = true;
+  double cosine_scale = 1;
+  std::optional<int> max_interval;
+  std::optional<int> max_block_area;
+  std::optional<int> max_uncoded_block_area;
+  std::optional<double> smoothness;
+  std::optional<double> border;
+  std::optional<double> interpolation;
+  std::optional<double> bridge;
+  int cells = 1;    // along either side of a unit
+  int seeding = 1;  // along either side of a square of them that a track starts in; divides cells
+
+  bool is_within_reach(int interval) const {
+    return !max_interval || std::abs(interval) <= *max_interval;
+  }
+};
+
+}  // namespace colmap_av1::tracks

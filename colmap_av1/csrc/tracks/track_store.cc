@@ -1,0 +1,130 @@
+#include "tracks/track_store.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+
+namespace colmap_av1::tracks {
+
+void TrackStore::set_size(int width, int height) {
+  width_ = width;
+  height_ = height;
+}
+
+std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
+  auto index = static_cast<std::int32_t>(tracks_.size());
+  if (free_tracks_.empty()) {
+    tracks_.emplace_back();
+    serials_.emplace_back();
+  } else {
+    index = free_tracks_.back();
+    free_tracks_.pop_back();
+    tracks_[index] = Track{};
+  }
+  serials_[index] = frame.first_serial + static_cast<std::int64_t>(cell);
+  Track& track = tracks_[index];
+  track.frames = 1;
+  frame.cells[cell].track = index;
+  if (frame.is_shown()) observe(track, frame, frame.cells[cell]);
+  return index;
+}
+
+void TrackStore::observe(const ChainedFrame& frame) {
+  for (const Cell& cell : frame.cells) {
+    if (cell.track >= 0) observe(tracks_[cell.track], frame, cell);
+  }
+}
+
+void TrackStore::observe(Track& track, const ChainedFrame& frame, const Cell& cell) {
+  const float scale_x = static_cast<float>(width_) / frame.motion.width;
+  const float scale_y = static_cast<float>(height_) / frame.motion.height;
+  const int place = track.length % kStretch;
+  if (place == 0) start_stretch(track);
+  stretches_[track.last_stretch].observations[place] = {
+      frame.motion.display_index,
+      {cell.position.x * scale_x, cell.position.y * scale_y},
+      std::sqrt(cell.variance) * scale_y};
+  ++track.length;
+}
+
+void TrackStore::start_stretch(Track& track) {
+  auto index = static_cast<std::int32_t>(previous_stretch_.size());
+  if (!free_stretches_.empty()) {
+    index = free_stretches_.back();
+    free_stretches_.pop_back();
+  } else if (stretches_.size() < std::numeric_limits<std::int32_t>::max()) {
+    stretches_.emplace_back();
+    previous_stretch_.push_back(-1);
+  } else {
+    throw std::length_error("too many observations at a time: cut the video");
+  }
+  previous_stretch_[index] = track.last_stretch;
+  track.last_stretch = index;
+}
+
+void TrackStore::release(ChainedFrame& frame) {
+  for (std::size_t i = 0; i < frame.cells.size(); ++i) {
+    const Cell& cell = frame.cells[i];
+    if (cell.track == kSeed && length(frame, cell) >= min_length_) start(frame, i);
+    if (cell.track < 0) continue;
+    Track& track = tracks_[cell.track];
+    if (--track.frames > 0) continue;
+    free_tracks_.push_back(cell.track);
+    if (track.length >= min_length_) keep(cell.track);
+    for (std::int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
+      free_stretches_.push_back(s);
+    }
+  }
+}
+
+void TrackStore::keep(std::int32_t index) {
+  const Track& track = tracks_[index];
+  const auto first = static_cast<std::ptrdiff_t>(done_.frame.size());
+  kept_.push_back({serials_[index], first, track.length});
+  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.length);
+  done_.frame.resize(size);
+  done_.xy.resize(2 * size);
+  done_.sigma.resize(size);
+  auto frame = done_.frame.end();
+  auto xy = done_.xy.end();
+  auto sigma = done_.sigma.end();
+  std::int32_t stretch = track.last_stretch;
+  for (int i = track.length - 1; i >= 0; --i) {
+    const Observation& observation = stretches_[stretch].observations[i % kStretch];
+    *--frame = observation.frame;
+    *--xy = observation.position.y;
+    *--xy = observation.position.x;
+    *--sigma = observation.sigma;
+    if (i % kStretch == 0) stretch = previous_stretch_[stretch];
+  }
+}
+
+TrackArrays TrackStore::finish() {
+  std::sort(kept_.begin(), kept_.end(),
+            [](const Kept& a, const Kept& b) { return a.serial < b.serial; });
+  tracks_.clear();
+  stretches_.clear();
+  TrackArrays out;
+  out.width = width_;
+  out.height = height_;
+  out.offsets.reserve(kept_.size() + 1);
+  out.offsets.push_back(0);
+  for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
+  // One array after the other, the largest first: that takes the least memory.
+  const auto sort = [this](auto& values, std::ptrdiff_t width, auto* sorted) {
+    sorted->resize(values.size());
+    auto end = sorted->begin();
+    for (const Kept& kept : kept_) {
+      const auto first = values.begin() + width * kept.first;
+      end = std::copy(first, first + width * kept.length, end);
+    }
+    values = {};
+  };
+  sort(done_.xy, 2, &out.xy);
+  sort(done_.frame, 1, &out.frame);
+  sort(done_.sigma, 1, &out.sigma);
+  return out;
+}
+
+}  // namespace colmap_av1::tracks

@@ -1,0 +1,232 @@
+#include "tracks/trusted_motion.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <optional>
+
+#include "av1/constants.h"
+#include "av1/spec_tables.h"
+#include "tracks/displacement.h"
+#include "tracks/fill_motion.h"
+#include "tracks/trust.h"
+
+namespace colmap_av1::tracks {
+namespace {
+
+using Verdict = TrustScratch::Verdict;
+
+// How the units around a block move, against the block.
+struct Agreement {
+  int judged = 0;
+  int agreeing = 0;
+  double distance = 0;  // summed over the judged ones
+};
+
+bool has_compounds(const FrameMotion& frame) {
+  for (int unit = 0; unit < frame.num_units(); ++unit) {
+    if (frame.ref_frame[2 * unit + 1] > 0) return true;
+  }
+  return false;
+}
+
+void read_frame_values(const FrameMotion& frame, TrustedMotion& motion) {
+  motion.decode_index = frame.decode_index;
+  motion.display_index = frame.display_index;
+  motion.rows = frame.mi_rows;
+  motion.cols = frame.mi_cols;
+  motion.visible_rows = std::min(frame.mi_rows, (frame.height + 3) / 4);
+  motion.visible_cols = std::min(frame.mi_cols, (frame.frame_width + 3) / 4);
+  motion.width = static_cast<float>(frame.width);
+  motion.height = static_cast<float>(frame.height);
+  motion.coded_width = static_cast<float>(frame.frame_width);
+  motion.upscale = motion.width / motion.coded_width;
+  for (int ref = 0; ref < kNumRefs; ++ref) {
+    const int display_index = frame.ref_display_index[ref];
+    motion.ref_decode_index[ref] = ref > 0 ? frame.ref_decode_index[ref] : -1;
+    motion.ref_interval[ref] =
+        display_index >= 0 && frame.display_index >= 0 ? display_index - frame.display_index : 0;
+  }
+  motion.mi_size.assign(frame.mi_size, frame.mi_size + frame.num_units());
+  motion.num_lists = has_compounds(frame) ? 2 : 1;
+  for (auto& list : motion.used_lists()) list.assign(motion.mi_size.size(), UnitMotion{});
+}
+
+// The frame with its warp models where they are kept: local ones, then global ones.
+FrameMotion keep_warps(const FrameMotion& frame, TrustedMotion& motion) {
+  FrameMotion kept = frame;
+  motion.warps.assign(frame.local_warp_params, frame.local_warp_params + 6 * frame.num_local_warps);
+  motion.warps.insert(motion.warps.end(), frame.gm_params, frame.gm_params + 6 * (kNumRefs - 1));
+  kept.local_warp_params = motion.warps.data();
+  kept.gm_params = motion.warps.data() + 6 * frame.num_local_warps;
+  return kept;
+}
+
+bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool coded) {
+  if (options.max_block_area && block_area > *options.max_block_area) return false;
+  return coded || !options.max_uncoded_block_area || block_area <= *options.max_uncoded_block_area;
+}
+
+// Whether motion from `from` to `to` keeps away from the picture's edge.
+bool is_within_border(const TrustedMotion& motion, float border, Point from, Point to) {
+  const auto is_in_border = [&](Point p) {
+    return p.x < border || p.y < border || p.x > motion.coded_width - border ||
+           p.y > motion.height - border;
+  };
+  return !is_in_border(from) && !is_in_border(to);
+}
+
+// The displacements of visible units by the rules that need no other unit.
+void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
+                        TrustedMotion& motion) {
+  const DisplacementModel model(frame);
+  const auto border = static_cast<float>(options.border.value_or(0));
+  for (int row = 0; row < motion.visible_rows; ++row) {
+    for (int col = 0; col < motion.visible_cols; ++col) {
+      const int unit = row * motion.cols + col;
+      if (!is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0)) continue;
+      for (int list = 0; list < motion.num_lists; ++list) {
+        const Displacement d = model.at(unit, list);
+        if (d.ref == 0 || !options.is_within_reach(motion.ref_interval[d.ref])) continue;
+        const Point centre{kUnit * static_cast<float>(col) + kUnit / 2.F,
+                           kUnit * static_cast<float>(row) + kUnit / 2.F};
+        if (border > 0.F &&
+            !is_within_border(motion, border, centre, {centre.x + d.dx, centre.y + d.dy})) {
+          continue;
+        }
+        const std::int32_t warp =
+            d.warp == nullptr ? -1 : static_cast<std::int32_t>(d.warp - motion.warps.data());
+        motion.lists[list][unit] = {d.dx, d.dy, warp, 0.F, static_cast<std::int8_t>(d.ref)};
+      }
+    }
+  }
+}
+
+// Of a unit's motion to that of another unit, in px, by the list that comes nearest, motion into
+// other frames scaled to the interval; infinite where nothing can be compared.
+double disagreement(const TrustedMotion& motion, const UnitMotion& own, int other_unit) {
+  const double interval = motion.ref_interval[own.ref];
+  double best = std::numeric_limits<double>::infinity();
+  for (const auto& list : motion.used_lists()) {
+    const UnitMotion& other = list[other_unit];
+    if (other.ref == 0) continue;
+    double ratio = 1;
+    if (motion.ref_decode_index[other.ref] != motion.ref_decode_index[own.ref]) {
+      const double other_interval = motion.ref_interval[other.ref];
+      if (interval == 0 || other_interval == 0) continue;
+      ratio = interval / other_interval;
+    }
+    best = std::min(
+        best, std::max(std::abs(own.dx - ratio * other.dx), std::abs(own.dy - ratio * other.dy)));
+  }
+  return best;
+}
+
+// Holds the units around the block that starts at (row, col) each against the unit of the block
+// that it touches.
+Agreement judge_border(const TrustedMotion& motion, std::optional<double> smoothness, int row,
+                       int col, int list) {
+  Agreement result;
+  const auto judge = [&](int inner_row, int inner_col, int outer_row, int outer_col) {
+    if (!motion.is_visible(outer_row, outer_col) || inner_row >= motion.visible_rows ||
+        inner_col >= motion.visible_cols) {
+      return;
+    }
+    const UnitMotion& own = motion.lists[list][inner_row * motion.cols + inner_col];
+    if (own.ref == 0) return;
+    const double distance = disagreement(motion, own, outer_row * motion.cols + outer_col);
+    if (std::isinf(distance)) return;
+    ++result.judged;
+    result.distance += distance;
+    // Motion that is large changes much from place to place.
+    const double length = std::sqrt(own.dx * own.dx + own.dy * own.dy);
+    if (smoothness && distance <= *smoothness * (1 + length / 8)) ++result.agreeing;
+  };
+  const int mi_size = motion.mi_size[row * motion.cols + col];
+  const int end_row = row + av1::kBlockHeight[mi_size] / 4;
+  const int end_col = col + av1::kBlockWidth[mi_size] / 4;
+  for (int c = col; c < end_col; ++c) {
+    judge(row, c, row - 1, c);
+    judge(end_row - 1, c, end_row, c);
+  }
+  for (int r = row; r < end_row; ++r) {
+    judge(r, col, r, col - 1);
+    judge(r, end_col - 1, r, end_col);
+  }
+  return result;
+}
+
+// Of the block whose first unit is at (row, col). At the picture's border, other units of a block
+// may be trusted than the first.
+Verdict judge_block(const FrameMotion& frame, const TrackBuilderOptions& options,
+                    const TrustedMotion& motion, int row, int col, int list) {
+  const int unit = row * motion.cols + col;
+  const UnitMotion& own = motion.lists[list][unit];
+  const Agreement around = judge_border(motion, options.smoothness, row, col, list);
+  StepTraits traits;
+  traits.block_area = motion.block_area(unit);
+  traits.y_mode = frame.y_mode[unit];
+  traits.coded = frame.skip[unit] == 0;
+  traits.warped = own.warp >= 0;
+  traits.overlapped = frame.motion_mode[unit] == av1::OBMC;
+  traits.length = std::hypot(own.dx, own.dy);
+  if (around.judged > 0) {
+    traits.disagreement = static_cast<float>(around.distance / around.judged);
+  }
+  const float sigma = step_sigma(traits);
+  return {sigma * sigma, options.smoothness && 2 * around.agreeing < around.judged};
+}
+
+// Says how far to trust the lists of every block, and takes out those that most of the units
+// around it contradict. A block of w x h units lies at a multiple of (w, h), so its origin follows
+// from its size.
+void judge_blocks(const FrameMotion& frame, const TrackBuilderOptions& options,
+                  TrustScratch& scratch, TrustedMotion& motion) {
+  auto& verdicts = scratch.verdicts;
+  for (auto& list : verdicts) list.assign(motion.mi_size.size(), Verdict{});
+  for (int row = 0; row < motion.visible_rows; ++row) {
+    for (int col = 0; col < motion.visible_cols; ++col) {
+      const int unit = row * motion.cols + col;
+      const int block_cols = av1::kBlockWidth[motion.mi_size[unit]] / 4;
+      const int block_rows = av1::kBlockHeight[motion.mi_size[unit]] / 4;
+      const int origin = (row & ~(block_rows - 1)) * motion.cols + (col & ~(block_cols - 1));
+      for (int list = 0; list < motion.num_lists; ++list) {
+        verdicts[list][unit] = origin != unit ? verdicts[list][origin]
+                                              : judge_block(frame, options, motion, row, col, list);
+      }
+    }
+  }
+  for (std::size_t unit = 0; unit < motion.mi_size.size(); ++unit) {
+    for (int list = 0; list < motion.num_lists; ++list) {
+      motion.lists[list][unit].variance = verdicts[list][unit].variance;
+      if (verdicts[list][unit].rough) motion.lists[list][unit].ref = 0;
+    }
+  }
+}
+
+}  // namespace
+
+int TrustedMotion::block_area(int unit) const {
+  return av1::kBlockWidth[mi_size[unit]] * av1::kBlockHeight[mi_size[unit]];
+}
+
+void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
+                         TrustScratch& scratch, TrustedMotion& motion) {
+  read_frame_values(frame, motion);
+  read_displacements(keep_warps(frame, motion), options, motion);
+  judge_blocks(frame, options, scratch, motion);
+  const auto limit = [](std::optional<double> value) {
+    return static_cast<float>(value.value_or(0));
+  };
+  if (options.interpolation.value_or(0) > 0)
+    interpolate_blocks(limit(options.interpolation), scratch.unfilled, motion);
+  if (options.bridge.value_or(0) > 0)
+    bridge_blocks(limit(options.bridge), scratch.unfilled, motion);
+  motion.num_linked = {};
+  for (const auto& list : motion.used_lists()) {
+    for (const UnitMotion& unit : list) ++motion.num_linked[unit.ref];
+  }
+}
+
+}  // namespace colmap_av1::tracks

@@ -1,0 +1,109 @@
+// The motion of a coded frame as far as it may be trusted, unit by unit.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "tracks/displacement.h"
+#include "tracks/frame_motion.h"
+#include "tracks/geometry.h"
+#include "tracks/track_builder_options.h"
+
+namespace colmap_av1::tracks {
+
+// A unit's motion by one of its lists: ref 0 where there is none to trust.
+struct UnitMotion {
+  float dx = 0.F;  // at the unit's centre, in coded pixels
+  float dy = 0.F;
+  std::int32_t warp = -1;  // first of six entries of TrustedMotion::warps
+  float variance = 0.F;    // expected of the displacement, in coded px^2
+  std::int8_t ref = 0;
+};
+
+struct TrustedMotion {
+  int decode_index = -1;
+  int display_index = -1;
+  int rows = 0;
+  int cols = 0;
+  int visible_rows = 0;
+  int visible_cols = 0;
+  float width = 0.F;
+  float height = 0.F;
+  float coded_width = 0.F;
+  float upscale = 1.F;  // picture pixels to a coded one, above 1 by super-resolution
+  std::array<int, kNumRefs> ref_decode_index{};
+  std::array<int, kNumRefs> ref_interval{};      // in shown frames, 0 where unknown
+  std::array<std::vector<UnitMotion>, 2> lists;  // the second stays unused without compounds
+  int num_lists = 0;
+  std::array<int, kNumRefs> num_linked{};  // entries of the lists, by their ref
+  std::vector<std::int32_t> warps;
+  std::vector<std::uint8_t> mi_size;
+
+  std::span<std::vector<UnitMotion>> used_lists() { return std::span(lists).first(num_lists); }
+  std::span<const std::vector<UnitMotion>> used_lists() const {
+    return std::span(lists).first(num_lists);
+  }
+  bool moves(int unit) const {
+    return lists[0][unit].ref != 0 || (num_lists > 1 && lists[1][unit].ref != 0);
+  }
+  bool is_visible(int row, int col) const {
+    return row >= 0 && row < visible_rows && col >= 0 && col < visible_cols;
+  }
+  // Whether a position in coded pixels lies in the picture.
+  bool contains(Point position) const {
+    return position.x >= 0.F && position.y >= 0.F && position.x < coded_width &&
+           position.y < height;
+  }
+  Point unit_centre(int unit) const {
+    return {kUnit * (static_cast<float>(unit % cols) + 0.5F),
+            kUnit * (static_cast<float>(unit / cols) + 0.5F)};
+  }
+  int block_area(int unit) const;  // of the block that a unit belongs to, in px^2
+};
+
+// Working memory of read_trusted_motion, kept by the caller from frame to frame.
+struct TrustScratch {
+  // How far to trust a block's motion.
+  struct Verdict {
+    float variance = 0.F;
+    bool rough = false;
+  };
+  std::array<std::vector<Verdict>, 2> verdicts;
+  std::vector<UnitMotion> unfilled;
+};
+
+// Copies what chaining needs of a coded frame, by the trust rules of `options`. Overwrites
+// `motion`, whose memory is used again. The frame has passed check_frame_motion.
+void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
+                         TrustScratch& scratch, TrustedMotion& motion);
+
+inline bool moves_alike(const UnitMotion& a, const UnitMotion& b, float limit) {
+  return distance({a.dx, a.dy}, {b.dx, b.dy}) < limit;
+}
+
+// Where a unit's motion takes a position in coded pixels.
+inline Point move(const TrustedMotion& frame, const UnitMotion& motion, Point position) {
+  if (motion.warp < 0) return {position.x + motion.dx, position.y + motion.dy};
+  double x = 0;
+  double y = 0;
+  apply_warp(frame.warps.data() + motion.warp, position.x, position.y, &x, &y);
+  return {static_cast<float>(x), static_cast<float>(y)};
+}
+
+// The position that `move` takes to `target`. False where the warp has no inverse.
+inline bool move_back(const TrustedMotion& frame, const UnitMotion& motion, Point target,
+                      Point* source) {
+  if (motion.warp < 0) {
+    *source = {target.x - motion.dx, target.y - motion.dy};
+    return true;
+  }
+  double x = 0;
+  double y = 0;
+  if (!invert_warp(frame.warps.data() + motion.warp, target.x, target.y, &x, &y)) return false;
+  *source = {static_cast<float>(x), static_cast<float>(y)};
+  return true;
+}
+
+}  // namespace colmap_av1::tracks
