@@ -91,8 +91,8 @@ def densify(
         model: folder of a COLMAP model of this video's frames, from whatever mapper.
         video: a video; one that is not AV1 is converted first.
         output: new or empty folder for the dense model.
-        image_path: folder of the model's images, to tell by what they show which frames they
-            are where their names leave doubt.
+        image_path: folder of the model's images, to recognise by their content which frames
+            they are where their names leave doubt.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 

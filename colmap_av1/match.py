@@ -53,15 +53,15 @@ class MatchReport:
         track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
             to 1 (longest).
         num_observations: keypoints of all images.
-        focal_length: in heights of a pixel, where the tracks told it; None where it was given,
-            or the motion does not tell it, so that the camera has COLMAP's first guess.
+        focal_length: in heights of a pixel, where it was estimated from the tracks; None where it
+            was given, or the motion does not determine it and the camera has COLMAP's first guess.
         num_pairs: image pairs written.
         num_verified_pairs: those with a two-view geometry.
         num_matches: matches of all pairs.
         num_inliers: inlier matches of all pairs.
         configs: number of pairs by COLMAP's name of their two-view configuration.
         forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
-            with no pair unless told to, and the focal length cannot be found.
+            with no pair unless its options allow that, and the focal length cannot be found.
         seconds: wall time of each stage.
         warnings: what the user should know, such as damage of the stream.
     """

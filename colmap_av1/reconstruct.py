@@ -91,7 +91,7 @@ def reconstruct(
     The poses come from COLMAP's mapper on a spread choice of long, sure tracks; then every
     track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one
     PINHOLE camera, undistorted and of the video's size, and beside them `database.db` and
-    `report.json`. A run that was stopped goes on after its last finished stage; a changed
+    `report.json`. A run that was stopped is resumed after its last finished stage; a changed
     option redoes what depends on it.
 
     Args:

@@ -254,7 +254,7 @@ def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> No
 
 
 def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An interrupt and a full disk leave the old output whole and are gone on after."""
+    """An interrupt and a full disk leave the old output whole, and the run is resumed."""
     before = {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")}
     other = replace(OPTIONS, triangulate=TriangulateOptions(min_angle=2.0))
 

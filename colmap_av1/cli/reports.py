@@ -42,7 +42,7 @@ def match_rows(report: MatchReport) -> Rows:
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
     ]
     if report.focal_length is not None:
-        rows.append(("focal length", f"{report.focal_length:.1f} px, told by the tracks"))
+        rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     return [*rows, *_seconds_rows(report.seconds)]

@@ -38,7 +38,7 @@ class CheckReport:
 
     Attributes:
         database: the database file.
-        user_version: the number by which COLMAP tells layouts apart.
+        user_version: the number by which COLMAP distinguishes layouts.
         layout: versions of COLMAP whose layout it is.
         readers: versions of COLMAP that open it.
         num_images: images listed.

@@ -82,7 +82,7 @@ class Pairs:
         index: int64 [m, 2] place of their images in `Images`.
         num_matches: int64 [m]; -1 where there is no row.
         num_inliers: int64 [m]; -1 where there is no row.
-        config: int64 [m] kind of geometry.
+        config: int64 [m] configuration of the geometry.
         displacement: float64 [m] median distance of the inliers' keypoints, in pixels.
         spread: float64 [m] how far these displacements differ, in pixels: parallax does that,
             and a turn of the camera much less.

@@ -125,7 +125,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
         other = seen.setdefault(_pair_part(name), name)
         if other != name:
             raise DatabaseError(
-                f"{path}: hloc cannot tell images {other!r} and {name!r} apart in its pairs: "
+                f"{path}: hloc cannot distinguish images {other!r} and {name!r} in its pairs: "
                 "rename one"
             )
 

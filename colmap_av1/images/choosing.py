@@ -68,7 +68,7 @@ def choose_images(
 ) -> ChosenImages:
     """Choose the frames that are images: those that existing images show, else by the options.
 
-    Existing images are told apart by `frame_list`; by `every`, in the order of their names from
+    Existing images are identified by `frame_list`; by `every`, in the order of their names from
     frame 0 on, or with `first_number` by the numbers in them; or by count and names, see
     `frames_of_images`. Where these leave doubt or turn out wrong, and the files are there, what
     they show says it.

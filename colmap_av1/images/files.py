@@ -240,7 +240,7 @@ def _write_frames(
     num_threads: int,
     report: Callable[[int], None],
 ) -> None:
-    """Write the wanted ones of the frames, on threads; `report` is told how many are written."""
+    """Write the wanted ones of the frames, on threads; `report` gets how many are written."""
     size: tuple[int, ...] | None = None
     queue: list[Future[None]] = []
     num_taken = 0

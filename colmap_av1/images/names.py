@@ -69,7 +69,7 @@ def frames_of_images(
         unnumbered = names[numbers.index(None)]
         raise ImageError(
             f"{counts}, and '{unnumbered}' has no frame number: list the images in a "
-            "--frame_list, or give their folder as --image_path, to tell them by what they show"
+            "--frame_list, or give their folder as --image_path, to recognise them by content"
         )
     lowest, highest = min(found), max(found)
     if first_number is None:
@@ -98,8 +98,8 @@ def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) ->
     raise ImageError(
         f"{counts}, and the image numbers {lowest} to {highest} do not say which frames they "
         "are: say with --first_number how the first frame of the video is numbered, list the "
-        "images in a --frame_list, or give their folder as --image_path, to tell them by what "
-        "they show"
+        "images in a --frame_list, or give their folder as --image_path, to recognise them by "
+        "content"
     )
 
 

@@ -107,7 +107,7 @@ def prepare_images(
         options: all but those of density, pairs and verification are used; all are checked.
         listed: (width, height) of images that a database lists, by name.
         clock: gets the stages up to "choice".
-        progress: told about these stages.
+        progress: called in these stages.
 
     Raises:
         VideoError: the video cannot be read.
@@ -214,7 +214,7 @@ def write_chosen(
         chosen: the images.
         options: those of reading and the threads are used.
         display: how pictures are cut and turned.
-        progress: told about the stage "images".
+        progress: called in the stage "images".
 
     Returns:
         The number of images written; the others were there.

@@ -1,4 +1,4 @@
-"""The focal length that tracks tell: the one with which pairs of images agree best."""
+"""The focal length, estimated from tracks: that with the least epipolar errors of image pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _Floats = NDArray[np.float64]
 # Focal lengths that are tried, in longer sides of the image: fields of view from 127 to 18 degrees.
 _SHORTEST, _LONGEST, _NUM_TRIED = 0.25, 3.2, 17
 # Pairs that are looked at, one of each part of the video, and matches of each; about so many
-# matches tell which pair of a part has the widest parallax.
+# matches show which pair of a part has the widest parallax.
 _NUM_PAIRS = 40
 _NUM_MATCHES = 200
 _NUM_GLANCED = 64
@@ -26,7 +26,7 @@ _MIN_PAIRS = 8
 _MIN_MATCHES = 50
 # Error in pixels from which on a match counts less (Cauchy's loss).
 _LOSS_SCALE = 0.5
-# A loss far below what tracks are good for tells no more than this one.
+# A loss far below the precision of tracks means no more than this one.
 _LEAST_LOSS = 1e-3
 # A pose is searched with some of the matches and refined with all.
 _NUM_SEARCHED = 64
@@ -51,7 +51,7 @@ def estimate_focal_length(
 
     For each of a range of focal lengths relative poses are fitted to pairs of wide parallax; the
     robust loss of their epipolar errors, its geometric mean over the pairs, is least at the true
-    one. A single pair tells little, many together do. The principal point counts as the centre, the
+    one. A single pair says little, many together do. The principal point counts as the centre, the
     lens as free of distortion: a first guess for the mapper, a few per cent off.
 
     Args:
@@ -63,9 +63,9 @@ def estimate_focal_length(
         seed: the random seed.
 
     Returns:
-        The focal length in heights of a pixel; None where the motion does not tell it, as where
-        the camera moves along its axis, or in a plane circle around what it looks at, or where
-        too few matches do.
+        The focal length in heights of a pixel; None where the motion does not determine it, as
+        where the camera moves along its axis, or in a plane circle around what it looks at, or
+        where there are too few matches.
     """
     shape = np.array([pixel_aspect, 1.0])
     centre = np.array(size) * shape / 2

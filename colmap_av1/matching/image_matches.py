@@ -68,7 +68,7 @@ def pair_images(
         chosen: the images.
         options: those of pairs are used.
         clock: gets the stage "pairs".
-        progress: told about the stage "pairs".
+        progress: called in the stage "pairs".
 
     Raises:
         VideoError: no two images share enough tracks.
@@ -103,7 +103,7 @@ def shared_focal_length(
     *,
     clock: Clock,
 ) -> float | None:
-    """The focal length that the tracks tell of a camera about which nothing is given.
+    """Estimate, from the tracks, the focal length of a camera about which nothing is given.
 
     Args:
         paired: the images, all of one camera.
@@ -113,7 +113,7 @@ def shared_focal_length(
         clock: gets the stage "focal length".
 
     Returns:
-        In heights of a pixel; None where parameters are given or the motion does not tell it.
+        In heights of a pixel; None where parameters are given or the motion does not determine it.
     """
     camera = options.camera
     if camera.camera_params is not None or not is_nearly_pinhole(camera.camera_model):
@@ -144,7 +144,7 @@ def verify_images(
         cameras: the camera of all images, or one for each.
         options: those of verification are used.
         clock: gets the stage "verification".
-        progress: told about the stage "verification".
+        progress: called in the stage "verification".
     """
     keypoints, pairs, matches = paired.keypoints, paired.pairs, paired.matches
     with clock.measure("verification"):

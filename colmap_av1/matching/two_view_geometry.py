@@ -45,7 +45,7 @@ class TwoViewGeometry:
 
     Attributes:
         config: configuration.
-        inlier_matches: uint32 [n, 2] the matches that agree with it, in their order.
+        inlier_matches: uint32 [n, 2] the inliers, in the order of the matches.
         E: float64 [3, 3] essential matrix on normalised, undistorted coordinates, or None.
         F: float64 [3, 3] fundamental matrix on pixels, or None, also where E explains so many
             matches that F was not needed.

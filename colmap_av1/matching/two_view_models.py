@@ -2,7 +2,7 @@
 
 Nearly all matches of tracks are right, so a linear fit or few iterations of PoseLib's robust
 estimators on matches that are spread over the image find a model; more of them refine it and all
-are tested against it. Where few are right, the robust estimators go on by themselves.
+are tested against it. Where few are right, the robust estimators iterate longer by themselves.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _COLMAP_LEAVES_OUT = 1.08
 
 @dataclass(frozen=True)
 class Model:
-    """A model and the matches that agree with it.
+    """A model and its inliers.
 
     Attributes:
         matrix: float64 [3, 3] in the coordinates the matches were tested in; None where none
@@ -229,7 +229,7 @@ def _again_on_inliers(
 
 
 def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
-    """The loss that refinement lowers: it tells models apart that have the same inliers."""
+    """The loss that refinement lowers: it ranks models that have the same inliers."""
     if model.matrix is None:
         return math.inf
     algebraic, gradient = _epipolar_terms(model.matrix, points.spread_a, points.spread_b)

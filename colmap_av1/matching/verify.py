@@ -291,7 +291,7 @@ def _verify_calibrated(
 
 
 def _inliers(matches: NDArray[np.uint32], model: Model) -> NDArray[np.uint32]:
-    """The matches that agree with a model; the same object where all do."""
+    """The inliers of a model; the same object where all matches are."""
     chosen = matches if model.count == len(matches) else matches.compress(model.inliers, axis=0)
     return chosen.astype(np.uint32, copy=False)
 

@@ -114,7 +114,7 @@ def triangulate(
     error follow, weighted by the expected error of each observation and by how well it agrees.
     Observations beyond `max_reprojection_error`, or behind the camera, are dropped. What is dropped
     may be a point of its own, where a track slid from one surface to another: it is tried once
-    more. Rays that meet at an angle a and are off by e tell a distance to e / a of it; where that
+    more. Rays that meet at an angle a and are off by e give a distance to e / a of it; where that
     is too much there is no point.
 
     Args:

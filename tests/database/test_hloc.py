@@ -248,7 +248,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         (
             "UPDATE images SET name = CASE image_id WHEN 1 THEN 'a/b' ELSE 'a-b' END "
             "WHERE image_id < 3",
-            "cannot tell images 'a-b' and 'a/b' apart",
+            "cannot distinguish images 'a-b' and 'a/b'",
         ),
         ("DELETE FROM keypoints", "holds no keypoints"),
         ("DELETE FROM keypoints WHERE image_id = 4", "match keypoints that are not there"),
