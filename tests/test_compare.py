@@ -145,7 +145,7 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     assert [c["seconds"] for c in again["columns"]] == [c["seconds"] for c in first["columns"]]
 
     # A model as the truth: itself.
-    model = output / "frontends" / "sift-exhaustive" / "mapped" / "model"
+    model = output / "frontends" / "sift-exhaustive" / "mapped" / "model" / "0"
     report = run_again(video, output, model, "sift-exhaustive")
     (sift,) = report.columns
     assert (report.is_truth, report.pose_reference) == (True, str(model))
