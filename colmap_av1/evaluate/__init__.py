@@ -1,19 +1,14 @@
 """What tracks, models and front-ends are worth: one module for each family of metrics."""
 
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage, prepare_footage
-from colmap_av1.evaluate.frontends.frontends import (
-    FRONTENDS,
-    Frontend,
-    FrontendRun,
-    make_frontends,
-    run_frontend,
-)
+from colmap_av1.evaluate.frontends.frontend import Frontend, FrontendRun
 from colmap_av1.evaluate.frontends.mapping import (
     MapperRun,
     densify_model,
     measure_mapper,
 )
 from colmap_av1.evaluate.frontends.measure import Measured, run_measured
+from colmap_av1.evaluate.frontends.registry import FRONTENDS, make_frontends, run_frontend
 from colmap_av1.evaluate.metrics.database_tracks import database_tracks
 from colmap_av1.evaluate.metrics.poses import PoseErrors, model_poses, pose_errors
 from colmap_av1.evaluate.metrics.sequence import Sequence, read_sequence

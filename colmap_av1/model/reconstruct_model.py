@@ -80,7 +80,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
     return run_stage(
         run.stages,
         "model",
-        [posed.key, given],
+        [posed.digest, given],
         into=run.output,
         products=["images", "sparse"],
         make=make,

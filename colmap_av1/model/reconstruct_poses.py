@@ -78,7 +78,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
     return run_stage(
         run.stages,
         "poses",
-        [matched.key, how, pycolmap.__version__],
+        [matched.digest, how, pycolmap.__version__],
         into=run.stages,
         products=["poses"],
         make=make,
@@ -159,7 +159,7 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
     return run_stage(
         run.stages,
         "adjustment",
-        [posed.key, given],
+        [posed.digest, given],
         into=run.stages,
         products=["adjusted"],
         make=make,

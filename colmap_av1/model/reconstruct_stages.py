@@ -33,9 +33,10 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
+from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.util.stages import Kept, run_stage
-from colmap_av1.video.unchanged import check_unchanged, file_state
+from colmap_av1.video.unchanged import check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
@@ -98,13 +99,12 @@ def track_stage(run: Run) -> Kept:
             "warnings": list(tracked.warnings),
         }
 
-    given = (options.images, options.read, options.tracks, options.refine, options.encode)
-    frame_list = options.images.frame_list
-    listed = [file_state(frame_list).found] if frame_list is not None else None
+    given = (options.images, options.read, options.tracks, options.refine)
+    listed = digest_if_there(options.images.frame_list)
     return run_stage(
         run.stages,
         "tracks",
-        [*(file.found for file in source.files), given, listed],
+        [[file_digest(file.path) for file in source.files], given, listed],
         into=run.stages,
         products=["tracks.npz"],
         make=make,
@@ -159,7 +159,7 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
     return run_stage(
         run.stages,
         "matches",
-        [tracked.key, given],
+        [tracked.digest, given],
         into=run.output,
         products=["database.db"],
         make=make,

@@ -1,4 +1,10 @@
-"""Stages of a long run that are kept in a folder, so that a later run goes on after them."""
+"""Stages of a long run that are kept in a folder, so that a later run resumes after them.
+
+A stage's record is written when all it makes is there: a key of what the result depends on, facts,
+and what tells the products from others. A later run takes over the stage where the key is the
+same and the products are as recorded. All else is made again, damaged records and products too.
+The key holds options and inputs by their content, and this package's code and version.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ModelError, OptionError, cannot_write
-from colmap_av1.util.files import only_run, remove_leftovers
+from colmap_av1.util.digests import (
+    code_digest,
+    digest_of,
+    file_record,
+    is_as_recorded,
+    package_version,
+)
+from colmap_av1.util.files import only_run, remove_leftovers, whole_file
 
 _FOLDER = ".stages"
+WHOLE_PACKAGE = (".",)
 
 
 @dataclass(frozen=True)
@@ -23,13 +37,13 @@ class Kept:
     """A finished stage.
 
     Attributes:
-        facts: what the stage told, as JSON holds it.
-        key: what its result depends on, digested.
+        facts: what the stage found, as JSON holds it.
+        digest: tells its result, products included, from others: what stages after it depend on.
         resumed: it was finished by an earlier run.
     """
 
     facts: dict[str, Any]
-    key: str
+    digest: str
     resumed: bool
 
 
@@ -69,7 +83,8 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
             raise OptionError(
                 f"{output}: another run is at work in it: wait for its end, or give another folder"
             )
-        remove_leftovers(output)
+        for folder in (output, stages):
+            remove_leftovers(folder)
         yield stages
 
 
@@ -84,12 +99,13 @@ def run_stage(
 ) -> Kept:
     """Run a stage, unless an earlier run finished it with the same input.
 
-    What it makes appears under its name when it is complete, never in part.
+    What it makes appears under its name when it is complete, never in part; what was there until
+    then stays.
 
     Args:
         stages: the folder of the stages.
         name: name of the stage.
-        depends_on: everything the result depends on; told apart by its `repr`.
+        depends_on: everything the result depends on but the code, see `digest_of`.
         into: folder that gets the products.
         products: files and folders that the stage makes.
         make: makes the products in the given folder and returns facts that JSON can hold.
@@ -97,15 +113,11 @@ def run_stage(
     Raises:
         ModelError: something cannot be written.
     """
-    key = hashlib.sha256(repr(depends_on).encode()).hexdigest()
+    key = _stage_key(depends_on)
     record = stages / f"{name}.json"
-    if record.is_file() and all((into / product).exists() for product in products):
-        try:
-            before = json.loads(record.read_text())
-        except ValueError:
-            before = {}
-        if before.get("key") == key:
-            return Kept(before["facts"], key, resumed=True)
+    finished = _finished(record, key, into)
+    if finished is not None:
+        return finished
     partial = stages / f"{name}.partial"
     try:
         _remove(partial)
@@ -115,9 +127,7 @@ def run_stage(
         for product in products:
             _remove(into / product)
             (partial / product).replace(into / product)
-        text = json.dumps({"key": key, "facts": facts}, indent=1)
-        (partial / record.name).write_text(text)
-        (partial / record.name).replace(record)
+        return _record(record, key, facts, into, [into / product for product in products])
     except OSError as error:
         if error.filename is not None and stages.parent not in Path(error.filename).parents:
             raise  # of what is read
@@ -127,7 +137,98 @@ def run_stage(
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Kept(facts, key, resumed=False)
+
+
+def run_stage_in(
+    folder: Path,
+    depends_on: Sequence[Any],
+    make: Callable[[], dict[str, Any]],
+    *,
+    products: Sequence[Path],
+    made_by: Sequence[str] = WHOLE_PACKAGE,
+    timed: bool = False,
+) -> Kept:
+    """Run a stage that has a folder to itself, unless an earlier run finished it.
+
+    What it makes is made in its place, for programs that write down where their output lies.
+
+    Args:
+        folder: emptied before the stage is run; gets `result.json` beside what the stage leaves.
+        depends_on: everything the result depends on but the code, see `digest_of`.
+        make: makes the products and returns facts that JSON can hold.
+        products: files and folders that later stages read, in the folder or elsewhere.
+        made_by: folders of this package whose code changes the result, see `code_digest`: where
+            other programs make it, not those that only make what it depends on.
+        timed: the facts tell how long it took, so that the number of threads counts.
+
+    Raises:
+        OSError: something cannot be written.
+    """
+    key = _stage_key(depends_on, made_by=made_by, timed=timed)
+    record = folder / "result.json"
+    finished = _finished(record, key, folder)
+    if finished is not None:
+        return finished
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return _record(record, key, make(), folder, products)
+
+
+def _stage_key(
+    depends_on: Sequence[Any], *, made_by: Sequence[str] = WHOLE_PACKAGE, timed: bool = False
+) -> str:
+    code = [code_digest(*made_by)]
+    if tuple(made_by) == WHOLE_PACKAGE:
+        code.append(package_version())
+    return digest_of([code, *depends_on], timed=timed)
+
+
+def _finished(record: Path, key: str, into: Path) -> Kept | None:
+    """The stage as recorded; None where it is another, or the record or a product is damaged."""
+    try:
+        body = json.loads(record.read_text())
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(body, dict) or body.pop("digest", None) != _json_digest(body):
+        return None
+    if body["key"] != key:
+        return None
+    if not all(is_as_recorded(into / name, file) for name, file in body["files"].items()):
+        return None
+    return _kept(body, resumed=True)
+
+
+def _record(
+    record: Path, key: str, facts: dict[str, Any], into: Path, products: Sequence[Path]
+) -> Kept:
+    files = {
+        path.relative_to(into).as_posix() if path.is_relative_to(into) else str(path.absolute()): (
+            file_record(path)
+        )
+        for product in products
+        for path in _files_of(product)
+    }
+    # As a later run reads them: JSON knows no tuples.
+    body = json.loads(json.dumps({"key": key, "facts": facts, "files": files}))
+    with whole_file(record) as partial:
+        partial.write_text(json.dumps({**body, "digest": _json_digest(body)}, indent=1))
+    return _kept(body, resumed=False)
+
+
+def _files_of(product: Path) -> list[Path]:
+    if not product.is_dir():
+        return [product]
+    return sorted(path for path in product.rglob("*") if path.is_file())
+
+
+def _kept(body: dict[str, Any], *, resumed: bool) -> Kept:
+    contents = {name: file["digest"] for name, file in body["files"].items()}
+    result = {"key": body["key"], "facts": body["facts"], "contents": contents}
+    return Kept(body["facts"], _json_digest(result), resumed)
+
+
+def _json_digest(body: Any) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
 def _remove(path: Path) -> None:

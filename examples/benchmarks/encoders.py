@@ -37,10 +37,11 @@ from colmap_av1.evaluate import (
     model_figures,
     prepare_footage,
     run_frontend,
+    run_measured,
 )
-from colmap_av1.evaluate.frontends.measure import run_measured
-from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.encode import encode
 from colmap_av1.video.encoders import find_encoder
 
@@ -168,11 +169,11 @@ def lossless(material: ruler.Material, folder: Path) -> Path:
     words = material.source
     video = folder / "lossless" / "video.mkv"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         ruler.ffmpeg(*words, "-an", "-c:v", "ffv1", "-pix_fmt", "yuv420p", str(video))
         return {}
 
-    kept(video.parent, words, work)
+    run_stage_in(video.parent, words, make, products=[video], made_by=())
     return video
 
 
@@ -180,11 +181,12 @@ def encoded(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path, d
     """The stream of a setting, and the time it took."""
     stream = folder / "stream.mp4"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         measured = run_measured(encode_quietly, source, stream, setting, log=folder / "log.txt")
         return {"seconds": measured.seconds, "cpu_seconds": measured.cpu_seconds}
 
-    return stream, kept(folder, (content_of(source), setting), work)
+    given = (file_digest(source), setting)
+    return stream, run_stage_in(folder, given, make, products=[stream], timed=True).facts
 
 
 def encode_quietly(source: Path, stream: Path, setting: EncodeOptions) -> None:

@@ -59,8 +59,9 @@ from colmap_av1.evaluate import (
     run_frontend,
     track_statistics,
 )
-from colmap_av1.evaluate.resume import content_of, kept
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
@@ -304,7 +305,8 @@ def real_sequence(case: Case, folder: Path, console: Console) -> Material:
         return {"bytes": video.stat().st_size}
 
     pictures = sorted(source.iterdir()) if source.is_dir() else [source]
-    kept(video.parent, (words, ENCODING, [content_of(p) for p in pictures]), encode)
+    given = (words, ENCODING, [file_digest(p) for p in pictures])
+    run_stage_in(video.parent, given, encode, products=[video], made_by=())
     return Material(
         video, sequence.num_frames, sequence.camera, sequence.cam_from_world, source=words
     )
@@ -316,12 +318,13 @@ def source_footage(footage: Footage, material: Material, folder: Path) -> Footag
     words = material.source
     images = folder / "source" / "images"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         images.mkdir()
         ffmpeg(*words, "-start_number", "0", str(images / "frame_%06d.png"))
         return {}
 
-    kept(images.parent, (words, content_of(footage.video)), work)
+    given = (words, file_digest(footage.video))
+    run_stage_in(images.parent, given, make, products=[images], made_by=())
     return replace(footage, image_path=images)
 
 

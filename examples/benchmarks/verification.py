@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import CameraOptions, ColmapAv1Error, MatchOptions, match
 from colmap_av1.database.reading import image_ids_from_pair_id
-from colmap_av1.evaluate import read_sequence
-from colmap_av1.evaluate.frontends.measure import run_measured
+from colmap_av1.evaluate import read_sequence, run_measured
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import DensityOptions, VerifyOptions

@@ -1,4 +1,4 @@
-"""Front-ends and mapper of the comparison, what they take, and what of it is kept."""
+"""Front-ends and mapper of the comparison, and what they take."""
 
 import os
 import signal
@@ -27,7 +27,6 @@ from colmap_av1.evaluate import (
     run_measured,
     track_statistics,
 )
-from colmap_av1.evaluate.resume import kept
 from colmap_av1.options import CameraOptions, DensityOptions, MapOptions, MatchOptions, TrackOptions
 
 EXAMPLES = PROJECT / "examples"
@@ -112,28 +111,6 @@ def _is_alive(pid):
     # One that nobody waits for is a zombie.
     stat = Path(f"/proc/{pid}/stat")
     return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-def test_results_are_kept_while_their_key_is_the_same(tmp_path):
-    folder = tmp_path / "kept"
-    calls = []
-
-    def work():
-        calls.append(list(folder.iterdir()))
-        (folder / "file").touch()
-        return {"call": len(calls)}
-
-    assert kept(folder, (1, "a"), work) == {"call": 1}
-    assert kept(folder, (1, "a"), work) == {"call": 1}
-    assert kept(folder, (1, "b"), work) == {"call": 2}
-    assert calls == [[], []]
-
-    def stop():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        kept(folder, "c", stop)
-    assert kept(folder, "c", work) == {"call": 3}
 
 
 def test_tracks_of_a_database_are_those_written(clip, tmp_path):

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_av1.errors import ImageError, VideoError
-from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.errors import VideoError
 from colmap_av1.images.camera import make_camera
-from colmap_av1.images.files import check_images_there, existing_images, write_images
+from colmap_av1.images.files import existing_images, write_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
 from colmap_av1.matching.image_matches import pair_images, verify_images
@@ -23,7 +22,9 @@ from colmap_av1.options import (
 )
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import keep_frames
+from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
 
@@ -88,12 +89,12 @@ def prepare_footage(
         camera=camera,
     )
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         footage.image_path.mkdir()
         write_images(opened, footage.image_path, footage.names, frames)
         return {}
 
-    kept(folder, (content_of(video), frames), work)
+    run_stage_in(folder, [file_digest(video), frames], make, products=[footage.image_path])
     return footage
 
 
@@ -119,7 +120,7 @@ def choose_footage(
     """
     images = image_path if image_path is not None else folder / "images"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         clock = Clock()
         existed = bool(existing_images(images, options.images.image_name))
         with unchanged(video.state) as check_video:
@@ -141,20 +142,13 @@ def choose_footage(
             "existed": existed,
         }
 
-    listed = options.images.frame_list
-    key = (
-        content_of(video.path),
-        (options.images, options.camera, options.read, options.encode, options.tracks),
-        content_of(Path(listed)) if listed is not None and Path(listed).is_file() else None,
-        str(images),
-        [content_of(images / n) for n in existing_images(images, options.images.image_name)],
-    )
-    facts = kept(folder, key, work)
-    try:
-        check_images_there(images, facts["names"])
-    except ImageError:
-        (folder / "result.json").unlink()
-        facts = kept(folder, key, work)
+    given = (options.images, options.camera, options.read, options.encode, options.tracks)
+    depends_on = [
+        *(file_digest(video.path), given, images),
+        digest_if_there(options.images.frame_list),
+        [file_digest(images / n) for n in existing_images(images, options.images.image_name)],
+    ]
+    facts = run_stage_in(folder, depends_on, make, products=[images]).facts
     for name in ("frames", "size", "warnings"):
         facts[name] = tuple(facts[name])
     return Footage(video=video.path, image_path=images, camera=options.camera, **facts)

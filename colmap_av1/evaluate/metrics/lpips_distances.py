@@ -2,8 +2,8 @@
 
 Standard input: a JSON list of [rendered file, reference file]; standard output: a JSON list
 of distances. Where the packages or the weights are missing, one line on standard error says
-so, with exit status 3. Run by `colmap_av1.evaluate.renderings`; imports nothing of the
-package.
+so, with exit status 3. Run by `colmap_av1.evaluate.metrics.renderings`; imports nothing of
+the package.
 """
 
 import contextlib

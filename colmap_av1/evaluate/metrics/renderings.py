@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,8 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError
+from colmap_av1.errors import EvaluationError, ImageError
+from colmap_av1.evaluate.programs import run_program
 from colmap_av1.util.processes import bound
 
 _Image = NDArray[np.uint8]
@@ -206,14 +206,8 @@ def _lpips(
     In a process of its own: torch and pycolmap do not live in one.
     """
     files = [[str(a), str(b)] for a, b in zip(rendered, references, strict=True)]
-    run = subprocess.run(
-        bound([sys.executable, str(_LPIPS_SCRIPT)]),
-        input=json.dumps(files),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if run.returncode != 0:
-        reason = (run.stderr.strip().splitlines() or ["it ended without a word"])[-1]
-        return None, reason
-    return np.array(json.loads(run.stdout), dtype=np.float64), ""
+    try:
+        distances = run_program(_LPIPS_SCRIPT, files)
+    except EvaluationError as error:
+        return None, str(error)
+    return np.array(distances, dtype=np.float64), ""

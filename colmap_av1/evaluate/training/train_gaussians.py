@@ -2,8 +2,8 @@
 
     train_gaussians.py SCENE.npz OUTPUT ITERATIONS SEED MILESTONE [MILESTONE ...]
 
-SCENE.npz is what `colmap_av1.evaluate.splatting` writes and says. Standard output gets a JSON
-line for every hundredth iteration and every milestone; after a milestone `OUTPUT/ITERATION/`
+SCENE.npz is what `colmap_av1.evaluate.training.splatting` writes and says. Standard output gets
+a JSON line for every hundredth iteration and every milestone; after a milestone `OUTPUT/ITERATION/`
 holds the renderings of the test images. Where packages or the GPU are missing, one line on
 standard error says so, with exit status 3. Imports nothing of the package.
 

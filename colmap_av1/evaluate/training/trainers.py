@@ -20,13 +20,17 @@ from numpy.typing import NDArray
 from colmap_av1.errors import EvaluationError, OptionError
 from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
-from colmap_av1.evaluate.resume import content_of, kept
+from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model.colmap_model import ModelPoints, posed_images, read_model, write_model
+from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_shell
+from colmap_av1.util.stages import run_stage_in
 
 GSPLAT = "gsplat"
 _PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
+# What it says about a training; an upgrade of the rest repeats none.
+_CODE = ("evaluate/training", "evaluate/metrics")
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
 
@@ -76,8 +80,10 @@ def check_trainer(trainer: str) -> None:
 
     Raises:
         OptionError: it has other placeholders, or writes no renderings.
+        EvaluationError: a package that gsplat needs is missing.
     """
     if trainer == GSPLAT:
+        check_packages("the trainer gsplat", ("torch", "gsplat", "pytorch_msssim"), "splatting")
         return
     known = ", ".join(f"{{{name}}}" for name in _PLACEHOLDERS)
     try:
@@ -112,7 +118,7 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
             f"{model}: one image cannot be parted for training and test: give a larger model"
         )
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         run_measured(_undistort, model, image_path, split.data, registered, log=folder / "log.txt")
         halves = split_images(registered)
         for part, names in zip((split.train, split.test), halves, strict=True):
@@ -125,7 +131,8 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
         return {}
 
     files = [*sorted(model.glob("*.bin")), *(image_path / name for name in registered)]
-    kept(folder, ([content_of(file) for file in files], pycolmap.__version__), work)
+    given = ([file_digest(file) for file in files], pycolmap.__version__)
+    run_stage_in(folder, given, make, products=[split.data, split.train, split.test])
     return split
 
 
@@ -154,8 +161,8 @@ def train(
         ColmapAv1Error: the trainer failed, or rendered no test images.
     """
     renders, references = folder / "renders", split.references
-    model = sorted((split.data / "sparse" / "0").glob("*.bin"))
-    given = [content_of(path) for path in (*model, *references)]
+    inputs = [p for part in ("sparse/0", "images") for p in (split.data / part).rglob("*")]
+    given = [file_digest(path) for path in sorted(inputs) if path.is_file()]
     if trainer == GSPLAT:
         stops = tuple(stop for stop in milestones if stop < iterations)
         seconds, states = _kept_gsplat(split, folder, (given, iterations, stops))
@@ -164,7 +171,7 @@ def train(
         metrics = states[-1].metrics
         return Training(seconds, states, [r.name for r in references], references, files, metrics)
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         for path in (folder / "output", renders):
             path.mkdir()
         words = {
@@ -177,9 +184,12 @@ def train(
         }
         quoted = {key: shlex.quote(str(value)) for key, value in words.items()}
         measured = run_measured(_run, trainer.format(**quoted), log=folder / "log.txt")
+        match_renders(renders, references)  # refuses others before they are kept
         return {"seconds": measured.seconds}
 
-    seconds = kept(folder, (trainer, given, iterations), work)["seconds"]
+    depends_on = (trainer, given, iterations)
+    finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
+    seconds = finished.facts["seconds"]
     files = match_renders(renders, references)
     metrics = rendering_metrics(files, references)
     return Training(seconds, (), [r.name for r in references], references, files, metrics)
@@ -212,7 +222,7 @@ def _kept_gsplat(
 ) -> tuple[float, tuple[Milestone, ...]]:
     _, iterations, stops = key
 
-    def work() -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         states = train_gaussians(
             split.data / "sparse" / "0",
             split.data / "images",
@@ -222,7 +232,10 @@ def _kept_gsplat(
         )
         return {"states": [_plain(state) for state in states]}
 
-    states = tuple(_milestone(state) for state in kept(folder, (GSPLAT, *key), work)["states"])
+    finished = run_stage_in(
+        *(folder, (GSPLAT, *key), make), products=[folder / "output"], made_by=_CODE
+    )
+    states = tuple(_milestone(state) for state in finished.facts["states"])
     return states[-1].seconds, states
 
 

@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from colmap_av1.evaluate.report.tables import (
     models_table,
     renderings_table,
 )
+from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import whole_file
 
 PICTURES = "pictures"
@@ -141,11 +141,7 @@ def _json(report: CompareReport) -> str:
 
 
 def _versions() -> dict[str, str]:
-    try:
-        own = version("colmap-av1")
-    except PackageNotFoundError:
-        own = "of a checkout"
-    return {"colmap-av1": own, "pycolmap": pycolmap.__version__}
+    return {"colmap-av1": package_version(), "pycolmap": pycolmap.__version__}
 
 
 def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:

@@ -1,0 +1,35 @@
+"""The front-end that is this package's `match`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from colmap_av1.evaluate.frontends.footage import Footage, frame_list
+from colmap_av1.evaluate.frontends.frontend import Frontend
+from colmap_av1.match import match
+from colmap_av1.options import ImageOptions, MatchOptions
+
+Preset = Literal["sparse", "default", "dense"]
+
+
+def av1_frontend(
+    refine: Literal["none", "lk"], preset: Preset, options: MatchOptions | None = None
+) -> Frontend:
+    """This package's `match`, with the given refinement and preset in some options."""
+    options = options if options is not None else MatchOptions()
+    given = replace(
+        options,
+        refine=replace(options.refine, refine=refine),
+        density=replace(options.density, preset=preset),
+    )
+    return Frontend(partial(_match, given), lambda _: (given,))
+
+
+def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
+    images = ImageOptions(frame_list=frame_list(footage, database.with_name("frames.txt")))
+    options = replace(options, camera=footage.camera, images=images, on_existing="error")
+    folder = footage.image_path if footage.existed else None
+    return match(database, footage.video, image_path=folder, options=options).seconds

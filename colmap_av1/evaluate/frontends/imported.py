@@ -1,0 +1,84 @@
+"""The front-ends that are other programs: what they wrote in hloc's layout, verified by COLMAP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import pycolmap
+
+from colmap_av1.database.hloc import HlocMatches, read_hloc
+from colmap_av1.errors import HlocError
+from colmap_av1.evaluate.frontends.footage import Footage
+from colmap_av1.evaluate.frontends.frontend import (
+    OF_OTHERS,
+    Frontend,
+    images_digest,
+    list_images,
+)
+from colmap_av1.util.digests import digest_if_there
+from colmap_av1.util.progress import Clock
+
+
+def imported_frontend(features: Path, matches: Path) -> Frontend:
+    """What other programs wrote in hloc's layout, verified by COLMAP."""
+    return Frontend(
+        partial(_import_all, (features, matches)),
+        lambda footage: (
+            *(digest_if_there(path) for path in (features, matches)),
+            pycolmap.__version__,
+            images_digest(footage),
+        ),
+        (*OF_OTHERS, "database"),
+    )
+
+
+def _import_all(files: tuple[Path, Path], footage: Footage, database: Path) -> dict[str, float]:
+    return import_hloc(files, footage.names, footage, database)
+
+
+def import_hloc(
+    files: tuple[Path, Path], names: Sequence[str], footage: Footage, database: Path
+) -> dict[str, float]:
+    """Fill a database from files in hloc's layout, which hold the named images at least.
+
+    Returns:
+        Wall time of "import" and "verification".
+
+    Raises:
+        HlocError: the files cannot be read, or lack an image.
+    """
+    clock = Clock()
+    pycolmap.set_random_seed(0)
+    with clock.measure("import"):
+        found = read_hloc(*files)
+        missing = next((name for name in names if name not in found.names), None)
+        if missing is not None:
+            raise HlocError(
+                f"{files[0]}: lacks image '{missing}': extract the features of the images in "
+                f"{footage.image_path}"
+            )
+        list_images(footage, database)
+        pairs = _write_hloc(found, set(names), database)
+    with clock.measure("verification"):
+        listing = database.with_name("pairs.txt")
+        listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        pycolmap.verify_matches(database, listing)
+    return clock.seconds
+
+
+def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> list[tuple[str, str]]:
+    """Write keypoints and matches of some images; returns the pairs."""
+    pairs = []
+    with pycolmap.Database.open(database) as rows:
+        ids = {image.name: image.image_id for image in rows.read_all_images()}
+        for name, xy in zip(found.names, found.keypoints, strict=True):
+            if name in names:
+                rows.write_keypoints(ids[name], xy)
+        for (i, j), between in zip(found.pairs, found.matches, strict=True):
+            pair = found.names[i], found.names[j]
+            if names.issuperset(pair):
+                rows.write_matches(ids[pair[0]], ids[pair[1]], between)
+                pairs.append(pair)
+    return pairs

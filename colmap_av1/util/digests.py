@@ -1,0 +1,162 @@
+"""What tells inputs, options, code and products from others: digests."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import os
+import stat
+import time
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).resolve().parents[1]
+# Fields of options that change how long a result takes, not the result: not the threads of the
+# mappers, which change its last digits.
+WITHOUT_EFFECT = frozenset({"ReadOptions.num_threads", "VerifyOptions.num_threads"})
+_CODE = {".py", ".so", ".pyd"}
+# A file that is written again so soon may keep its times: those of FAT come in steps of 2 s.
+_UNSURE_NS = 2_000_000_000
+_BLOCK = 1 << 20
+
+
+def file_digest(path: Path) -> str:
+    """Digest of a file's content; a file is read once by a process as long as it stays.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    status = path.stat()
+    times = _sure_times(status)
+    if times is None:
+        return _read_digest(path)
+    return _known_digest(path.absolute(), status.st_size, *times)
+
+
+def digest_if_there(path: str | os.PathLike[str] | None) -> str | None:
+    """The same of a file that may be missing; None where it is, or none is given.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    return file_digest(Path(path)) if path is not None and Path(path).is_file() else None
+
+
+@functools.cache
+def _known_digest(path: Path, *_: int) -> str:
+    return _read_digest(path)
+
+
+def _read_digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def file_record(path: Path) -> dict[str, Any]:
+    """What `is_as_recorded` tells later changes of a file by, as JSON holds it.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    status = path.stat()
+    return {
+        "bytes": status.st_size,
+        "times": _sure_times(status),
+        "digest": file_digest(path),
+    }
+
+
+def is_as_recorded(path: Path, record: dict[str, Any]) -> bool:
+    """Whether a file is there and holds what it held when it was recorded.
+
+    It is read only where its times differ, as those of copies do, or were too fresh to be told
+    from later ones: all images of a long video take a while to read, most of all from a disk on
+    the network. One of the times is that of the last change of the file's attributes, which
+    programs cannot set, so that other content under an old date is noticed, too.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size != record["bytes"]:
+            return False
+        same_times: bool = _times(status) == record["times"]
+        return same_times or file_digest(path) == record["digest"]
+    except OSError:
+        return False
+
+
+def _times(status: os.stat_result) -> list[int]:
+    return [status.st_mtime_ns, status.st_ctime_ns]
+
+
+def _sure_times(status: os.stat_result) -> list[int] | None:
+    """The times of a file's changes; None where they may stay through another one."""
+    times = _times(status)
+    return times if time.time_ns() - max(times) > _UNSURE_NS else None
+
+
+@functools.cache
+def code_digest(*folders: str) -> str:
+    """Digest of the code in some folders of this package, compiled code included.
+
+    Args:
+        folders: paths within the package, below which all counts; ".": the whole package.
+
+    Raises:
+        ValueError: the package has no such folder.
+    """
+    missing = next((f for f in folders if not (PACKAGE / f).is_dir()), None)
+    if missing is not None:
+        raise ValueError(f"{missing}: no folder of {PACKAGE}")
+    files = {p for folder in folders for p in (PACKAGE / folder).rglob("*") if p.suffix in _CODE}
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {_read_digest(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def package_version() -> str:
+    """Version of this package as it is installed."""
+    try:
+        return version("colmap-av1")
+    except PackageNotFoundError:
+        return "of a checkout"
+
+
+def digest_of(values: Iterable[Any], *, timed: bool = False) -> str:
+    """Digest of values that a result depends on: options, paths, numbers, words and such in rows.
+
+    Args:
+        values: dataclasses, dictionaries, sequences and plain values; of dataclasses those fields
+            do not count that have no effect on a result.
+        timed: the time that the result takes is of interest, too: all fields count.
+
+    Raises:
+        TypeError: something is of another type, which nothing is known to tell apart by.
+    """
+    text = _spell(list(values), frozenset() if timed else WITHOUT_EFFECT)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _spell(value: Any, left_out: frozenset[str]) -> str:
+    """The value as text; that of another value is another one."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        kind = type(value).__name__
+        names = (field.name for field in dataclasses.fields(value))
+        fields = {name: getattr(value, name) for name in names if f"{kind}.{name}" not in left_out}
+        return f"{kind}{_spell(fields, left_out)}"
+    if isinstance(value, dict):
+        items = sorted((_spell(k, left_out), _spell(v, left_out)) for k, v in value.items())
+        return f"{{{','.join(f'{k}:{v}' for k, v in items)}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(_spell(v, left_out) for v in value)}]"
+    if isinstance(value, os.PathLike):
+        return repr(os.fspath(value))
+    if value is None or type(value) in (bool, int, float, str):
+        return repr(value)
+    raise TypeError(f"{value!r}: tell apart by a plain value")

@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from colmap_av1.options import MapOptions, MatchOptions, ReadOptions, VerifyOptions
+from colmap_av1.util import digests, stages
+from colmap_av1.util.digests import code_digest, digest_of, file_digest
+from colmap_av1.util.stages import Kept, open_stages, run_stage, run_stage_in
+
+
+@dataclass
+class Twice:
+    """A stage of either kind in a folder, and how often it was run."""
+
+    folder: Path
+    run: Callable[..., Kept]
+    record: Path
+    products: list[Path]
+    calls: int = 0
+    stop: bool = False
+
+
+@pytest.fixture(params=["aside", "in place"])
+def stage(request: pytest.FixtureRequest, tmp_path: Path) -> Twice:
+    """A stage that makes an .npz file and two images, and has been run."""
+
+    def make(folder: Path) -> dict[str, Any]:
+        twice.calls += 1
+        (folder / "images").mkdir()
+        for name in ("a.png", "b.png"):
+            (folder / "images" / name).write_bytes(name.encode() * 1000)
+        if twice.stop:
+            raise KeyboardInterrupt
+        np.savez(folder / "tracks.npz", xy=np.arange(1000.0))
+        return {"found": 3, "sizes": (1, 2)}
+
+    def run_aside(depends_on: Any = "same") -> Kept:
+        with open_stages(tmp_path / "out", "test") as folder:
+            return run_stage(
+                *(folder, "tracks", [depends_on]),
+                into=tmp_path / "out",
+                products=["images", "tracks.npz"],
+                make=make,
+            )
+
+    def run_in_place(depends_on: Any = "same", **how: Any) -> Kept:
+        folder = tmp_path / "out"
+        products = [folder / "images", folder / "tracks.npz"]
+        return run_stage_in(folder, [depends_on], lambda: make(folder), products=products, **how)
+
+    folder = tmp_path / "out"
+    aside = request.param == "aside"
+    twice = Twice(
+        folder,
+        run_aside if aside else run_in_place,
+        folder / (".stages/tracks.json" if aside else "result.json"),
+        [folder / "images" / "a.png", folder / "images" / "b.png", folder / "tracks.npz"],
+    )
+    first = twice.run()
+    assert not first.resumed
+    assert first.facts == {"found": 3, "sizes": [1, 2]}
+    return twice
+
+
+def check_resumed(stage: Twice) -> None:
+    before = stage.calls
+    assert stage.run().resumed
+    assert stage.calls == before
+
+
+def check_made_again(stage: Twice) -> None:
+    """The stage is run once more, and its products are what they were."""
+    before = stage.calls
+    again = stage.run()
+    assert not again.resumed
+    assert stage.calls == before + 1
+    a, b, tracks = stage.products
+    assert (a.read_bytes(), b.read_bytes()) == (b"a.png" * 1000, b"b.png" * 1000)
+    with np.load(tracks) as file:
+        assert file["xy"].sum() == 499500
+    check_resumed(stage)
+
+
+def test_a_finished_stage_is_not_run_again(stage: Twice) -> None:
+    written = [p.stat().st_mtime_ns for p in stage.products]
+    first = stage.run()
+    assert stage.run() == first
+    assert first.resumed
+    assert first.facts == {"found": 3, "sizes": [1, 2]}
+    assert [p.stat().st_mtime_ns for p in stage.products] == written
+    assert not stage.run("other").resumed
+    assert not stage.run().resumed
+
+
+def test_a_stage_that_is_stopped_is_run_again(stage: Twice) -> None:
+    stage.stop = True
+    with pytest.raises(KeyboardInterrupt):
+        stage.run("other")
+    stage.stop = False
+    assert not stage.run("other").resumed
+    assert stage.run("other").resumed
+
+
+def overwrite(path: Path) -> None:
+    """Other bytes, as many, under the old date."""
+    status, content = path.stat(), path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_products_that_are_damaged_are_made_again(stage: Twice, index: int) -> None:
+    product = stage.products[index]
+    product.unlink()
+    check_made_again(stage)
+    os.truncate(product, product.stat().st_size // 2)
+    check_made_again(stage)
+    overwrite(product)
+    check_made_again(stage)
+    product.unlink()
+    product.mkdir()
+    check_made_again(stage)
+
+
+def test_products_of_long_ago_are_checked_by_their_dates(
+    stage: Twice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are not read; a change under the old date is noticed all the same."""
+    now = time.time_ns()
+    monkeypatch.setattr(digests.time, "time_ns", lambda: now + 10_000_000_000)
+    stage.run("long ago")
+    reads: list[Path] = []
+    read = digests._read_digest
+    with monkeypatch.context() as patch:
+        patch.setattr(digests, "_read_digest", lambda path: reads.append(path) or read(path))
+        code_digest.cache_clear()
+        code_digest(".")
+        reads.clear()
+        assert stage.run("long ago").resumed
+        assert reads == []
+        for product in stage.products:
+            product.touch()
+        assert stage.run("long ago").resumed
+        assert sorted(reads) == sorted(stage.products)
+    if os.name == "posix":
+        overwrite(stage.products[0])
+        assert not stage.run("long ago").resumed
+
+
+def test_a_copy_is_taken_over_and_more_files_do_not_matter(stage: Twice, tmp_path: Path) -> None:
+    (stage.folder / "images" / "c.png").touch()
+    shutil.copytree(stage.folder, tmp_path / "copy")
+    shutil.rmtree(stage.folder)
+    shutil.copytree(tmp_path / "copy", stage.folder)
+    check_resumed(stage)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: text[: len(text) // 2],
+        lambda text: "[" * 100_000,
+        lambda text: "\0" * len(text),
+        lambda text: "[]",
+        lambda text: "3",
+        lambda text: "null",
+        lambda text: '"key"',
+        lambda text: "{}",
+        lambda text: json.dumps({**json.loads(text), "facts": []}),
+        lambda text: json.dumps({**json.loads(text), "files": None}),
+        lambda text: json.dumps({"key": json.loads(text)["key"], "facts": {"found": 3}}),
+        lambda text: text.replace('"found": 3', '"found": 4'),
+    ],
+)
+def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[str], str]) -> None:
+    stage.record.write_text(damage(stage.record.read_text()))
+    check_made_again(stage)
+    stage.record.write_bytes(b"\xff\xfe" + stage.record.read_bytes())
+    check_made_again(stage)
+
+
+def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
+    options = MatchOptions()
+    assert not stage.run(options).resumed
+    threads = replace(options, verify=VerifyOptions(num_threads=7), read=ReadOptions(num_threads=3))
+    assert stage.run(threads).resumed
+    assert not stage.run(replace(options, read=ReadOptions(strict=True))).resumed
+    assert not stage.run(MapOptions(num_threads=1)).resumed
+    assert not stage.run(MapOptions(num_threads=2)).resumed  # changes the last digits
+
+
+def test_threads_count_where_time_is_measured(tmp_path: Path) -> None:
+    def run(num_threads: int) -> bool:
+        options = MatchOptions(verify=VerifyOptions(num_threads=num_threads))
+        return run_stage_in(tmp_path / "a", [options], dict, products=[], timed=True).resumed
+
+    assert [run(1), run(1), run(2)] == [False, True, False]
+
+
+def test_an_upgrade_redoes(stage: Twice, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_resumed(stage)
+    for name in ("code_digest", "package_version"):
+        with monkeypatch.context() as patch:
+            patch.setattr(stages, name, lambda *_: "another")
+            check_made_again(stage)
+        check_made_again(stage)
+
+
+def test_code_counts_compiled_or_not_whatever_its_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(digests, "PACKAGE", tmp_path)
+
+    def digest(*folders: str) -> str:
+        code_digest.cache_clear()
+        return code_digest(*folders)
+
+    try:
+        for room in ("motion", "evaluate/report"):
+            (tmp_path / room).mkdir(parents=True)
+        seen = {digest("."), digest("evaluate")}
+        for name in ("match.py", "motion/reading.py", "evaluate/report/tables.py", "_core.abi3.so"):
+            (tmp_path / name).write_bytes(b"1")
+            seen.add(digest("."))
+            (tmp_path / name).write_bytes(b"2")
+            seen.add(digest("."))
+        (tmp_path / "match.py").rename(tmp_path / "other.py")
+        assert len(seen | {digest(".")}) == 1 + 2 * 4 + 1
+        report = digest("evaluate/report")
+        (tmp_path / "motion" / "reading.py").write_bytes(b"3")
+        assert digest("evaluate/report") == report
+        with pytest.raises(ValueError, match="nowhere: no folder of"):
+            digest("nowhere")
+    finally:
+        code_digest.cache_clear()
+
+
+def test_all_code_of_the_package_counts() -> None:
+    files = {p for p in digests.PACKAGE.rglob("*") if p.suffix in digests._CODE}
+    assert {p.name for p in files} >= {"match.py", "stages.py", "tables.py"}
+    assert any(re.match(r"_core\..*(so|pyd)$", p.name) for p in files)
+    assert digests.PACKAGE.name == "colmap_av1"
+
+
+def test_values_are_told_apart() -> None:
+    values: list[Any] = [
+        *(None, True, 1, 1.0, "1", (1,), ("1",), [[1]], {"1": 1}, {1: 1}, (), {}, "", "a,b"),
+        *(("a", "b"), MatchOptions(), ReadOptions(), {}.fromkeys("ab"), ("None",), (None,)),
+    ]
+    assert len({digest_of([value]) for value in values}) == len(values)
+    assert digest_of([{"a": 1, "b": 2}]) == digest_of([{"b": 2, "a": 1}])
+    assert digest_of([Path("a") / "b"]) == digest_of([str(Path("a/b"))])
+    with pytest.raises(TypeError, match="tell apart by a plain value"):
+        digest_of([object()])
+    with pytest.raises(TypeError, match="tell apart by a plain value"):
+        digest_of([np.arange(3)])
+
+
+def test_a_file_is_read_once_while_it_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "video.mp4"
+    path.write_bytes(b"1")
+    first = file_digest(path)
+    path.write_bytes(b"2")  # at once: the date may be the same
+    assert file_digest(path) != first
+    now = time.time_ns()
+    monkeypatch.setattr(digests.time, "time_ns", lambda: now + 10_000_000_000)
+    second = file_digest(path)
+    monkeypatch.setattr(digests, "_read_digest", lambda _: "read again")
+    assert file_digest(path) == second
+    path.touch()
+    assert file_digest(path) == "read again"
