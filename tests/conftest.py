@@ -88,6 +88,15 @@ def make_frames(count: int, width: int = 192, height: int = 128) -> NDArray[np.u
     return frames
 
 
+def encode_two_sizes(encode: Encode, output: Path, count: int) -> Path:
+    """A stream of frames of 192x128, as many as told, and then of 128x128."""
+    parts = [output.with_name(f"{width}.obu") for width in (192, 128)]
+    for width, part in zip((192, 128), parts, strict=True):
+        encode(make_frames(count, width, 128), part)
+    output.write_bytes(b"".join(part.read_bytes() for part in parts))
+    return output
+
+
 @pytest.fixture(scope="session")
 def clip(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An AV1 clip of 16 frames, 192x128, in MP4."""

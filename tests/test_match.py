@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
+from conftest import AV1, PROJECT, Encode, Ffmpeg, encode_two_sizes, make_frames
 
 from colmap_av1.database.reading import read_images
 from colmap_av1.errors import (
@@ -300,12 +300,7 @@ def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path
 
 
 def test_video_that_changes_its_size(encode: Encode, tmp_path: Path) -> None:
-    parts = [
-        encode(make_frames(8, width, 128), tmp_path / f"{width}.obu").read_bytes()
-        for width in (192, 128)
-    ]
-    both = tmp_path / "both.obu"
-    both.write_bytes(b"".join(parts))
+    both = encode_two_sizes(encode, tmp_path / "both.obu", 8)
     with pytest.raises(ImageError, match="from 192x128 to 128x128"):
         match(tmp_path / "a.db", both, image_path=tmp_path / "frames")
     assert not (tmp_path / "frames").exists()

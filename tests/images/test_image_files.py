@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import Encode, make_frames
+from conftest import Encode, encode_two_sizes, make_frames
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.files import check_image_folder, size_of_images, write_images
@@ -180,11 +180,6 @@ def test_leftovers_of_killed_processes_are_removed(clip: Path, tmp_path: Path) -
 
 
 def test_frames_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
-    parts = [
-        encode(make_frames(2, width, 128), tmp_path / f"{width}.obu").read_bytes()
-        for width in (192, 128)
-    ]
-    both = tmp_path / "both.obu"
-    both.write_bytes(b"".join(parts))
+    both = encode_two_sizes(encode, tmp_path / "both.obu", 2)
     with pytest.raises(ImageError, match="frame 2 is 128x128, those before 192x128"):
         write_images(both, tmp_path / "out", [f"{i}.png" for i in range(4)], range(4))

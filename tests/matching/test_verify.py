@@ -62,6 +62,24 @@ def as_bytes(geometry: TwoViewGeometry) -> tuple[object, ...]:
     )
 
 
+def agreement_with_colmap(
+    keypoints: Sequence[ImageKeypoints],
+    pairs: NDArray[np.int32],
+    matches: Sequence[NDArray[np.uint32]],
+    camera: pycolmap.Camera,
+    ours: Sequence[TwoViewGeometry],
+) -> tuple[list[bool], list[float]]:
+    """For each pair whether COLMAP decides the same, and the share of inliers in common."""
+    same, overlap = [], []
+    for pair, m, geometry in zip(pairs, matches, ours, strict=True):
+        theirs = colmap_geometry(keypoints, pair, m, camera)
+        same.append(int(theirs.config) == geometry.config)
+        a = set(map(tuple, geometry.inlier_matches.tolist()))
+        b = set(map(tuple, theirs.inlier_matches.tolist()))
+        overlap.append(len(a & b) / len(a | b))
+    return same, overlap
+
+
 @pytest.mark.parametrize(
     ("camera", "scene", "config"),
     [
@@ -78,13 +96,7 @@ def test_same_decisions_as_colmap(
 ) -> None:
     keypoints, pairs, matches = prepare(scene, outliers=0.2)
     ours = verify_pairs(keypoints, pairs, matches, camera)
-    same, overlap = [], []
-    for pair, m, geometry in zip(pairs, matches, ours, strict=True):
-        theirs = colmap_geometry(keypoints, pair, m, camera)
-        same.append(int(theirs.config) == geometry.config)
-        a = set(map(tuple, geometry.inlier_matches.tolist()))
-        b = set(map(tuple, theirs.inlier_matches.tolist()))
-        overlap.append(len(a & b) / len(a | b))
+    same, overlap = agreement_with_colmap(keypoints, pairs, matches, camera, ours)
     assert np.mean(same) >= 0.95
     assert np.mean(overlap) >= 0.95
     assert np.mean([g.config == config for g in ours]) >= 0.9
@@ -269,15 +281,8 @@ def test_same_decisions_as_colmap_on_real_images() -> None:
         good = {a.trainIdx: a.queryIdx for a, b in found if a.distance < 0.8 * b.distance}
         matches.append(np.array(sorted((q, t) for t, q in good.items()), dtype=np.uint32))
     camera = make_camera(CameraOptions(), width, height)
-    same, overlap = [], []
-    for pair, m, ours in zip(
-        pairs, matches, verify_pairs(keypoints, pairs, matches, camera), strict=True
-    ):
-        theirs = colmap_geometry(keypoints, pair, m, camera)
-        same.append(int(theirs.config) == ours.config)
-        a = set(map(tuple, ours.inlier_matches.tolist()))
-        b = set(map(tuple, theirs.inlier_matches.tolist()))
-        overlap.append(len(a & b) / len(a | b))
+    ours = verify_pairs(keypoints, pairs, matches, camera)
+    same, overlap = agreement_with_colmap(keypoints, pairs, matches, camera, ours)
     # Pairs of neighbours lie near COLMAP's 0.8 between homography and fundamental matrix:
     # COLMAP with another seed agrees with itself on 95 % of such pairs.
     assert np.mean(same) >= 0.9
