@@ -92,7 +92,7 @@ def reconstruct(
     track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one
     PINHOLE camera, undistorted and of the video's size, and beside them `database.db` and
     `report.json`. A run that was stopped is resumed after its last finished stage; a changed
-    option redoes what depends on it.
+    option redoes what depends on it, and what is damaged or gone is made again.
 
     Args:
         video: a video; one that is not AV1 is converted first.

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import Encode, encode_two_sizes, make_frames
+from conftest import Encode, encode_two_sizes
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.files import check_image_folder, size_of_images, write_images
