@@ -28,6 +28,7 @@ from colmap_av1.evaluate.training.trainers import check_trainer, train, write_sp
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.model.figures import model_figures
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
+from colmap_av1.tracks.video_tracks import with_stream_kept
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
@@ -81,7 +82,8 @@ def compare(
     front-end that fails leaves a line in its column; the others stand.
 
     Args:
-        video: a video; one that is not AV1 is converted first.
+        video: a video; one that is not AV1 is converted first, to a stream that lies in the
+            folder, or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
         image_path: folder of images that exist or are to be written; None: within the output.
         reference: given truth: folder of a COLMAP model with images of the same names, or a
@@ -102,6 +104,8 @@ def compare(
     progress = progress if progress is not None else no_progress
     output = Path(output)
     write_report = _report_writer()
+    # Front-ends have processes of their own: they share the stream.
+    options = replace(options, match=with_stream_kept(options.match, output))
     frontends = _chosen_frontends(options)
     check_learned_options(options.learned)
     _check_training(options)

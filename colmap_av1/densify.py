@@ -89,7 +89,7 @@ def densify(
 
     Args:
         model: folder of a COLMAP model of this video's frames, from whatever mapper.
-        video: a video; one that is not AV1 is converted first.
+        video: a video; one that is not AV1 is converted first, see `match`.
         output: new or empty folder for the dense model.
         image_path: folder of the model's images, to recognise by their content which frames
             they are where their names leave doubt.
@@ -118,8 +118,8 @@ def densify(
     video = read_video(video, options.match.read.operating_point)
     with unchanged(video.state):
         size = _check_input(model, video, folder, sizes, options)
-        source = open_source(video, options.match, clock=clock, progress=progress)
-        with unchanged(source.stream.state):
+        opening = open_source(video, options.match, beside=output, clock=clock, progress=progress)
+        with opening as source, unchanged(source.stream.state):
             matching = chaining_for_points(options.match, options.triangulate)
             tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
             with clock.measure("choice"):

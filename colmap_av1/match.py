@@ -43,7 +43,8 @@ class MatchReport:
     Attributes:
         database: the database file.
         video: the video file.
-        stream: the AV1 file whose motion was read: the video, or what it was converted to.
+        stream: the AV1 file whose motion was read: the video, or what it was converted to; None
+            where that was not kept.
         image_path: folder of the images; None where none was given.
         num_frames: shown frames of the video.
         num_coded_frames: frames with block data, hidden ones included.
@@ -68,7 +69,7 @@ class MatchReport:
 
     database: Path
     video: Path
-    stream: Path
+    stream: Path | None
     image_path: Path | None
     num_frames: int
     num_coded_frames: int
@@ -128,7 +129,8 @@ def match(
 
     Args:
         database: the database file; made where it is missing.
-        video: a video; one that is not AV1 is converted first, see `encode.stream_of`.
+        video: a video; one that is not AV1 is converted first, to a file beside the database that
+            is there as long as it is read, or to one that is kept (`options.keep_stream`).
         image_path: folder to write the images to, for the mapper's colours and for
             training; existing images of the right size are kept. None: none are written.
         options: options of every stage.
@@ -153,7 +155,11 @@ def match(
     video = read_video(video, options.read.operating_point)
     with unchanged(video.state) as check_video:
         prepared = prepare_images(
-            video, folder, options, listed=existing, clock=clock, progress=progress
+            *(video, folder, options),
+            listed=existing,
+            beside=database,
+            clock=clock,
+            progress=progress,
         )
         source, display, chosen = prepared.source, prepared.display, prepared.chosen
         size, pixel_aspect = prepared.size, prepared.pixel_aspect
@@ -187,7 +193,7 @@ def match(
     return MatchReport(
         database=database,
         video=video.path,
-        stream=source.stream.path,
+        stream=source.stream.path if source.is_kept else None,
         image_path=folder,
         num_frames=num_frames,
         num_coded_frames=num_coded_frames,

@@ -210,7 +210,8 @@ class MatchOptions:
     # what becomes of keypoints and matches that listed images have already: 'error': refuse
     # the database; 'append': keep them, add the new ones after them; 'replace': remove them
     on_existing: OnExisting = "error"
-    # file that keeps the AV1 stream of a video that is not AV1; None: beside the video
+    # file that keeps the AV1 stream of a video that is not AV1, for further runs; None: the
+    # output folder of reconstruct and compare keeps it, other commands keep none
     keep_stream: str | None = None
     # convert an AV1 video, too, where its structure is poor for matching
     reencode: bool = False

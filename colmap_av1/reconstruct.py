@@ -23,7 +23,7 @@ from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.model.triangulate import check_triangulate_options
 from colmap_av1.option_checks import check_options
 from colmap_av1.options import MapperOptions, ReconstructOptions
-from colmap_av1.tracks.video_tracks import open_source
+from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
@@ -95,7 +95,8 @@ def reconstruct(
     option redoes what depends on it, and what is damaged or gone is made again.
 
     Args:
-        video: a video; one that is not AV1 is converted first.
+        video: a video; one that is not AV1 is converted first, to a stream that a run which
+            goes on uses again; it lies in the folder, or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
@@ -115,12 +116,13 @@ def reconstruct(
     check_options(options.match, video.picture_size)
     _check_reconstruct_options(options)
     with open_stages(output, "reconstruct") as stages:
-        source = open_source(video, options.match, clock=clock, progress=progress)
-        try:
-            report = _run_stages(Run(source, output, stages, options, clock, progress))
-        except ColmapAv1Error:  # which may come of a change
-            check_unchanged(*source.files)
-            raise
+        matching = with_stream_kept(options.match, stages)
+        with open_source(video, matching, beside=output, clock=clock, progress=progress) as source:
+            try:
+                report = _run_stages(Run(source, output, stages, options, clock, progress))
+            except ColmapAv1Error:  # which may come of a change
+                check_unchanged(*source.files)
+                raise
         _write_report(report)
     return report
 

@@ -35,6 +35,7 @@ from colmap_av1.options import (
     VerifyOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
+from colmap_av1.video.unchanged import file_state
 
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
@@ -363,6 +364,21 @@ def test_short_videos(encode: Encode, tmp_path: Path) -> None:
         reconstruct(two, tmp_path / "out")
     with pytest.raises(VideoError, match="of 4 frames or more, the video has 3: give a"):
         reconstruct(three, tmp_path / "out")
+
+
+def test_converted_stream_is_kept_in_the_folder(encode: Encode, tmp_path: Path) -> None:
+    """For runs that go on; here both end where images are chosen."""
+    (tmp_path / "videos").mkdir()
+    video = encode(make_frames(2), tmp_path / "videos" / "phone.mp4", "-c:v", "libx264")
+    output, states = tmp_path / "out", []
+    for _ in range(2):
+        with pytest.raises(ImageError, match="2 of 2 frames"):
+            reconstruct(video, output)
+        states.append(file_state(output / ".stages" / "stream.mp4"))
+    assert states[0].found is not None
+    assert states[0] == states[1]
+    assert list(video.parent.iterdir()) == [video]
+    assert [p.name for p in tmp_path.iterdir()] == ["videos", "out"]
 
 
 def test_model_of_two_images_is_none(

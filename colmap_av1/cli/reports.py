@@ -27,7 +27,7 @@ def match_rows(report: MatchReport) -> Rows:
     inlier_share = report.num_inliers / max(report.num_matches, 1)
     rows = [
         ("database", str(report.database)),
-        ("stream", str(report.stream)),
+        ("stream", str(report.stream or "converted and not kept, see --keep_stream")),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
         ("tracks", str(report.num_tracks)),

@@ -46,7 +46,7 @@ class PreparedImages:
     """The images of a video, before anything is matched.
 
     Attributes:
-        source: the video.
+        source: the video; a stream that is not kept is gone by now.
         display: how its pictures are shown in the images.
         tracked: the video's tracks, in its own pixels.
         tracks: the same in pixels of the images.
@@ -96,6 +96,7 @@ def prepare_images(
     options: MatchOptions,
     *,
     listed: Mapping[str, tuple[int, int]],
+    beside: Path,
     clock: Clock,
     progress: Progress,
 ) -> PreparedImages:
@@ -106,6 +107,7 @@ def prepare_images(
         folder: folder of the images, which may exist; None: none are wanted.
         options: all but those of density, pairs and verification are used; all are checked.
         listed: (width, height) of images that a database lists, by name.
+        beside: the file that is being made, see `open_source`.
         clock: gets the stages up to "choice".
         progress: called in these stages.
 
@@ -124,8 +126,10 @@ def prepare_images(
         if size != fit.video_size:
             check_images_there(folder, existing)
 
-    source = open_source(video, options, clock=clock, progress=progress)
-    with unchanged(source.stream.state):
+    with (
+        open_source(video, options, beside=beside, clock=clock, progress=progress) as source,
+        unchanged(source.stream.state),
+    ):
         tracked = track_video(
             source, options, one_size=folder is not None, clock=clock, progress=progress
         )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import BitstreamError, ImageError
+from colmap_av1.errors import BitstreamError, EncodeError, ImageError, cannot_write
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, inspect
 from colmap_av1.motion.reading import read_motion
@@ -17,10 +19,11 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.util.files import scratch_folder
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
-from colmap_av1.video.encode import stream_of
+from colmap_av1.video.encode import encode, stream_of
 from colmap_av1.video.facts import Video, frame_times, read_video
 from colmap_av1.video.unchanged import FileState
 
@@ -38,10 +41,12 @@ class VideoSource:
         stream: the AV1 video whose motion is read. One that was made of another holds the frames
             that the other's edit list hides, too.
         pictures: the video whose pictures become images: the same, or what it was made of.
+        is_kept: the stream stays when the work is done.
     """
 
     stream: Video
     pictures: Video
+    is_kept: bool = True
 
     @property
     def files(self) -> tuple[FileState, ...]:
@@ -64,14 +69,18 @@ class TrackedVideo:
     warnings: tuple[str, ...]
 
 
+@contextmanager
 def open_source(
-    video: Video, options: MatchOptions, *, clock: Clock, progress: Progress
-) -> VideoSource:
+    video: Video, options: MatchOptions, *, beside: Path, clock: Clock, progress: Progress
+) -> Iterator[VideoSource]:
     """Find the AV1 stream of a video, or make it: its motion is read, not its pictures.
+
+    A stream that is made lasts as long as the body, unless the options say where it is kept.
 
     Args:
         video: a video of any codec.
         options: those of encoding and reading are used.
+        beside: the file or folder that is being made, which gets the stream beside it meanwhile.
         clock: gets the stage "encoding" where a stream is made.
         progress: told about the stage "encoding".
 
@@ -80,18 +89,48 @@ def open_source(
         EncodeError: no AV1 encoder works, or the stream cannot be written.
         OptionError: an option has a value that cannot work.
     """
-    stream = video
-    if video.codec != "av1" or (options.reencode and inspect(video, options.read).reasons):
+    if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
+        yield VideoSource(video, video)
+        return
+    strict = options.read.strict
+    if options.keep_stream is not None:
         with clock.measure("encoding"):
-            encoded = stream_of(
-                video,
-                strict=options.read.strict,
+            made = stream_of(
+                *(video, options.keep_stream),
+                strict=strict,
                 options=options.encode,
-                keep_stream=options.keep_stream,
                 progress=progress,
             )
-        stream = read_video(encoded.output)
-    return VideoSource(stream, video)
+        yield VideoSource(read_video(made.output), video)
+        return
+    with _scratch(beside) as folder:
+        with clock.measure("encoding"):
+            made = encode(
+                *(video, folder / "stream.mp4"),
+                strict=strict,
+                options=options.encode,
+                progress=progress,
+            )
+        yield VideoSource(read_video(made.output), video, is_kept=False)
+
+
+def with_stream_kept(options: MatchOptions, folder: Path) -> MatchOptions:
+    """The same options; a stream that is made is kept in a folder unless they say where."""
+    if options.keep_stream is not None:
+        return options
+    return replace(options, keep_stream=str(folder.absolute() / "stream.mp4"))
+
+
+@contextmanager
+def _scratch(beside: Path) -> Iterator[Path]:
+    """A folder for a stream that is not kept."""
+    with ExitStack() as made:
+        try:
+            folder = made.enter_context(scratch_folder(beside))
+        except OSError as error:
+            where = beside.absolute().parent
+            raise EncodeError(f"{cannot_write(where, error)}; or give --keep_stream") from error
+        yield folder
 
 
 def track_video(

@@ -54,6 +54,26 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+@contextmanager
+def scratch_folder(beside: Path) -> Iterator[Path]:
+    """A hidden folder beside a file or folder, which need not exist, as long as the body runs.
+
+    What a killed run left of its own there is removed first.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    remove_leftovers(beside.parent, beside.name)
+    scratch = _partial(beside.with_name(f"{beside.name}.scratch"))
+    # Of a process that had this one's number: it is gone, for this one has only begun.
+    shutil.rmtree(scratch, ignore_errors=True)
+    try:
+        scratch.mkdir(parents=True)
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
 def check_new_folder(path: Path) -> None:
     """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
 

@@ -155,23 +155,22 @@ def encode(
 
 def stream_of(
     video: str | os.PathLike[str],
+    keep_stream: str | os.PathLike[str],
     *,
     strict: bool = False,
     options: EncodeOptions | None = None,
-    keep_stream: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
     """The AV1 stream of a video that is not AV1: the one kept from before, or a new one.
 
-    It is kept beside the video, as 'phone.av1.mp4' for 'phone.mov', or where `keep_stream`
-    says, and used again while it is newer than the video, whole, and made of a file of the
-    video's size with the settings that `options` ask for.
+    It is used again while it is newer than the video, whole, and made of a file of the video's
+    size with the settings that `options` ask for.
 
     Args:
         video: a video that ffmpeg decodes.
+        keep_stream: where the stream is kept; its extension says the container.
         strict: refuse a damaged video.
         options: which encoder and how.
-        keep_stream: where the stream is kept; its extension says the container.
         progress: as in `encode`.
 
     Raises:
@@ -183,7 +182,7 @@ def stream_of(
     """
     options = options if options is not None else EncodeOptions()
     path = Path(video)
-    output = Path(keep_stream) if keep_stream is not None else path.with_suffix(".av1.mp4")
+    output = Path(keep_stream)
     if output.suffix.lower() not in _KEPT_FORMATS:
         raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
     file = with_counted_packets(read_file(video))

@@ -22,6 +22,8 @@ from colmap_av1.video.encode import stream_of
 from colmap_av1.video.facts import read_video
 
 OPTIONS = MatchOptions()
+# No video here is converted to a stream that is not kept.
+BESIDE = Path("absent/a.db")
 LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
 
 
@@ -36,6 +38,7 @@ def prepared(
         folder,
         options,
         listed=listed or {},
+        beside=BESIDE,
         clock=Clock(),
         progress=no_progress,
     )
@@ -48,6 +51,7 @@ def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
         None,
         replace(OPTIONS, images=ImageOptions(num_images=5)),
         listed={},
+        beside=BESIDE,
         clock=clock,
         progress=lambda stage, done, total: told.add(stage),
     )
@@ -94,8 +98,9 @@ def test_a_stream_of_another_size_than_its_video_is_refused(
 ) -> None:
     """As an encoder makes it that wants sizes of its own."""
     video = encode(make_frames(6), tmp_path / "v.mp4", "-c:v", "libx264")
-    options = replace(OPTIONS, encode=EncodeOptions(encoder="libaom"))
-    stream = stream_of(video, options=options.encode).output
+    stream = tmp_path / "stream.mp4"
+    options = replace(OPTIONS, encode=EncodeOptions(encoder="libaom"), keep_stream=str(stream))
+    stream_of(video, stream, options=options.encode)
     with av.open(str(stream)) as opened:
         mark = opened.metadata["comment"]
     larger = encode(make_frames(6, 208, 144), tmp_path / "larger.mp4", *AV1)

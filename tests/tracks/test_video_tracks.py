@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import AV1, Encode, Ffmpeg, make_frames
 
-from colmap_av1.errors import BitstreamError
+from colmap_av1.errors import BitstreamError, EncodeError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import MatchOptions, ReadOptions, RefineOptions
 from colmap_av1.tracks.tracks import build_tracks
@@ -19,6 +20,7 @@ from colmap_av1.tracks.video_tracks import (
     open_source,
     times_of_frames,
     track_video,
+    with_stream_kept,
 )
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.decoding import decode_frames
@@ -29,11 +31,70 @@ STRICT = MatchOptions(read=ReadOptions(strict=True))
 
 
 def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
-    return open_source(read_video(video), options, clock=Clock(), progress=no_progress)
+    """A video that is not converted: its stream outlasts the source."""
+    beside = video.with_name("a.db")
+    with open_source(
+        read_video(video), options, beside=beside, clock=Clock(), progress=no_progress
+    ) as source:
+        return source
 
 
 def tracked(source: VideoSource, options: MatchOptions = OPTIONS) -> TrackedVideo:
     return track_video(source, options, one_size=False, clock=Clock(), progress=no_progress)
+
+
+@pytest.fixture(scope="module")
+def phone(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An H.264 clip of 6 frames, 96x64."""
+    folder = tmp_path_factory.mktemp("phone")
+    return encode(make_frames(6, 96, 64), folder / "phone.mp4", "-c:v", "libx264")
+
+
+def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_path: Path) -> None:
+    beside, clock = tmp_path / "a.db", Clock()
+    with open_source(
+        read_video(phone), OPTIONS, beside=beside, clock=clock, progress=no_progress
+    ) as source:
+        assert source.pictures.path == phone
+        assert source.stream.codec == "av1"
+        assert source.stream.path.parent.parent == tmp_path
+        assert not source.is_kept
+        assert tracked(source).tracks.num_frames == 6
+    assert list(clock.seconds) == ["encoding"]
+    assert not list(tmp_path.iterdir())
+    assert list(phone.parent.iterdir()) == [phone]
+    with (
+        pytest.raises(RuntimeError),
+        open_source(read_video(phone), OPTIONS, beside=beside, clock=clock, progress=no_progress),
+    ):
+        raise RuntimeError
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_stream_that_is_kept_stays(phone: Path, tmp_path: Path) -> None:
+    options = with_stream_kept(OPTIONS, tmp_path)
+    assert with_stream_kept(options, tmp_path / "other") is options
+    source = opened(phone, options)
+    assert source.stream.path == tmp_path / "stream.mp4"
+    assert source.is_kept
+    before = source.stream.state
+    assert opened(phone, options).stream.state == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_takes_no_stream(phone: Path, tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with (
+        pytest.raises(EncodeError, match=r"ermission.*--keep_stream"),
+        open_source(
+            read_video(phone),
+            OPTIONS,
+            beside=tmp_path / "a.db",
+            clock=Clock(),
+            progress=no_progress,
+        ),
+    ):
+        pass
 
 
 @pytest.fixture

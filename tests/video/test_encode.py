@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,6 +34,8 @@ from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
 from colmap_av1.video.encoders import find_encoder
 
+TO_A_FILE = ("encode", "--output", "out.mp4")
+TO_A_DATABASE = ("match", "--database", "a.db")
 H264 = ("-c:v", "libx264", "-g", "6", "-bf", "2")
 
 
@@ -104,44 +106,45 @@ def test_odd_sizes(encode: Encode, tmp_path: Path, encoder: str) -> None:
 
 def test_stream_is_kept_and_used_again(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mov"))
-    first = stream_of(video)
-    assert first.output == tmp_path / "phone.av1.mp4"
+    stream = tmp_path / "stream.mp4"
+    first = stream_of(video, stream)
+    assert first.output == stream
     assert not first.reused
     bytes_before = first.output.read_bytes()
-    assert stream_of(video).reused
-    assert stream_of(video, options=EncodeOptions(quality=20)).reused
+    assert stream_of(video, stream).reused
+    assert stream_of(video, stream, options=EncodeOptions(quality=20)).reused
     # Made with other settings, cut off, or older than the video: made again.
-    assert not stream_of(video, options=EncodeOptions(quality=40)).reused
-    assert not stream_of(video, options=EncodeOptions(quality=20)).reused
+    assert not stream_of(video, stream, options=EncodeOptions(quality=40)).reused
+    assert not stream_of(video, stream, options=EncodeOptions(quality=20)).reused
     assert first.output.read_bytes() == bytes_before
     first.output.write_bytes(bytes_before[: len(bytes_before) // 2])
     with pytest.raises(OptionError, match="exists and is no stream that was kept"):
-        stream_of(video)
+        stream_of(video, stream)
     first.output.unlink()
-    stream_of(video)
+    stream_of(video, stream)
     os.utime(first.output, (0, 0))
-    assert not stream_of(video).reused
+    assert not stream_of(video, stream).reused
 
 
 def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
-    first = stream_of(video)
-    # As many frames, older than the stream, and the stream's name is the same.
+    stream = tmp_path / "stream.mp4"
+    stream_of(video, stream)
+    # As many frames, and older than the stream.
     other = ffmpeg("-i", phone, "-vf", "hflip", *H264, tmp_path / "phone.mov")
     os.utime(other, (0, 0))
-    assert not stream_of(other).reused
-    assert not stream_of(video).reused
-    assert stream_of(video).output == first.output
+    assert not stream_of(other, stream).reused
+    assert not stream_of(video, stream).reused
     with pytest.raises(OptionError, match=r"ends in \.mp4, \.mkv, \.webm"):
-        stream_of(video, keep_stream=tmp_path / "out.ivf")
+        stream_of(video, tmp_path / "out.ivf")
 
 
 def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
-    other = tmp_path / "phone.av1.mp4"
+    other = tmp_path / "other.mp4"
     shutil.copy(phone, other)
     with pytest.raises(OptionError, match="exists and is no stream that was kept"):
-        stream_of(video)
+        stream_of(video, other)
     with pytest.raises(OptionError, match="exists: give another output, or --overwrite"):
         encode_video(video, other)
     with pytest.raises(OptionError, match="is the video itself"):
@@ -166,6 +169,28 @@ def test_match_takes_any_codec(phone: Path, tmp_path: Path) -> None:
     assert again.num_matches == report.num_matches
 
 
+def test_nothing_is_left_of_a_conversion(phone: Path, tmp_path: Path) -> None:
+    """Neither beside the video nor beside the database."""
+    (tmp_path / "videos").mkdir()
+    video = Path(shutil.copy(phone, tmp_path / "videos" / "phone.mp4"))
+    (tmp_path / "work").mkdir()
+    seen: set[str] = set()
+
+    def look(stage: str, done: int, total: int | None) -> None:
+        seen.update(p.name for p in (tmp_path / "work").iterdir() if stage == "motion")
+
+    # As a killed run left it that had this process's number.
+    leftover = tmp_path / "work" / f".a.db.scratch.{os.getpid()}.partial"
+    leftover.mkdir()
+    (leftover / "stream.mp4").touch()
+    report = match(tmp_path / "work" / "a.db", video, progress=look)
+    assert report.stream is None
+    assert report.num_images == 12
+    assert seen == {leftover.name}
+    assert [p.name for p in (tmp_path / "work").iterdir()] == ["a.db"]
+    assert list(video.parent.iterdir()) == [video]
+
+
 def test_reencode_only_what_is_poor(
     clip: Path, encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,7 +201,7 @@ def test_reencode_only_what_is_poor(
     assert main(words) == 2
     assert "--reencode 1" in capsys.readouterr().err
     assert main([*words, "--reencode", "1"]) == 0
-    assert (tmp_path / "intra.av1.mp4").is_file()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.db", "intra.mp4"]
     good = match(tmp_path / "b.db", clip, options=MatchOptions(reencode=True))
     assert good.stream == clip
 
@@ -200,7 +225,7 @@ def test_damaged_video_is_used_up_to_the_damage(
     whole = encode(make_frames(24, 96, 64), tmp_path / "whole.mp4", *how)
     video = hurt(whole, tmp_path / "video.mp4", 13)
     with pytest.warns(UserWarning, match=r"video\.mp4: damaged after 13 of 24 frames"):
-        first = stream_of(video)
+        first = stream_of(video, tmp_path / "stream.mp4")
     assert first.num_frames == len(list(decode_frames(first.output))) == 13
     for (_, before), (_, after) in zip(
         decode_frames(whole), decode_frames(first.output), strict=False
@@ -208,12 +233,12 @@ def test_damaged_video_is_used_up_to_the_damage(
         assert cv2.PSNR(before, after) > 30
     # Nor is the damage forgotten when the stream is used again.
     with pytest.warns(UserWarning, match="damaged after 13 of 24 frames"):
-        again = stream_of(video)
+        again = stream_of(video, first.output)
     assert again.reused
     assert again.num_frames == 13
     bytes_before = first.output.read_bytes()
     with pytest.raises(BitstreamError, match="damaged after 13 frames"):
-        stream_of(video, strict=True)
+        stream_of(video, first.output, strict=True)
     words = ["encode", "--video", str(video), "--output", str(tmp_path / "out.mp4"), "--quiet"]
     assert main([*words, "--strict"]) == 2
     assert not (tmp_path / "out.mp4").exists()
@@ -263,18 +288,19 @@ def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None
 
 
 @contextmanager
-def long_conversion(ffmpeg: Ffmpeg, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is converting long.mp4 of a folder to out.mp4, for some time yet."""
+def long_conversion(
+    ffmpeg: Ffmpeg, folder: Path, words: Sequence[str] = TO_A_FILE
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is converting long.mp4 of a folder to `words`, for some time yet."""
     long = ffmpeg(
         *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
         *("-c:v", "libx264", "-preset", "ultrafast", folder / "long.mp4"),
     )
-    words = ["encode", "--video", str(long), "--output", str(folder / "out.mp4")]
-    words += ["--encoder", "libaom", "--speed", "2"]
+    words = [*words, "--video", str(long), "--encoder", "libaom", "--speed", "2"]
     command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
     with subprocess.Popen(command, cwd=folder) as process:
         deadline = time.monotonic() + 60
-        while not list(folder.glob(".out.mp4.*.partial")):
+        while not [p for p in folder.rglob(".*.partial") if p.is_file()]:
             assert time.monotonic() < deadline
             assert process.poll() is None
             time.sleep(0.05)
@@ -288,11 +314,12 @@ def is_converted(video: Path) -> bool:
     return str(video) in running.stdout
 
 
+@pytest.mark.parametrize("words", [TO_A_FILE, TO_A_DATABASE], ids=["encode", "match"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_conversion_leaves_nothing(
-    ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int
+    ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int, words: Sequence[str]
 ) -> None:
-    with long_conversion(ffmpeg, tmp_path) as process:
+    with long_conversion(ffmpeg, tmp_path, words) as process:
         process.send_signal(number)
         assert process.wait(30) == status
     assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
@@ -316,6 +343,17 @@ def test_killed_conversion_ends_and_is_cleaned_up_after(
         (tmp_path / name).touch()
     encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
     assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "out.mp4", *others}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
+def test_killed_match_is_cleaned_up_after(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    with long_conversion(ffmpeg, tmp_path, TO_A_DATABASE) as process:
+        process.kill()
+        process.wait(30)
+    left = [p.name for p in tmp_path.iterdir() if p.name != "long.mp4"]
+    assert left == [f".a.db.scratch.{process.pid}.partial"]
+    match(tmp_path / "a.db", phone)
+    assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "a.db"}
 
 
 def fake_ffmpeg(folder: Path, script: str) -> Path:

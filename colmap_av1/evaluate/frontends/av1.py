@@ -25,7 +25,9 @@ def av1_frontend(
         refine=replace(options.refine, refine=refine),
         density=replace(options.density, preset=preset),
     )
-    return Frontend(partial(_match, given), lambda _: (given,))
+    # Where the stream lies does not change the result.
+    anywhere = replace(given, keep_stream=None)
+    return Frontend(partial(_match, given), lambda _: (anywhere,))
 
 
 def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:

@@ -125,7 +125,11 @@ def choose_footage(
         existed = bool(existing_images(images, options.images.image_name))
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
-                video, images, options, listed={}, clock=clock, progress=progress
+                *(video, images, options),
+                listed={},
+                beside=folder / "result.json",
+                clock=clock,
+                progress=progress,
             )
             chosen = prepared.chosen
             check_video()

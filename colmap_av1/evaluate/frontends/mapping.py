@@ -116,7 +116,9 @@ def densify_model(
         }
 
     inputs = [file_digest(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
-    given = (inputs, footage.names, footage.frames, options)
+    # Where the stream lies does not change the result.
+    anywhere = replace(options, match=replace(options.match, keep_stream=None))
+    given = (inputs, footage.names, footage.frames, anywhere)
     return MapperRun(
         output, **run_stage_in(folder, given, make, products=[output], timed=True).facts
     )
