@@ -16,7 +16,6 @@ from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend
 from colmap_av1.evaluate.frontends.imported import imported_frontend
-from colmap_av1.evaluate.frontends.learned import check_learned_options
 from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
 from colmap_av1.evaluate.frontends.registry import make_frontends, run_frontend
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
@@ -97,7 +96,7 @@ def compare(
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images cannot be chosen or written, or the reference fits none.
         ModelError: the reference is no readable model.
-        OptionError: an option has a value that cannot work, or the folder holds other things.
+        OptionError: there is no such front-end, or the folder holds other things.
         EvaluationError: a package is missing that the report, a front-end or the trainer needs.
     """
     options = options if options is not None else CompareOptions()
@@ -107,8 +106,8 @@ def compare(
     # Front-ends have processes of their own: they share the stream.
     options = replace(options, match=with_stream_kept(options.match, output))
     frontends = _chosen_frontends(options)
-    check_learned_options(options.learned)
-    _check_training(options)
+    if options.trainer is not None:
+        check_trainer(options.trainer)
     video = read_video(video, options.match.read.operating_point)
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
@@ -260,16 +259,6 @@ def _run_column(
         dense = replace(dense, error=str(error), model_path=None)
     progress(name, 3, total)
     return [column, dense]
-
-
-def _check_training(options: CompareOptions) -> None:
-    if options.trainer is not None:
-        check_trainer(options.trainer)
-    if options.iterations < 1 or min(options.milestones, default=1) < 1:
-        raise OptionError(
-            f"iterations is {options.iterations}, milestones are {options.milestones}: give 1 or "
-            "more each"
-        )
 
 
 def _trained(

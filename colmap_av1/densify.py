@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, ModelError, cannot_write
-from colmap_av1.images.choosing import choose_images
+from colmap_av1.images.choosing import check_frame_list, choose_images
 from colmap_av1.images.files import size_of_images
 from colmap_av1.model.colmap_model import (
     ModelImage,
@@ -29,8 +29,7 @@ from colmap_av1.model.track_points import (
     to_model_points,
     triangulate_tracks,
 )
-from colmap_av1.model.triangulate import TriangulatedPoints, check_triangulate_options
-from colmap_av1.option_checks import check_options
+from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensifyOptions
 from colmap_av1.tracks.tracks import scale_tracks
 from colmap_av1.tracks.video_tracks import (
@@ -102,7 +101,7 @@ def densify(
         VideoError: the video cannot be read, or changes meanwhile.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: the model's images do not say which frames they are.
-        OptionError: an option has a value that cannot work, or the folder is not empty.
+        OptionError: an option does not go with the images, or the folder is not empty.
     """
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress
@@ -138,7 +137,7 @@ def densify(
                 *(seen, view, [cameras[i.camera_id] for i in images]),
                 *([i.cam_from_world for i in images], None),
                 options=options.triangulate,
-                num_threads=options.match.verify.num_threads,
+                num_threads=options.match.run.num_threads,
                 progress=progress,
             )
         agreeing = _agreement(model, points)
@@ -211,8 +210,7 @@ def _check_input(
     options: DensifyOptions,
 ) -> tuple[int, int]:
     """Refuse what does not fit before the long work; (width, height) of the model's images."""
-    check_options(options.match, video.picture_size)
-    check_triangulate_options(options.triangulate)
+    check_frame_list(options.match.images)
     if len(sizes) < 2:
         raise ModelError(f"{model}: only one image has a pose: give a model with two or more")
     try:

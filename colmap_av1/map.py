@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 from colmap_av1.database.check import check
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images
-from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError, cannot_write
+from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size
 from colmap_av1.images.names import image_file
 from colmap_av1.model.figures import ModelFigures, model_figures
 from colmap_av1.model.mapper import map_poses
-from colmap_av1.options import MapOptions, Mapper
+from colmap_av1.options import MapOptions
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 
@@ -70,13 +69,12 @@ def map_database(
         DatabaseError: the database is missing, unreadable, or nothing that mappers can use.
         ImageError: an image of the database is not in the folder, or of another size.
         ModelError: the mapper fails or finds no model; `OUTPUT.log` is what it printed.
-        OptionError: an option has a value that cannot work, or the output is not empty.
+        OptionError: the output is not empty.
     """
     options = options if options is not None else MapOptions()
     progress = progress if progress is not None else no_progress
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
-    _check_map_options(options)
     check_new_folder(output)
     num_images = _check_input(database, image_path)
 
@@ -115,21 +113,6 @@ def map_database(
         figures=figures,
         seconds=clock.seconds,
     )
-
-
-def _check_map_options(options: MapOptions) -> None:
-    kinds = get_args(Mapper)
-    if options.mapper not in kinds:
-        raise OptionError(f"mapper is {options.mapper!r}: give {' or '.join(kinds)}")
-    if options.forward_motion and options.mapper != "incremental":
-        raise OptionError(
-            "forward_motion says how the incremental mapper starts: leave it out, or give "
-            "--mapper incremental"
-        )
-    if options.seed < 0:
-        raise OptionError(f"seed is {options.seed}: give 0 or more")
-    if options.num_threads is not None and options.num_threads < 1:
-        raise OptionError(f"num_threads is {options.num_threads}: give 1 or more, or None")
 
 
 def _check_input(database: Path, image_path: Path) -> int:

@@ -142,7 +142,7 @@ def match(
         ImageError: images or names do not fit the video.
         DatabaseError: the database is locked, no COLMAP database, has features of its
             images and must not (`options.on_existing`), or does not fit the video.
-        OptionError: an option has a value that cannot work.
+        OptionError: an option does not fit the video or its images.
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress

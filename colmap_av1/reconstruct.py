@@ -7,9 +7,10 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, cannot_write
+from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.images.preparing import check_fit
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage
 from colmap_av1.model.reconstruct_stages import (
@@ -20,9 +21,7 @@ from colmap_av1.model.reconstruct_stages import (
     track_stage,
 )
 from colmap_av1.model.track_points import LEAST_AGREEING
-from colmap_av1.model.triangulate import check_triangulate_options
-from colmap_av1.option_checks import check_options
-from colmap_av1.options import MapperOptions, ReconstructOptions
+from colmap_av1.options import ReconstructOptions
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -106,15 +105,15 @@ def reconstruct(
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images cannot be chosen or written.
         ModelError: no poses are found, or the output cannot be written.
-        OptionError: an option has a value that cannot work, or the folder holds other things.
+        OptionError: an option does not fit the video, or the folder holds other things.
     """
     options = options if options is not None else ReconstructOptions()
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()
     video = read_video(video, options.match.read.operating_point)
-    check_options(options.match, video.picture_size)
-    _check_reconstruct_options(options)
+    # What can be refused is refused before the long work.
+    check_fit(options.match, video.picture_size, video.display.pixel_aspect)
     with open_stages(output, "reconstruct") as stages:
         matching = with_stream_kept(options.match, stages)
         with open_source(video, matching, beside=output, clock=clock, progress=progress) as source:
@@ -152,26 +151,6 @@ def _run_stages(run: Run) -> ReconstructReport:
         warnings=tuple(notes),
         **reported,
     )
-
-
-def _check_reconstruct_options(options: ReconstructOptions) -> None:
-    check_triangulate_options(options.triangulate)
-    kinds = get_args(MapperOptions.__annotations__["mapper"]) or ("auto", "incremental", "global")
-    if options.mapping.mapper not in kinds:
-        raise OptionError(f"mapper is {options.mapping.mapper!r}: give {', '.join(kinds)}")
-    if options.mapping.pose_tracks_per_image < 50:
-        raise OptionError(
-            f"pose_tracks_per_image is {options.mapping.pose_tracks_per_image}: give 50 or more"
-        )
-    if options.mapping.mapper_threads < 1:
-        raise OptionError(f"mapper_threads is {options.mapping.mapper_threads}: give 1 or more")
-    if not options.match.camera.single_camera:
-        raise OptionError(
-            "single_camera is 0, but a trainer's folder has one camera: leave it at 1"
-        )
-    name = options.match.images.image_name
-    if name.count(".") != 1:
-        raise OptionError(f"image_name '{name}': give one without a dot but that of the extension")
 
 
 def _notes(facts: dict[str, Any]) -> list[str]:

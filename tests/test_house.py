@@ -19,8 +19,7 @@ AT_THE_TOP = {"errors": "errors", "options": "options", "compare": "compare"}
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES = 14, 450, 60
 # Long for a reason: each says one thing in order.
 LONG_FUNCTIONS: dict[str, int] = {}
-LONG_FILES = {"cli.commands": 581}
-CLIMBS = ["images.preparing imports option_checks"]
+LONG_FILES: dict[str, int] = {}
 
 
 def modules() -> dict[str, Path]:
@@ -53,7 +52,7 @@ def test_imports_run_down_the_flow() -> None:
         for other in sorted(imported(path))
         if FLOW.index(room_of(other)) > FLOW.index(room_of(name))
     ]
-    assert climbs == CLIMBS
+    assert climbs == []
 
 
 def test_rooms_and_files_are_small() -> None:

@@ -34,8 +34,8 @@ from colmap_av1.options import (
     PairOptions,
     ReadOptions,
     RefineOptions,
+    RunOptions,
     TrackOptions,
-    VerifyOptions,
 )
 from colmap_av1.video import facts, stored_frames
 
@@ -119,7 +119,7 @@ def test_same_input_gives_the_same_bytes(
         options = MatchOptions(
             refine=RefineOptions(refine=refine),
             density=DensityOptions(preset="default"),
-            verify=VerifyOptions(num_threads=threads),
+            run=RunOptions(num_threads=threads),
         )
         match(tmp_path / f"{name}.db", clip, options=options)
     assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
@@ -210,11 +210,12 @@ def test_every_other_frame(clip: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (MatchOptions(verify=VerifyOptions(max_error=0)), OptionError),
+        (MatchOptions(camera=CameraOptions(camera_params="9,9,9,9,0,0,0,0")), OptionError),
+        (MatchOptions(images=ImageOptions(frame_list="none.txt")), ImageError),
         (MatchOptions(pairs=PairOptions(min_matches=10**6)), VideoError),
     ],
 )
-def test_options_that_cannot_work_leave_nothing(
+def test_options_that_do_not_fit_leave_nothing(
     clip: Path, tmp_path: Path, options: MatchOptions, error: type[ColmapAv1Error]
 ) -> None:
     with pytest.raises(error):
@@ -275,8 +276,6 @@ def test_matches_of_listed_images_are_added_to_or_replaced(clip: Path, tmp_path:
     before = database.read_bytes()
     with pytest.raises(DatabaseError, match="--on_existing append adds to them, replace removes"):
         match(database, clip)
-    with pytest.raises(OptionError, match="give error, append, replace"):
-        match(database, clip, options=MatchOptions(on_existing="keep"))
     with pytest.raises(DatabaseError, match="these very keypoints already"):
         match(database, clip, options=MatchOptions(on_existing="append"))
     assert database.read_bytes() == before
@@ -322,7 +321,7 @@ def test_refined_and_thinned_tracks(clip: Path, tmp_path: Path) -> None:
 
 
 def test_density_counts_images_not_frames(clip: Path, tmp_path: Path) -> None:
-    density = DensityOptions(preset="dense", min_length=3)
+    density = DensityOptions(preset="dense", min_images=3)
     options = MatchOptions(density=density, images=ImageOptions(every=4))
     match(tmp_path / "a.db", clip, options=options)
     keypoints = [row[1] for row in tables(tmp_path / "a.db")["keypoints"]]

@@ -24,15 +24,11 @@ from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import (
-    CameraOptions,
-    ImageOptions,
-    MapperOptions,
     MatchOptions,
     ReadOptions,
-    ReconstructOptions,
+    RunOptions,
     TrackOptions,
     TriangulateOptions,
-    VerifyOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
@@ -309,9 +305,7 @@ def test_only_what_changes_the_result_redoes(
     before = contents(output)
     video = tmp_path / "elsewhere.mp4"
     shutil.copyfile(SCENE, video)
-    match = replace(
-        OPTIONS.match, read=ReadOptions(num_threads=1), verify=VerifyOptions(num_threads=1)
-    )
+    match = replace(OPTIONS.match, read=ReadOptions(num_threads=1), run=RunOptions(num_threads=1))
     one = reconstruct(video, output, options=replace(OPTIONS, match=match))
     assert one.resumed == ("tracks", "matches", "poses", "adjustment", "model")
     monkeypatch.setattr("colmap_av1.util.stages.code_digest", lambda *_: "of an upgrade")
@@ -461,22 +455,6 @@ def test_folder_of_others(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="not empty and not the output of an earlier run"):
         reconstruct(SCENE, tmp_path, options=OPTIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        replace(OPTIONS, match=MatchOptions(camera=CameraOptions(single_camera=False))),
-        replace(OPTIONS, match=MatchOptions(images=ImageOptions(image_name="a.b_%d.png"))),
-        replace(OPTIONS, mapping=MapperOptions(mapper="best")),  # type: ignore[arg-type]
-        replace(OPTIONS, mapping=MapperOptions(pose_tracks_per_image=1)),
-        replace(OPTIONS, triangulate=TriangulateOptions(min_angle=-1)),
-    ],
-)
-def test_options_that_cannot_work(options: ReconstructOptions, tmp_path: Path) -> None:
-    with pytest.raises(OptionError):
-        reconstruct(SCENE, tmp_path / "out", options=options)
-    assert not (tmp_path / "out").exists()
 
 
 def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:

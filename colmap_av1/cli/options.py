@@ -4,78 +4,45 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import inspect
-import re
-import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from typing import Any, TypeVar
 
-from colmap_av1.options import CameraOptions, VerifyOptions
+from colmap_av1.cli.parser import Parser
+from colmap_av1.options.fields import Options, declared_of, field_types, is_path, members_of
 
-_Options = TypeVar("_Options")
+_Options = TypeVar("_Options", bound=Options)
 _Number = TypeVar("_Number", int, float)
 
-# Prefix of the namespace entries that are fields of options.
-_OPTION = "option."
 
-# Options under other names than their fields', and COLMAP's prefixes, which are accepted.
-_SPELLINGS = {"seed": ("--random_seed",)}
-# Options whose value is a file.
-_FILES = ("frame_list", "keep_stream")
-_PREFIXES: dict[type, str] = {CameraOptions: "ImageReader", VerifyOptions: "TwoViewGeometry"}
-# Whole numbers are 32 bits wide where they are used; squares of others fit, too.
-_LARGEST = 2**31 - 1
+def add_options(command: Parser, *kinds: type[Options]) -> None:
+    """Add an option for each field of some options dataclasses and of those they hold.
 
-
-def add_options(
-    command: argparse.ArgumentParser, kinds: dict[type, str], *, without: Sequence[str] = ()
-) -> None:
-    """Add an option for each field of some options dataclasses, in groups of the given titles.
-
-    The field's comment is the help text. Fields that hold further options are left out; a name
-    that several kinds have, such as num_threads, is one option for all of them. What is not
-    given on the command line does not appear in the namespace.
+    Each dataclass is a group with its title; those of its fields that are not common are left to
+    --help-all. What is not given on the command line does not appear in the namespace.
 
     Args:
         command: the subcommand.
-        kinds: title of each dataclass's group.
-        without: fields that the subcommand has no use for.
+        kinds: the dataclasses.
+
+    Raises:
+        argparse.ArgumentError: two fields have one name.
     """
-    added: set[str] = set(without)
-    for kind, title in kinds.items():
-        group = command.add_argument_group(title)
-        hints = typing.get_type_hints(kind)
-        comments = _field_comments(kind)
-        for field in dataclasses.fields(kind):
-            if dataclasses.is_dataclass(field.default) or field.name in added:
-                continue
-            added.add(field.name)
-            names = [*_SPELLINGS.get(field.name, ()), f"--{field.name}"]
-            parse, metavar = _value_parser(hints[field.name])
-            default = _spell(field.default)
-            how: dict[str, Any] = {"nargs": "?", "const": True} if hints[field.name] is bool else {}
-            how |= {"dest": f"{_OPTION}{field.name}", "type": parse, "default": argparse.SUPPRESS}
-            group.add_argument(
-                *names,
-                metavar="PATH" if field.name in _FILES else metavar,
-                help=f"{comments.get(field.name, '')} [{default}]".strip().replace("%", "%%"),
-                **how,
-            )
-            if kind in _PREFIXES:  # accepted, but no reading for help
-                prefixed = f"--{_PREFIXES[kind]}.{field.name}"
-                command.add_argument(prefixed, help=argparse.SUPPRESS, **how)
+    for kind in kinds:
+        for options, path in _parts(kind(), kind.__name__, frozenset()):
+            group = command.add_argument_group(options.title)
+            for field in path.fields:
+                _add_option(command, group, options, field, f"{path.name}.{field.name}")
 
 
-def given(namespace: argparse.Namespace, kind: type[_Options], **more: Any) -> _Options:
-    """The options of a kind, with those given on the command line in place of defaults."""
-    names = typing.get_type_hints(kind)
-    given = {
-        k.removeprefix(_OPTION): v for k, v in vars(namespace).items() if k.startswith(_OPTION)
-    }
-    # `refine` is an option and, in MatchOptions, the kind of options that has it.
-    return kind(**{k: v for k, v in given.items() if k in names and k not in more}, **more)
+def given(namespace: argparse.Namespace, kind: type[_Options]) -> _Options:
+    """The options of a kind, with those given on the command line in place of defaults.
+
+    Raises:
+        OptionError: a value cannot work.
+    """
+    return _with_given(kind(), kind.__name__, vars(namespace))
 
 
 def underscored(word: str) -> str:
@@ -86,36 +53,70 @@ def underscored(word: str) -> str:
     return f"--{name.replace('-', '_')}{equals}{value}"
 
 
-def _field_comments(kind: type) -> dict[str, str]:
-    """The comment above each field of a class; none where its source is not installed."""
-    try:
-        lines = inspect.getsource(kind).splitlines()
-    except OSError:
-        return {}
-    comments: dict[str, str] = {}
-    comment: list[str] = []
-    for line in map(str.strip, lines):
-        if line.startswith("#"):
-            comment.append(line.lstrip("# "))
-            continue
-        field = re.match(r"(\w+):", line)
-        if field and comment:
-            comments[field[1]] = " ".join(comment).replace("None", "none")
-        comment = []
-    return comments
+@dataclasses.dataclass(frozen=True)
+class _Path:
+    """Where options are found in those of the command, and which of their fields it offers."""
+
+    name: str
+    fields: list[dataclasses.Field[Any]]
+
+
+def _parts(options: Options, name: str, unused: Collection[str]) -> Iterator[tuple[Options, _Path]]:
+    """The options and all that they hold, but for unused ones; first what holds others."""
+    used = [f for f in dataclasses.fields(typing.cast(Any, options)) if f.name not in unused]
+    parts = [f for f in used if isinstance(getattr(options, f.name), Options)]
+    yield options, _Path(name, [f for f in used if f not in parts])
+    for field in parts:
+        start = f"{field.name}."
+        below = {path.removeprefix(start) for path in unused if path.startswith(start)}
+        part = getattr(options, field.name)
+        yield from _parts(part, f"{name}.{field.name}", below | declared_of(field).unused)
+
+
+def _add_option(
+    command: Parser, group: Any, options: Options, field: dataclasses.Field[Any], dest: str
+) -> None:
+    declared = declared_of(field)
+    hint = field_types(type(options))[field.name]
+    names = [*declared.spellings, field.name]
+    parse, metavar = _value_parser(hint)
+    how: dict[str, Any] = {"nargs": "?", "const": True} if hint is bool else {}
+    how |= {"dest": dest, "type": parse, "default": argparse.SUPPRESS}
+    text = f"{declared.help} [{_spell(getattr(options, field.name))}]".replace("None", "none")
+    action = group.add_argument(
+        *(f"--{name}" for name in names), metavar=metavar, help=text.replace("%", "%%"), **how
+    )
+    if not declared.common:
+        command.rare.append(action)
+    if options.colmap_prefix:  # accepted, but no reading for help
+        prefixed = (f"--{options.colmap_prefix}.{name}" for name in names)
+        command.add_argument(*prefixed, help=argparse.SUPPRESS, **how)
+
+
+def _with_given(options: _Options, name: str, values: dict[str, Any]) -> _Options:
+    changes = {}
+    for field in dataclasses.fields(typing.cast(Any, options)):
+        path, value = f"{name}.{field.name}", getattr(options, field.name)
+        if isinstance(value, Options):
+            changes[field.name] = _with_given(value, path, values)
+        elif path in values:
+            changes[field.name] = values[path]
+    return typing.cast(_Options, dataclasses.replace(typing.cast(Any, options), **changes))
 
 
 def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
     """Parser and placeholder for the values of a field's type."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        (inner,) = (a for a in arguments if a is not type(None))
-        parse, metavar = _value_parser(inner)
+    members = [member for member in members_of(hint) if member is not type(None)]
+    if type(None) in members_of(hint):
+        parse, metavar = _value_parser(typing.Union[tuple(members)])  # noqa: UP007 - made here
         return (lambda word: None if word.lower() == "none" else parse(word)), metavar
-    if origin is tuple:
+    if is_path(members):
+        return str, "PATH"
+    arguments = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
         parse, metavar = _value_parser(arguments[0])
         return (lambda words: tuple(parse(word) for word in words.split(","))), f"{metavar},..."
-    if origin is typing.Literal:
+    if typing.get_origin(hint) is typing.Literal:
         return str, "|".join(arguments)
     if hint is bool:
         return _parse_bool, "0|1"
@@ -129,12 +130,9 @@ def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
 
 def _parse_number(kind: type[_Number], what: str, word: str) -> _Number:
     try:
-        value = kind(word)
+        return kind(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{word}' is no {what}") from None
-    if abs(value) > _LARGEST:
-        raise argparse.ArgumentTypeError(f"{word} is too large: give {_LARGEST} at most")
-    return value
 
 
 def _parse_bool(word: str) -> bool:
@@ -149,4 +147,4 @@ def _spell(value: Any) -> str:
         return str(int(value))
     if isinstance(value, tuple):
         return ",".join(map(str, value))
-    return "none" if value is None else str(value)
+    return str(value)

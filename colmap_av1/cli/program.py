@@ -6,24 +6,23 @@ import argparse
 import importlib.metadata
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
-from colmap_av1.cli.commands import (
-    ABOUT_NAMES,
-    add_check,
-    add_compare,
-    add_densify,
-    add_encode,
-    add_export,
-    add_info,
-    add_map,
-    add_match,
-    add_motion,
-    add_reconstruct,
-    add_view,
-)
+from colmap_av1.cli.commands.check import add_check
+from colmap_av1.cli.commands.compare import add_compare
+from colmap_av1.cli.commands.densify import add_densify
+from colmap_av1.cli.commands.encode import add_encode
+from colmap_av1.cli.commands.export import add_export
+from colmap_av1.cli.commands.info import add_info
+from colmap_av1.cli.commands.map import add_map
+from colmap_av1.cli.commands.match import add_match
+from colmap_av1.cli.commands.motion import add_motion
+from colmap_av1.cli.commands.reconstruct import add_reconstruct
+from colmap_av1.cli.commands.shared import ABOUT_NAMES
+from colmap_av1.cli.commands.view import add_view
 from colmap_av1.cli.options import underscored
+from colmap_av1.cli.parser import BAD_INPUT, Parser
 from colmap_av1.cli.terminal import (
     PROGRAM,
     allow_any_file_name,
@@ -35,7 +34,6 @@ from colmap_av1.util.signals import ending_in_order
 
 _INTERRUPTED = 130
 _BROKEN_PIPE = 141
-_BAD_INPUT = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,13 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings_as_lines(), ending_in_order():
             words = sys.argv[1:] if arguments is None else arguments
-            # argparse exits by itself, with status 2 and one line, on words it does not know.
-            namespace = _make_parser().parse_args([underscored(word) for word in words])
+            namespace = _parse([underscored(word) for word in words])
             status: int | None = namespace.run(namespace)
             sys.stdout.flush()
     except ColmapAv1Error as error:
         print_error(error)
-        return _BAD_INPUT
+        return BAD_INPUT
     except BrokenPipeError:  # as before `head`, which has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
@@ -70,16 +67,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         what = f"{os.fsdecode(error.filename)}: {error.strerror}"
         print_error(f"{what}: mend that, or give another path")
-        return _BAD_INPUT
+        return BAD_INPUT
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return _INTERRUPTED
     return status or 0
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(_BAD_INPUT, f"{PROGRAM}: error: {message} (see {self.prog} --help)\n")
+def _parse(words: Sequence[str]) -> argparse.Namespace:
+    """The words as a namespace; argparse exits by itself, with status 2, on what it refuses."""
+    parser, commands = _make_parser()
+    command = commands.get(words[0]) if words else None
+    if command is None:
+        return parser.parse_args(words)
+    command.refuse_unknown(words[1:])
+    namespace, others = parser.parse_known_args(words)
+    if others:
+        command.error(f"unrecognized arguments: {' '.join(others)}")
+    return namespace
 
 
 class _Version(argparse.Action):
@@ -88,12 +93,12 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _make_parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _make_parser() -> tuple[Parser, Mapping[str, Parser]]:
+    """The program's parser, and those of its commands by their names."""
+    parser = Parser(
         prog=PROGRAM,
         description="Dense COLMAP matches read from the motion vectors of an AV1 video.",
         epilog=ABOUT_NAMES,
-        allow_abbrev=False,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
@@ -102,4 +107,4 @@ def _make_parser() -> argparse.ArgumentParser:
         *(add_info, add_check, add_motion, add_export, add_view),
     ):
         add(commands)
-    return parser
+    return parser, commands.choices

@@ -89,7 +89,6 @@ def export_hloc(
         OptionError: the folder cannot be written.
     """
     options = options if options is not None else ExportOptions()
-    _check_options(options)
     path, folder = Path(database), Path(output)
     report = progress if progress is not None else no_progress
     if is_new(path):
@@ -107,11 +106,6 @@ def export_hloc(
                 options=options, report=report,
             )  # fmt: skip
     return len(counts), num_pairs
-
-
-def _check_options(options: ExportOptions) -> None:
-    if options.format != "hloc":
-        raise OptionError(f"format is {options.format!r}: give hloc")
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:

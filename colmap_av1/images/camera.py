@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pycolmap
 
-from colmap_av1.errors import OptionError
 from colmap_av1.options import CameraOptions
+from colmap_av1.options.camera import (
+    DEFAULT_MODEL,
+    DEFAULT_MODEL_OF_KNOWN_FOCAL_LENGTH,
+    DEFAULT_MODEL_OF_OBLONG_PIXELS,
+    camera_of_model,
+    parse_camera_params,
+)
 
 # Models that a pinhole camera is a first guess of, and those of them without distortion.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-# Models of new cameras: COLMAP's own choice; where the focal length is known, one with two
-# parameters for the distortion, as what a lens does beyond one bends focal length and path; and the
-# simplest with two focal lengths that knows distortion.
-_MODEL, _MODEL_OF_KNOWN_FOCAL_LENGTH, _MODEL_OF_OBLONG_PIXELS = "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 # Encoders that scale pictures round their display size: a few tenths of a percent.
 _SQUARE_TOLERANCE = 5e-3
 
@@ -40,37 +41,27 @@ def make_camera(
         width: image width in pixels.
         height: image height in pixels.
         pixel_aspect: width of a pixel over its height.
-        focal_length: in heights of a pixel; used where no parameters are given.
+        focal_length: in heights of a pixel, as estimated; used where no parameters are given.
 
     Raises:
-        OptionError: the model is unknown, or the parameters do not fit it.
+        OptionError: parameters without a model do not fit that of such pixels.
     """
-    names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     name = options.camera_model
     if name is None:
         estimated = focal_length is not None and options.camera_params is None
-        square = _MODEL_OF_KNOWN_FOCAL_LENGTH if estimated else _MODEL
-        name = square if is_square(pixel_aspect) else _MODEL_OF_OBLONG_PIXELS
-    if name not in names:
-        raise OptionError(f"unknown camera model {name!r}: give one of {', '.join(names)}")
-    model = pycolmap.CameraModelId.__members__[name]
-    create = getattr(pycolmap.Camera, "create_from_model_id", None) or pycolmap.Camera.create
+        square = DEFAULT_MODEL_OF_KNOWN_FOCAL_LENGTH if estimated else DEFAULT_MODEL
+        name = square if is_square(pixel_aspect) else DEFAULT_MODEL_OF_OBLONG_PIXELS
     is_known = focal_length is not None or options.camera_params is not None
     if focal_length is None:
         focal_length = 1.2 * max(width * pixel_aspect, height)
-    camera = create(0, model, focal_length, width, height)
+    camera = camera_of_model(name, focal_length, width, height)
     if has_two_focal_lengths(camera):
         params = camera.params
         params[camera.focal_length_idxs()[0]] = focal_length / pixel_aspect
         camera.params = params
-    if len(camera.focal_length_idxs()) == 0:
-        raise OptionError(
-            f"camera model {name} has no focal length, so it does not fit a "
-            "video: give a perspective or fisheye model such as SIMPLE_RADIAL"
-        )
     camera.has_prior_focal_length = is_known
     if options.camera_params is not None:
-        camera.params = _parse_camera_params(options.camera_params, camera)
+        camera.params = parse_camera_params(options.camera_params, camera)
     return camera
 
 
@@ -108,16 +99,3 @@ def check_pixel_aspect(camera: Any, pixel_aspect: float, what_to_do: str) -> lis
 def is_square(pixel_aspect: float) -> bool:
     """Whether pixels are square, but for what rounding does to their width."""
     return abs(pixel_aspect - 1) < _SQUARE_TOLERANCE
-
-
-def _parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:
-    wanted = f"{camera.model.name} takes {len(camera.params)} numbers, {camera.params_info}"
-    try:
-        params = [float(word) for word in text.split(",")]
-    except ValueError:
-        raise OptionError(f"cannot read camera_params {text!r}: {wanted}") from None
-    if len(params) != len(camera.params) or not all(map(math.isfinite, params)):
-        raise OptionError(f"camera_params {text!r} do not fit: {wanted}")
-    if min(params[i] for i in camera.focal_length_idxs()) <= 0:
-        raise OptionError(f"camera_params {text!r} hold a focal length of 0 or less: {wanted}")
-    return params

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -83,7 +82,7 @@ def choose_images(
 
     Raises:
         ImageError: the images do not say which frames they are, or fewer than two are chosen.
-        OptionError: an option has a value that cannot work, or does not go with existing images.
+        OptionError: an option does not go with existing images, or `fps` needs times.
     """
     if existing:
         chosen = _find_existing(tracks.num_frames, options, existing, folder, decode)
@@ -105,28 +104,6 @@ def choose_images(
     return chosen
 
 
-def check_image_options(options: ImageOptions) -> None:
-    """Refuse options that cannot work.
-
-    Raises:
-        OptionError: two ways to choose are given, or a value cannot work.
-    """
-    given = [n for n in ("num_images", "every", "fps", "frame_list") if getattr(options, n)]
-    if len(given) > 1:
-        raise OptionError(f"{given[0]} and {given[1]} both say which frames are images: give one")
-    for name, least in (("num_images", 2), ("every", 1)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise OptionError(f"{name} is {value}: give {least} or more")
-    if options.fps is not None and not 0 < options.fps < math.inf:
-        raise OptionError(f"fps is {options.fps}: give images per second, above 0")
-    if options.select not in ("time", "parallax"):
-        raise OptionError(f"select is {options.select!r}: give 'time' or 'parallax'")
-    if options.select == "parallax" and options.num_images is None:
-        raise OptionError("select 'parallax' spreads a number of images: give num_images, too")
-    image_names(options.image_name, ())
-
-
 def choose_frames(
     tracks: Tracks,
     options: ImageOptions,
@@ -144,10 +121,9 @@ def choose_frames(
         int32 display indices, strictly ascending.
 
     Raises:
-        OptionError: an option has a value that cannot work, or `fps` needs times.
+        OptionError: `fps` needs times.
         ImageError: there are fewer frames than images wanted.
     """
-    check_image_options(options)
     count = tracks.num_frames
     if options.every is not None:
         return np.arange(0, count, options.every, dtype=np.int32)
@@ -255,6 +231,32 @@ def read_frame_list(
         ImageError: the file is missing, or names a frame that the video does not have, a frame
             twice, or two images alike.
     """
+    entries = _read_entries(path, options)
+    for number, frame, _ in entries:
+        if not 0 <= frame < num_frames:
+            raise ImageError(
+                f"{path}, line {number}: there is no frame {frame}: the video has frames 0 to "
+                f"{num_frames - 1}, give one of them"
+            )
+    entries.sort(key=lambda entry: entry[1])
+    frames = np.array([frame for _, frame, _ in entries], dtype=np.int32)
+    return ChosenImages([name for _, _, name in entries], frames)
+
+
+def check_frame_list(options: ImageOptions) -> None:
+    """Refuse a list of frames that says too little, whatever the video.
+
+    Raises:
+        ImageError: see `read_frame_list`.
+    """
+    if options.frame_list is not None:
+        _read_entries(options.frame_list, options)
+
+
+def _read_entries(
+    path: str | os.PathLike[str], options: ImageOptions
+) -> list[tuple[int, int, str]]:
+    """Number of the line, frame and image name of each entry of a list of frames."""
     try:
         lines = Path(path).read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -263,7 +265,7 @@ def read_frame_list(
             f"{path}: is no list of frames that can be read: {reason}: give a text file with a "
             "frame's index on each line"
         ) from error
-    entries: list[tuple[int, str]] = []
+    entries: list[tuple[int, int, str]] = []
     for number, line in enumerate(lines, start=1):
         words = line.split(maxsplit=1)
         if not words or words[0].startswith("#"):
@@ -277,22 +279,15 @@ def read_frame_list(
             if found is None:
                 raise ImageError(f"{path}, line {number}: '{name}' names no frame: give its index")
             frame = found - (options.first_number or 0)
-        if not 0 <= frame < num_frames:
-            raise ImageError(
-                f"{path}, line {number}: there is no frame {frame}: the video has frames 0 to "
-                f"{num_frames - 1}, give one of them"
-            )
-        entries.append((frame, name))
-    entries.sort()
+        entries.append((number, frame, name))
     for what, values in (
-        ("frame", [str(f) for f, _ in entries]),
-        ("name", [n for _, n in entries]),
+        ("frame", [str(f) for _, f, _ in entries]),
+        ("name", [n for _, _, n in entries]),
     ):
         twice = next((v for v in values if values.count(v) > 1), None)
         if twice is not None:
             raise ImageError(f"{path}: gives the {what} {twice} twice: remove one line")
-    frames = np.array([frame for frame, _ in entries], dtype=np.int32)
-    return ChosenImages([name for _, name in entries], frames)
+    return entries
 
 
 def _find_existing(

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, VideoError, cannot_write
 from colmap_av1.images.names import (
     WRITE_PARAMETERS,
-    check_extension,
     image_file,
     image_names,
     natural_key,
     pattern_regex,
 )
+from colmap_av1.options.images import check_extension
+from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import remove_leftovers, whole_file
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
@@ -225,7 +226,7 @@ def write_images(
                 video, operating_point=operating_point, num_threads=num_threads, display=display
             )
             with contextlib.closing(decoded):
-                _write_frames(decoded, wanted, change, num_threads or os.cpu_count() or 1, report)
+                _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)
     except VideoError:  # images of two videos would be kept as those of one
         for path in wanted.values():
             path.unlink(missing_ok=True)

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError
+from colmap_av1.options.images import check_extension, check_image_pattern
 
 WRITE_PARAMETERS = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
@@ -29,7 +30,7 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
     Raises:
         OptionError: the pattern has no integer field, or no extension of an image.
     """
-    pattern_regex(pattern)
+    check_image_pattern(pattern)
     return [pattern % frame for frame in frames]
 
 
@@ -123,24 +124,8 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 def pattern_regex(pattern: str) -> re.Pattern[str]:
     """A regular expression that matches the names a pattern makes."""
-    fields = re.findall(r"%0?\d*d", pattern)
-    if len(fields) != 1 or pattern.count("%") != 1:
-        raise OptionError(
-            f"image name '{pattern}' needs exactly one number field, such as frame_%06d.png"
-        )
-    if Path(pattern).name != pattern or pattern.startswith("."):
-        raise OptionError(
-            f"image name '{pattern}' has a folder or a dot before it: give a plain file name"
-        )
-    check_extension(pattern)
-    before, after = pattern.split(fields[0])
+    before, after = pattern.split(check_image_pattern(pattern))
     return re.compile(re.escape(before) + r"\d+" + re.escape(after))
-
-
-def check_extension(name: str) -> None:
-    """Refuse a name that says no format of images."""
-    if PurePosixPath(name).suffix.lower() not in WRITE_PARAMETERS:
-        raise OptionError(f"image name '{name}': give one that ends in .png, .jpg or .jpeg")
 
 
 def check_new_name(name: str) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.camera import make_camera
+from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import (
     check_image_folder,
     check_images_there,
@@ -21,7 +22,6 @@ from colmap_av1.images.files import (
     write_images,
 )
 from colmap_av1.images.recognising import check_content, is_turned_back
-from colmap_av1.option_checks import check_options
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, scale_tracks, show_tracks
 from colmap_av1.tracks.video_tracks import (
@@ -90,6 +90,22 @@ class _Fit:
         return self.display.pixel_aspect * width * image_height / (height * image_width)
 
 
+def check_fit(options: MatchOptions, size: tuple[int, int], pixel_aspect: float) -> None:
+    """Refuse options that cannot give images of a video, before the long work.
+
+    Args:
+        options: those of the images and of the camera are looked at.
+        size: (width, height) of the images.
+        pixel_aspect: width of a pixel of theirs over its height.
+
+    Raises:
+        ImageError: the list of frames cannot be read.
+        OptionError: the camera's parameters do not fit such pixels.
+    """
+    make_camera(options.camera, *size, pixel_aspect)
+    check_frame_list(options.images)
+
+
 def prepare_images(
     video: Video,
     folder: Path | None,
@@ -105,7 +121,7 @@ def prepare_images(
     Args:
         video: a video.
         folder: folder of the images, which may exist; None: none are wanted.
-        options: all but those of density, pairs and verification are used; all are checked.
+        options: all but those of density, pairs and verification are used.
         listed: (width, height) of images that a database lists, by name.
         beside: the file that is being made, see `open_source`.
         clock: gets the stages up to "choice".
@@ -115,12 +131,12 @@ def prepare_images(
         VideoError: the video cannot be read.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images or names do not fit the video.
-        OptionError: an option has a value that cannot work.
+        OptionError: an option does not fit the video or its images.
     """
     # What can be refused is refused before the long work.
     fit = _fit(video, folder, options, listed)
     display, size, existing = fit.display, fit.size, list(fit.existing)
-    check_options(options, size)
+    check_fit(options, size, fit.pixel_aspect)
     if folder is not None:
         check_image_folder(folder, existing or options.images.image_name, size)
         if size != fit.video_size:
@@ -228,7 +244,7 @@ def write_chosen(
         folder,
         chosen.names,
         chosen.frames.tolist(),
-        num_threads=options.verify.num_threads,
+        num_threads=options.run.num_threads,
         operating_point=options.read.operating_point,
         display=display,
         progress=lambda done: progress("images", done, len(chosen.names)),

@@ -125,7 +125,7 @@ def shared_focal_length(
             paired.matches,
             size,
             pixel_aspect=pixel_aspect,
-            seed=options.verify.seed,
+            seed=options.run.seed,
         )
 
 
@@ -142,7 +142,7 @@ def verify_images(
     Args:
         paired: the images and their matches.
         cameras: the camera of all images, or one for each.
-        options: those of verification are used.
+        options: those of verification and of the run are used.
         clock: gets the stage "verification".
         progress: called in the stage "verification".
     """
@@ -154,6 +154,7 @@ def verify_images(
             matches,
             cameras,
             options=options.verify,
+            run=options.run,
             progress=lambda done: progress("verification", done, len(pairs)),
         )
     return MatchedImages(keypoints, pairs, matches, geometries, _is_forward_motion(geometries))

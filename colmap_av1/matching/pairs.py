@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
@@ -114,12 +113,8 @@ def schedule_pairs(
     Returns:
         int32 [m, 2] indices into `keypoints`, first < second, in ascending order; each pair
         shares at least `options.min_matches` tracks.
-
-    Raises:
-        OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else PairOptions()
-    _check_options(options)
     limit = _longest_track_span(keypoints)
     if options.max_span is not None:
         limit = min(limit, options.max_span)
@@ -184,14 +179,3 @@ def _longest_track_span(keypoints: Sequence[ImageKeypoints]) -> int:
     first[track[::-1]] = image[::-1]
     last[track] = image
     return int((last - first).max())
-
-
-def _check_options(options: PairOptions) -> None:
-    if not options.offsets or min(options.offsets) < 1:
-        raise OptionError(f"offsets is {options.offsets}: give one or more spans of at least 1")
-    if not (1 <= options.growth < math.inf):
-        raise OptionError(f"growth is {options.growth}: give 1 (off) or more, such as 1.4")
-    if options.max_span is not None and options.max_span < 1:
-        raise OptionError(f"max_span is {options.max_span}: give 1 or more, or None")
-    if options.min_matches < 1:
-        raise OptionError(f"min_matches is {options.min_matches}: give 1 or more")

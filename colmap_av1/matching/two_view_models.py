@@ -17,11 +17,10 @@ import poselib
 from numpy.typing import NDArray
 
 from colmap_av1.options import VerifyOptions
+from colmap_av1.options.matching import MIN_MATCHES
 
 _Floats = NDArray[np.float64]
 
-# A fundamental matrix takes seven matches; an eighth is the first that can disagree.
-MIN_MATCHES = 8
 # Iterations of a robust estimator at least; more follow where few matches agree.
 _MIN_ITERATIONS = 15
 # Share of inliers below which COLMAP spends no more iterations on a model.

@@ -8,7 +8,6 @@ matchers mean the same.
 from __future__ import annotations
 
 import math
-import os
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,6 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.two_view_models import (
     MAX_REFINED,
-    MIN_MATCHES,
     Model,
     Search,
     find_fundamental,
@@ -32,7 +30,9 @@ from colmap_av1.matching.two_view_models import (
     planar_share,
     spread_points,
 )
-from colmap_av1.options import VerifyOptions
+from colmap_av1.options import RunOptions, VerifyOptions
+from colmap_av1.options.matching import MIN_MATCHES
+from colmap_av1.util.cpus import threads_or_cpus
 
 _Floats = NDArray[np.float64]
 
@@ -52,6 +52,7 @@ def verify_pairs(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
     options: VerifyOptions | None = None,
     *,
+    run: RunOptions | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TwoViewGeometry]:
     """Find the two-view geometry of every pair.
@@ -67,18 +68,18 @@ def verify_pairs(
         cameras: the camera of all images, or one for each; images share a camera where theirs
             are the same object.
         options: thresholds and effort; the defaults of VerifyOptions if None.
+        run: threads and seed; the defaults of RunOptions if None.
         progress: called with the number of pairs done so far, from this thread, in order.
 
     Returns:
         One geometry per pair, in the order of `pairs`. The result depends on the input and
-        `options.seed` only, not on the number of threads.
+        `run.seed` only, not on the number of threads.
 
     Raises:
-        OptionError: an option has a value that cannot work, or a camera is not a perspective
-            one.
+        OptionError: a camera is not a perspective one.
     """
     options = options if options is not None else VerifyOptions()
-    _check_options(options)
+    run = run if run is not None else RunOptions()
     if isinstance(cameras, pycolmap.Camera):
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):
@@ -90,7 +91,7 @@ def verify_pairs(
         found = views.get(image)
         if found is None:
             # Where two threads make it at a time, both make the same.
-            seed = _seed(options.seed, image)
+            seed = _seed(run.seed, image)
             found = views[image] = _view(keypoints[image], cameras[image], seed)
         return found
 
@@ -98,15 +99,15 @@ def verify_pairs(
         found = []
         for index in some:
             i, j = pairs[index].tolist()
-            found.append(_verify_pair(view(i), view(j), matches[index], (i, j), options))
+            search = Search(options, _seed(run.seed, i, j))
+            found.append(_verify_pair(view(i), view(j), matches[index], search))
         return found
 
     geometries: list[TwoViewGeometry] = []
     # Threads that hand over every pair by itself would be busy with that.
     indices = range(len(pairs))
     parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
-    num_threads = options.num_threads if options.num_threads is not None else _num_cpus()
-    num_threads = min(num_threads, 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
+    num_threads = min(threads_or_cpus(run.num_threads), 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
     # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
@@ -202,22 +203,20 @@ def _verify_pair(
     a: _View,
     b: _View,
     matches: NDArray[np.uint32],
-    pair: tuple[int, int],
-    options: VerifyOptions,
+    search: Search,
 ) -> TwoViewGeometry:
     """Choose the model of one pair as COLMAP 4.2 does (EstimateTwoViewGeometry's rules).
 
     Its test for watermarks is left out: the matches of a wide picture that pans slowly pass
     it, and the mapper would lose the pairs of neighbours that tracks are made of.
     """
-    if len(matches) < max(options.min_num_inliers, MIN_MATCHES):
+    if len(matches) < max(search.options.min_num_inliers, MIN_MATCHES):
         return _degenerate()
     # A beginning of the order that was made for the whole image stays spread in its part.
     places = a.place.take(matches[:, 0])
-    num_refined = min(len(matches), max(MAX_REFINED, options.max_samples))
+    num_refined = min(len(matches), max(MAX_REFINED, search.options.max_samples))
     nearest = np.argpartition(places, num_refined - 1)[:num_refined]
     order = nearest[np.argsort(places[nearest])]
-    search = Search(options, _seed(options.seed, *pair))
     if a.flat is not None and b.flat is not None:
         return _verify_calibrated(a, b, matches, order, search)
     return _verify_uncalibrated(a, b, matches, order, search)
@@ -338,26 +337,3 @@ def _on_rays(E: _Floats, a: _View, b: _View) -> _Floats:
 
 def _unit(matrix: _Floats) -> _Floats:
     return np.asarray(matrix / np.linalg.norm(matrix))
-
-
-def _num_cpus() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _check_options(options: VerifyOptions) -> None:
-    if not 0 < options.max_error < math.inf:
-        raise OptionError(f"max_error is {options.max_error}: give a number of pixels above 0")
-    if options.min_num_inliers < 1:
-        raise OptionError(f"min_num_inliers is {options.min_num_inliers}: give 1 or more")
-    for name in ("min_e_f_inlier_ratio", "max_h_inlier_ratio", "confidence"):
-        value = getattr(options, name)
-        if not 0 <= value <= 1:
-            raise OptionError(f"{name} is {value}: give a share from 0 to 1")
-    for name, least in (("max_samples", MIN_MATCHES), ("max_iterations", 1), ("seed", 0)):
-        value = getattr(options, name)
-        if value < least:
-            raise OptionError(f"{name} is {value}: give {least} or more")
-    if options.num_threads is not None and options.num_threads < 1:
-        raise OptionError(f"num_threads is {options.num_threads}: give 1 or more, or None")

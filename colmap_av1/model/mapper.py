@@ -17,6 +17,7 @@ from colmap_av1.errors import ModelError
 from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import MapOptions
+from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
@@ -116,8 +117,7 @@ def run_mapper(
     refine = options.refine_intrinsics
     if refine is None:
         refine = not options.forward_motion
-    num_threads = options.num_threads if options.num_threads is not None else -1
-    common = {"random_seed": options.seed, "num_threads": num_threads}
+    common = {"random_seed": options.seed, "num_threads": threads_or_cpus(options.num_threads)}
     pycolmap.set_random_seed(options.seed)
     each = output / "each"
     each.mkdir()

@@ -56,7 +56,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 partial / "images",
                 names,
                 frames.tolist(),
-                num_threads=options.match.verify.num_threads,
+                num_threads=options.match.run.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=change,
                 progress=lambda done: progress("images", done, len(names)),

@@ -29,7 +29,7 @@ _FEW_TRACKS = 100
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted.
 _ADJUSTED = DensityOptions(
-    preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_length=3, max_sigma=0.0
+    preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_images=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.25
 # Poses follow from rays, however uncertain the points are that these meet in.
@@ -46,9 +46,9 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
         mapper = "incremental" if matched.facts["guessed"] else "global"
     how = MapOptions(
         mapper=mapper,
-        forward_motion=forward,
+        forward_motion=forward and mapper == "incremental",
         refine_intrinsics=_refines_intrinsics(options),
-        seed=options.match.verify.seed,
+        seed=options.match.run.seed,
         num_threads=mapping.mapper_threads,
     )
 
@@ -147,14 +147,14 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
                 folder,
                 refine_intrinsics=refine,
                 loss_scale=_LOSS_SCALE,
-                seed=options.match.verify.seed,
+                seed=options.match.run.seed,
                 num_threads=options.mapping.mapper_threads,
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
         return {"poses": "adjusted"}
 
-    how = (options.mapping.mapper_threads, options.match.verify.seed, pycolmap.__version__)
+    how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     given = (_ADJUSTED, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,
@@ -207,7 +207,7 @@ def triangulate_images(
         *(seen, view, [placed.camera] * len(placed.images)),
         *([image.cam_from_world for image in placed.images], pinhole),
         options=options,
-        num_threads=run.options.match.verify.num_threads,
+        num_threads=run.options.match.run.num_threads,
         progress=progress,
     )
     if len(points.xyz) == 0:

@@ -159,7 +159,7 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
     return run_stage(
         run.stages,
         "matches",
-        [tracked.digest, given],
+        [tracked.digest, given, options.match.run.seed],
         into=run.output,
         products=["database.db"],
         make=make,

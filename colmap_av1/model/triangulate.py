@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -12,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError
 from colmap_av1.model.colmap_model import camera_centres
 from colmap_av1.options import TriangulateOptions
+from colmap_av1.util.cpus import threads_or_cpus
 
 _Floats = NDArray[np.float64]
 
@@ -126,12 +125,8 @@ def triangulate(
 
     Returns:
         The points, in the order of the tracks.
-
-    Raises:
-        OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else TriangulateOptions()
-    check_triangulate_options(options)
     offsets = observations.offsets
     chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK), side="left")
     bounds = np.unique(np.minimum(chunk, len(offsets) - 1))
@@ -143,7 +138,7 @@ def triangulate(
         return replace(part, observation=part.observation + offsets[first])
 
     # NumPy's loops release the interpreter lock.
-    with ThreadPoolExecutor(max_workers=num_threads or os.cpu_count() or 1) as executor:
+    with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
         try:
             for index, part in enumerate(executor.map(work, range(len(bounds) - 1))):
                 parts.append(part)
@@ -162,26 +157,6 @@ def triangulate(
         num_agreeing=sum(part.num_agreeing for part in parts),
         num_tracks=sum(part.num_tracks for part in parts),
     )
-
-
-def check_triangulate_options(options: TriangulateOptions) -> None:
-    """Refuse options that cannot work.
-
-    Raises:
-        OptionError: an option has a value that cannot work.
-    """
-    if not 0 < options.max_reprojection_error < math.inf:
-        raise OptionError(
-            f"max_reprojection_error is {options.max_reprojection_error}: give pixels above 0"
-        )
-    if not 0 <= options.min_angle < 90:
-        raise OptionError(f"min_angle is {options.min_angle}: give degrees from 0 to below 90")
-    if options.max_depth_error is not None and not 0 < options.max_depth_error < math.inf:
-        raise OptionError(
-            f"max_depth_error is {options.max_depth_error}: give a share above 0, or None"
-        )
-    if options.min_observations < 2:
-        raise OptionError(f"min_observations is {options.min_observations}: give 2 or more")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import warnings
@@ -15,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.errors import BitstreamError, LimitError, OptionError
+from colmap_av1.errors import BitstreamError, LimitError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import ReadOptions
+from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.container import open_stream
 
 # Bytes of block data that threads may read ahead of their use, all together.
 _READ_AHEAD = 1 << 28
 _BYTES_PER_UNIT = 24
 _SMALL_AHEAD = 4  # frames
-_NUM_OPERATING_POINTS = 32  # that a sequence header has room for (5.5.1)
 
 
 @dataclass(frozen=True)
@@ -76,11 +75,9 @@ def read_motion(
         BitstreamError: the stream is damaged before its first frame is complete, or anywhere
             with `options.strict`.
         LimitError: a frame is larger than `options.max_frame_size`.
-        OptionError: an option has a value that cannot work.
         VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
     """
     options = options if options is not None else ReadOptions()
-    check_read_options(options)
     index = _read_index(video, options)
     display_index: dict[int, int] = {}
     for number, decode_index in enumerate(index.shown):
@@ -96,21 +93,6 @@ def read_motion(
         if options.strict or count == 0:
             raise
         warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
-
-
-def check_read_options(options: ReadOptions) -> None:
-    """Refuse options that cannot work.
-
-    Raises:
-        OptionError: an option has a value that cannot work.
-    """
-    last = _NUM_OPERATING_POINTS - 1
-    if not 0 <= options.operating_point <= last:
-        raise OptionError(f"operating_point is {options.operating_point}: give 0 to {last}")
-    if options.num_threads is not None and options.num_threads < 1:
-        raise OptionError(f"num_threads is {options.num_threads}: give 1 or more, or None")
-    if options.max_frame_size < 1:
-        raise OptionError(f"max_frame_size is {options.max_frame_size}: give samples above 0")
 
 
 def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
@@ -181,7 +163,7 @@ def _read_events(
     video: str | PathLike[str], options: ReadOptions, index: _Index
 ) -> Generator[_core.Event, None, None]:
     """Events of the parser in bitstream order; those before an error come first."""
-    num_threads = options.num_threads or os.cpu_count() or 1
+    num_threads = threads_or_cpus(options.num_threads)
     if num_threads == 1:
         for _, event in _read_groups(video, options, index.groups, num_threads=num_threads):
             if event is not None:

@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError
 from colmap_av1.options import RefineOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 # Pixels around a template's window: one for its gradients, two for the way back.
 _MARGIN = 3
-_LARGEST_WINDOW = 101  # a template of each track is kept in memory
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.01)
 # Frames without a confirmation after which a track is given a new template.
 _MAX_MISSES = 3
@@ -68,10 +67,8 @@ def refine_tracks(
 
     Raises:
         ImageError: a picture differs in size from the tracks' frames, or comes out of order.
-        OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else RefineOptions()
-    _check_options(options)
     if options.refine == "none":
         return tracks
     state = match_tracks(tracks, frames, options, progress)
@@ -422,17 +419,3 @@ def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> N
     exponent = _MATCH_CONSTANT + _MATCH_NOISE * np.log(0.02 + noise)
     exponent += _MATCH_PRIOR * np.log(0.01 + np.maximum(prior, 0.0))
     return np.asarray(np.exp(exponent), np.float64)
-
-
-def _check_options(options: RefineOptions) -> None:
-    if options.refine not in ("none", "lk"):
-        raise OptionError(f"refine is {options.refine!r}: give 'none' or 'lk'")
-    if not 5 <= options.refine_window <= _LARGEST_WINDOW or options.refine_window % 2 == 0:
-        raise OptionError(
-            f"refine_window is {options.refine_window}: give an odd number from 5 to "
-            f"{_LARGEST_WINDOW}"
-        )
-    for name in ("refine_move", "refine_difference"):
-        value = getattr(options, name)
-        if not 0 < value < math.inf:
-            raise OptionError(f"{name} is {value}: give more than 0")

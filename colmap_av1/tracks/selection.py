@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.errors import OptionError
 from colmap_av1.options import DensityOptions
+from colmap_av1.tracks.presets import limits_of
 from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
 
 # Error in pixels that an observation has however sure its motion is; keeps one sure
@@ -22,27 +20,6 @@ _SIGMA_FLOOR = 0.3
 _MAX_ERROR_SHARE = 1 / 30
 # An observation is wide that moved at least this share of what those that moved farthest did.
 _WIDE = 0.8
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """The limits in force; 0 is none."""
-
-    max_tracks_per_image: int
-    spacing: float
-    min_length: int
-    max_sigma: float
-    wide_tracks: int
-
-
-# max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
-# as errors grow from step to step.
-_PRESETS = {
-    # Poses need views from far apart; points do not, and long tracks take a mapper's time.
-    "sparse": _Limits(1500, spacing=12.0, min_length=3, max_sigma=0.8, wide_tracks=1000),
-    "default": _Limits(2500, spacing=9.0, min_length=3, max_sigma=0.8, wide_tracks=300),
-    "dense": _Limits(0, spacing=0.0, min_length=1, max_sigma=0.0, wide_tracks=0),
-}
 
 
 def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
@@ -61,15 +38,12 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         options: how many to use; the defaults of DensityOptions if None.
 
     Returns:
-        The chosen tracks in their former order, each with `min_length` observations or more.
+        The chosen tracks in their former order, each with `min_images` observations or more.
         The same object where nothing is left out.
-
-    Raises:
-        OptionError: an option has a value that cannot work.
     """
     options = options if options is not None else DensityOptions()
-    limits = _limits(options)
-    if limits.min_length <= 1 and not (
+    limits = limits_of(options)
+    if limits.min_images <= 1 and not (
         limits.max_sigma or limits.spacing or limits.max_tracks_per_image
     ):
         return tracks
@@ -97,7 +71,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         order=np.argsort(-score, kind="stable"),
         spacing=limits.spacing,
         max_tracks_per_image=limits.max_tracks_per_image,
-        min_length=limits.min_length,
+        min_length=limits.min_images,
     )
     return keep_observations(tracks, kept.view(np.bool_))
 
@@ -146,14 +120,3 @@ def _error_shares(
 def _frames_between_images(tracks: Tracks) -> float:
     frames = np.flatnonzero(np.bincount(tracks.frame))
     return float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
-
-
-def _limits(options: DensityOptions) -> _Limits:
-    if options.preset not in _PRESETS:
-        raise OptionError(f"preset is {options.preset!r}: give 'sparse', 'default' or 'dense'")
-    names = [field.name for field in fields(_Limits)]
-    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
-    for name, value in given.items():
-        if not 0 <= value < math.inf:
-            raise OptionError(f"{name} is {value}: give 0 (no limit) or more")
-    return replace(_PRESETS[options.preset], **given)

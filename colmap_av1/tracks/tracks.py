@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.video.display import Display, shown_points, shown_size
@@ -81,13 +81,11 @@ def build_tracks(
         positions are in pixels of the first shown frame's size.
 
     Raises:
-        OptionError: an option has a value that cannot work.
         VideoError: no frame is shown.
         ValueError: the frames are not in bitstream order, or their arrays contradict
             each other.
     """
     options = options if options is not None else TrackOptions()
-    _check_options(options)
     builder = _core.TrackBuilder(_core_options(options))
     for count, frame in enumerate(motion, start=1):
         builder.add(frame)
@@ -199,7 +197,8 @@ def least_length(options: TrackOptions) -> int:
 
 def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:
     """The options as the core counts: cells instead of their widths."""
-    cell = options.cell or _UNIT
+    # Squares that tracks start in are not smaller than those that hold one.
+    cell = options.cell or min(_UNIT, options.seeding)
     core = _core.TrackBuilderOptions()
     core.min_length = least_length(options)
     core.cosine = options.cosine
@@ -215,34 +214,3 @@ def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:
     core.cells = _UNIT // cell
     core.seeding = options.seeding // cell
     return core
-
-
-def _check_options(options: TrackOptions) -> None:
-    if options.min_length is not None and options.min_length < 1:
-        raise OptionError(f"min_length is {options.min_length}: give 1 or more")
-    widths = (1, 2, _UNIT)
-    if options.cell not in (None, *widths) or options.seeding not in widths:
-        raise OptionError(
-            f"cell is {options.cell}, seeding {options.seeding}: give widths of 1, 2 or 4 pixels"
-        )
-    if options.seeding < (options.cell or _UNIT):
-        raise OptionError(
-            f"seeding is {options.seeding}, below cell {options.cell or _UNIT}: squares that "
-            "tracks start in cannot be smaller than those that hold one, give a smaller --cell"
-        )
-    if options.cosine is not None and not -1.0 <= options.cosine <= 1.0:
-        raise OptionError(f"cosine is {options.cosine}: give a value from -1 to 1, or None")
-    if options.cosine_relative_to not in ("dominant", "none"):
-        raise OptionError(
-            f"cosine_relative_to is {options.cosine_relative_to!r}: give 'dominant' or 'none'"
-        )
-    if not (0.0 <= options.cosine_scale < math.inf):
-        raise OptionError(f"cosine_scale is {options.cosine_scale}: give 0 or more pixels")
-    limits = (
-        *("max_interval", "max_block_area", "max_uncoded_block_area"),
-        *("smoothness", "border", "interpolation", "bridge"),
-    )
-    for name in limits:
-        value = getattr(options, name)
-        if value is not None and not value >= 0:
-            raise OptionError(f"{name} is {value}: give 0 or more, or None")

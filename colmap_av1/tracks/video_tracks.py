@@ -87,9 +87,9 @@ def open_source(
     Raises:
         VideoError: the video cannot be converted.
         EncodeError: no AV1 encoder works, or the stream cannot be written.
-        OptionError: an option has a value that cannot work.
+        OptionError: `keep_stream` names a file that is none of this video's.
     """
-    if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
+    if video.codec == "av1" and not (options.reencode and inspect(video, options.reading).reasons):
         yield VideoSource(video, video)
         return
     strict = options.read.strict
@@ -156,7 +156,7 @@ def track_video(
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: the frames change their size and must not.
     """
-    motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
+    motion: Iterable[FrameMotion] = read_motion(source.stream, options.reading)
     if one_size or options.refine.refine != "none":
         motion = _of_one_size(motion)
     structure = Structure()
@@ -215,7 +215,7 @@ def decoded_pictures(source: VideoSource, options: MatchOptions) -> Iterator[tup
     return decode_frames(
         source.pictures,
         operating_point=options.read.operating_point,
-        num_threads=options.verify.num_threads,
+        num_threads=options.run.num_threads,
     )
 
 
@@ -226,7 +226,7 @@ def decodable_frames(
     decoded = decode_frames(
         video,
         operating_point=options.read.operating_point,
-        num_threads=options.verify.num_threads,
+        num_threads=options.run.num_threads,
         display=display,
     )
     count = 0

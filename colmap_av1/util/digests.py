@@ -16,7 +16,7 @@ from typing import Any
 PACKAGE = Path(__file__).resolve().parents[1]
 # Fields of options that change how long a result takes, not the result: not the threads of the
 # mappers, which change its last digits.
-WITHOUT_EFFECT = frozenset({"ReadOptions.num_threads", "VerifyOptions.num_threads"})
+WITHOUT_EFFECT = frozenset({"ReadOptions.num_threads", "RunOptions.num_threads"})
 _CODE = {".py", ".so", ".pyd"}
 # A file that is written again so soon may keep its times: those of FAT come in steps of 2 s.
 _UNSURE_NS = 2_000_000_000

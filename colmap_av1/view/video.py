@@ -67,12 +67,11 @@ def view_video(
         The number of frames drawn.
 
     Raises:
-        OptionError: an option has a value that cannot work, or the output cannot be written.
+        OptionError: the output cannot be written.
         VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
         BitstreamError: the stream is damaged before its second frame, or with strict.
     """
     options = options if options is not None else ViewOptions()
-    _check_view_options(options)
     report = progress if progress is not None else no_progress
     path, operating_point = Path(output), read.operating_point if read is not None else 0
     count = 0
@@ -233,14 +232,3 @@ def _direction_wheel(size: int) -> Image:
     colours = _direction_colours(offset)
     colours[np.hypot(offset[:, 0], offset[:, 1]) > 1] = 0
     return colours.reshape(size, size, 3)
-
-
-def _check_view_options(options: ViewOptions) -> None:
-    if options.draw not in ("motion", "tracks", "both"):
-        raise OptionError(f"draw is {options.draw!r}: give 'motion', 'tracks' or 'both'")
-    if not 0 <= options.opacity <= 1:
-        raise OptionError(f"opacity is {options.opacity}: give a share from 0 to 1")
-    if options.tail < 0:
-        raise OptionError(f"tail is {options.tail}: give 0 or more frames")
-    if options.spacing < 1:
-        raise OptionError(f"spacing is {options.spacing}: give 1 or more pixels")

@@ -97,8 +97,8 @@ BAD = [
     (["--camera_params", "1,2"], "camera_params"),
     (["--min_length", "0"], "min_length is 0"),
     (["--min_length", "many"], "argument --min_length: 'many' is no whole number"),
-    (["--max_interval", "9999999999"], "9999999999 is too large: give 2147483647 at most"),
-    (["--max_sigma", "1e300"], "1e300 is too large: give 2147483647 at most"),
+    (["--max_interval", "9999999999"], "max_interval is 9999999999: give 2147483647 at most"),
+    (["--max_sigma", "1e300"], "max_sigma is 1e+300: give 2147483647 at most"),
     (["--offsets", "1,two"], "argument --offsets: 'two' is no whole number"),
     (["--spacing", "wide"], "argument --spacing: 'wide' is no number"),
     (["--operating_point", "-1"], "operating_point is -1"),
@@ -191,12 +191,12 @@ def test_motion(
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_help_gives_the_comments_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_is_that_of_the_fields(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
-        main(["match", "--help"])
+        main(["match", "--help-all"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "shown frames a track is seen in at least; none: 4" in text
-    assert "so many frames a second, by the time stamps" in text
+    assert "shortest track, in shown frames of the video; none: 4" in text
+    assert "images per second, by the time stamps of the frames" in text
 
 
 def test_path_that_the_system_refuses(

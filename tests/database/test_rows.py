@@ -31,7 +31,7 @@ from colmap_av1.database.reading import (
     read_images,
 )
 from colmap_av1.database.writing import write_matches
-from colmap_av1.errors import DatabaseError, OptionError
+from colmap_av1.errors import DatabaseError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
@@ -553,19 +553,3 @@ def test_every_model_survives_a_round_trip(tmp_path: Path, model: str) -> None:
     assert stored.has_prior_focal_length
     with pycolmap.Database.open(tmp_path / "new.db") as database:
         assert database.read_camera(1).model_name == model
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (CameraOptions("PINHOL"), "unknown camera model 'PINHOL'"),
-        (CameraOptions("EQUIRECTANGULAR"), "no focal length"),
-        (CameraOptions("PINHOLE", "1,2,3"), "takes 4 numbers, fx, fy, cx, cy"),
-        (CameraOptions("PINHOLE", "1;2;3;4"), "cannot read"),
-        (CameraOptions("PINHOLE", "500,500,nan,240"), "do not fit"),
-        (CameraOptions("PINHOLE", "500,0,320,240"), "focal length of 0 or less"),
-    ],
-)
-def test_cameras_that_cannot_work(options: CameraOptions, message: str) -> None:
-    with pytest.raises(OptionError, match=message):
-        make_camera(options, WIDTH, HEIGHT)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_scene import make_scene
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks
@@ -115,18 +115,3 @@ def test_scene_pairs_share_tracks() -> None:
     images = image_keypoints(make_scene().tracks, range(16))
     for i, j in schedule_pairs(images):
         assert len(pair_matches(images[i], images[j])) >= 15
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        PairOptions(offsets=()),
-        PairOptions(offsets=(0, 1)),
-        PairOptions(growth=0.5),
-        PairOptions(max_span=0),
-        PairOptions(min_matches=0),
-    ],
-)
-def test_options_that_cannot_work(options: PairOptions) -> None:
-    with pytest.raises(OptionError):
-        schedule_pairs([], options)

@@ -13,13 +13,12 @@ from conftest import SHARED
 from numpy.typing import NDArray
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, Scene, make_scene
 
-from colmap_av1.errors import OptionError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.matching import verify
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
-from colmap_av1.options import CameraOptions, VerifyOptions
+from colmap_av1.options import CameraOptions, RunOptions, VerifyOptions
 
 SHELFBOX = SHARED / "sequences/shelfbox/frames"
 UNKNOWN = make_camera(CameraOptions(), WIDTH, HEIGHT)
@@ -182,8 +181,9 @@ def test_bytes_do_not_depend_on_threads_but_on_the_seed(monkeypatch: pytest.Monk
     keypoints, pairs, matches = prepare(make_scene(num_points=2500), outliers=0.2)
 
     def run(**changes: int) -> list[tuple[object, ...]]:
-        options = replace(VerifyOptions(max_samples=100), **changes)
-        return [as_bytes(g) for g in verify_pairs(keypoints, pairs, matches, UNKNOWN, options)]
+        options, how = VerifyOptions(max_samples=100), RunOptions(**changes)
+        found = verify_pairs(keypoints, pairs, matches, UNKNOWN, options, run=how)
+        return [as_bytes(g) for g in found]
 
     assert run(num_threads=1) == run(num_threads=3)
     assert run(seed=0) != run(seed=1)
@@ -294,21 +294,3 @@ def test_progress_counts_up() -> None:
     seen: list[int] = []
     verify_pairs(keypoints, pairs, matches, UNKNOWN, progress=seen.append)
     assert seen == list(range(1, len(pairs) + 1))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        VerifyOptions(max_error=0),
-        VerifyOptions(min_num_inliers=0),
-        VerifyOptions(max_h_inlier_ratio=1.5),
-        VerifyOptions(confidence=-0.1),
-        VerifyOptions(max_samples=3),
-        VerifyOptions(max_iterations=0),
-        VerifyOptions(seed=-1),
-        VerifyOptions(num_threads=0),
-    ],
-)
-def test_options_that_cannot_work(options: VerifyOptions) -> None:
-    with pytest.raises(OptionError):
-        verify_pairs([], np.empty((0, 2), np.int32), [], UNKNOWN, options)

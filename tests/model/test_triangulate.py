@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from colmap_av1.errors import OptionError
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import TriangulateOptions
 
@@ -156,20 +155,3 @@ def test_threads_change_nothing() -> None:
         assert np.array_equal(getattr(one, name), getattr(two, name))
     assert len(done) > 1
     assert done[-1] == 40_000
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        TriangulateOptions(max_reprojection_error=0),
-        TriangulateOptions(min_angle=90),
-        TriangulateOptions(min_observations=1),
-        TriangulateOptions(max_depth_error=0),
-    ],
-)
-def test_options_that_cannot_work(
-    scene: tuple[np.ndarray, Views], options: TriangulateOptions
-) -> None:
-    xyz, seen_by = scene
-    with pytest.raises(OptionError):
-        triangulate(observations(rays_of(xyz, seen_by)), seen_by, options)

@@ -9,7 +9,7 @@ import render_scene
 from conftest import PROJECT
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import RefineOptions
 from colmap_av1.tracks.refine import refine_tracks
@@ -168,22 +168,6 @@ def test_frames_of_another_size_or_order_are_refused() -> None:
         refine_tracks(tracks, [frames[1], frames[0]], LK)
     with pytest.raises(ImageError, match="order"):
         refine_tracks(tracks, [(FRAMES, frames[0][1])], LK)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"refine": "sift"},
-        {"refine_window": 8},
-        {"refine_window": 3},
-        {"refine_move": 0.0},
-        {"refine_difference": float("nan")},
-    ],
-)
-def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
-    tracks, _ = moving_tracks(0.3)
-    with pytest.raises(OptionError, match=next(iter(options))):
-        refine_tracks(tracks, [], RefineOptions(**options))
 
 
 def test_progress_counts_frames() -> None:

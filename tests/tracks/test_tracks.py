@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import TrackOptions
@@ -906,34 +906,3 @@ def test_progress_counts_coded_frames() -> None:
 def test_no_shown_frame_is_an_error() -> None:
     with pytest.raises(VideoError, match="no frame"):
         build_tracks([])
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"min_length": 0},
-        {"cosine": 1.5},
-        {"cosine": math.nan},
-        {"cosine_relative_to": "median"},
-        {"cosine_scale": -1.0},
-        {"max_block_area": -5},
-        {"smoothness": math.nan},
-        {"border": -1.0},
-        {"interpolation": -1.0},
-        {"cell": 3},
-        {"seeding": 8},
-        {"seeding": 2, "cell": 4},
-    ],
-)
-def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match=next(iter(options))):
-        build_tracks([], TrackOptions(**options))
-
-
-def test_options_are_checked_before_the_motion_is_read() -> None:
-    def motion() -> Iterable[FrameMotion]:
-        pytest.fail("read")
-        yield frame(0)
-
-    with pytest.raises(OptionError):
-        build_tracks(motion(), TrackOptions(min_length=0))

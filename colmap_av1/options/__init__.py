@@ -1,0 +1,48 @@
+"""Options of every stage: frozen dataclasses that refuse values that cannot work."""
+
+from colmap_av1.options.camera import CameraOptions
+from colmap_av1.options.commands import (
+    DensifyOptions,
+    MatchOptions,
+    OnExisting,
+    ReconstructOptions,
+)
+from colmap_av1.options.compare import CompareOptions, LearnedOptions
+from colmap_av1.options.images import ImageOptions
+from colmap_av1.options.matching import PairOptions, VerifyOptions
+from colmap_av1.options.model import (
+    ExportOptions,
+    MapOptions,
+    Mapper,
+    MapperOptions,
+    TriangulateOptions,
+)
+from colmap_av1.options.run import RunOptions
+from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
+from colmap_av1.options.video import EncodeOptions, ReadOptions
+from colmap_av1.options.view import ViewOptions
+
+__all__ = [
+    "CameraOptions",
+    "CompareOptions",
+    "DensifyOptions",
+    "DensityOptions",
+    "EncodeOptions",
+    "ExportOptions",
+    "ImageOptions",
+    "LearnedOptions",
+    "MapOptions",
+    "Mapper",
+    "MapperOptions",
+    "MatchOptions",
+    "OnExisting",
+    "PairOptions",
+    "ReadOptions",
+    "ReconstructOptions",
+    "RefineOptions",
+    "RunOptions",
+    "TrackOptions",
+    "TriangulateOptions",
+    "VerifyOptions",
+    "ViewOptions",
+]

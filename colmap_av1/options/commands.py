@@ -1,0 +1,102 @@
+"""Options of `match`, and of the commands that build on it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+from colmap_av1.errors import OptionError
+from colmap_av1.options.camera import CameraOptions
+from colmap_av1.options.fields import Options, option, part
+from colmap_av1.options.images import ImageOptions
+from colmap_av1.options.matching import PairOptions, VerifyOptions
+from colmap_av1.options.model import MapperOptions, TriangulateOptions
+from colmap_av1.options.run import RunOptions
+from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
+from colmap_av1.options.video import EncodeOptions, ReadOptions
+
+OnExisting = Literal["error", "append", "replace"]
+
+
+@dataclass(frozen=True)
+class MatchOptions(Options):
+    """Options of `match`."""
+
+    title: ClassVar[str] = "database and stream"
+
+    images: ImageOptions = part(ImageOptions())
+    encode: EncodeOptions = part(EncodeOptions())
+    # Its threads are the run's where it has none of its own.
+    read: ReadOptions = part(ReadOptions(), unused=("num_threads",))
+    tracks: TrackOptions = part(TrackOptions())
+    refine: RefineOptions = part(RefineOptions())
+    density: DensityOptions = part(DensityOptions())
+    pairs: PairOptions = part(PairOptions())
+    verify: VerifyOptions = part(VerifyOptions())
+    camera: CameraOptions = part(CameraOptions())
+    run: RunOptions = part(RunOptions())
+    on_existing: OnExisting = option(
+        "error",
+        "where listed images have keypoints or matches already: error: refuse the database; "
+        "append: add the new ones after them; replace: remove them",
+        common=True,
+    )
+    keep_stream: str | os.PathLike[str] | None = option(
+        None,
+        "file that keeps the AV1 stream of a video that is not AV1, for further runs; None: the "
+        "output folder of reconstruct and compare keeps it, other commands keep none",
+    )
+    reencode: bool = option(
+        False, "convert an AV1 video as well where its structure is poor for matching"
+    )
+
+    @property
+    def reading(self) -> ReadOptions:
+        """How the bitstream is read, on the run's threads unless `read` has its own number."""
+        if self.read.num_threads is not None:
+            return self.read
+        return replace(self.read, num_threads=self.run.num_threads)
+
+
+@dataclass(frozen=True)
+class ReconstructOptions(Options):
+    """Options of `reconstruct`; of `match`, all but the selection of tracks applies."""
+
+    title: ClassVar[str] = "reconstruction"
+
+    match: MatchOptions = part(
+        MatchOptions(),
+        unused=("density", "on_existing", "images.first_number", "camera.single_camera"),
+    )
+    mapping: MapperOptions = part(MapperOptions())
+    triangulate: TriangulateOptions = part(TriangulateOptions())
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.match.camera.single_camera:
+            raise OptionError(
+                "single_camera is 0, but a trainer's folder has one camera: leave it at 1"
+            )
+        name = self.match.images.image_name
+        if name.count(".") != 1:
+            raise OptionError(
+                f"image_name '{name}': give one without a dot but that of the extension"
+            )
+
+
+@dataclass(frozen=True)
+class DensifyOptions(Options):
+    """Options of `densify`; of `match`, all of reading, tracks and existing images apply."""
+
+    title: ClassVar[str] = "dense points"
+
+    match: MatchOptions = part(
+        MatchOptions(),
+        unused=(
+            *("camera", "density", "pairs", "verify", "on_existing", "run.seed"),
+            *("images.image_name", "images.num_images", "images.fps"),
+            *("images.select", "images.skip_blurred"),
+        ),
+    )
+    triangulate: TriangulateOptions = part(TriangulateOptions())

@@ -1,0 +1,275 @@
+"""Options on the command line: refused before anything is opened, grouped, and found by name."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from colmap_av1.cli import main
+from colmap_av1.cli.options import add_options, given
+from colmap_av1.cli.parser import Parser
+from colmap_av1.options import (
+    CompareOptions,
+    DensifyOptions,
+    DensityOptions,
+    MatchOptions,
+    ReadOptions,
+    ReconstructOptions,
+    RunOptions,
+    TrackOptions,
+)
+from colmap_av1.options.fields import Options, option, part
+
+DATABASE, OUTPUT, VIDEO = ("--database", "a.db"), ("--output", "out"), ("--video", "none.mp4")
+NEEDED = {
+    "match": (*VIDEO, *DATABASE),
+    "map": (*DATABASE, *OUTPUT, "--image_path", "none"),
+    "reconstruct": (*VIDEO, *OUTPUT),
+    "densify": (*VIDEO, *OUTPUT, "--model", "none"),
+    "compare": (*VIDEO, *OUTPUT),
+    "encode": (*VIDEO, *OUTPUT),
+    "info": VIDEO,
+    "motion": (*VIDEO, *OUTPUT),
+    "export": (*DATABASE, *OUTPUT),
+    "view": (*VIDEO, *OUTPUT),
+}
+
+BAD = [
+    ("match", "--num_images 1", "num_images is 1: give 2 or more"),
+    ("match", "--every 2 --fps 2", "every and fps both say"),
+    ("match", "--image_name x.png", "needs exactly one number field"),
+    ("match", "--encoder x", "encoder is 'x': give auto, nvenc"),
+    ("match", "--quality 64", "quality is 64: give 0 to 63"),
+    ("match", "--operating_point -1", "operating_point is -1"),
+    ("match", "--cosine 5", "cosine is 5.0: give -1 to 1"),
+    ("match", "--seeding 2 --cell 4", "seeding is 2, below cell 4"),
+    ("match", "--refine_window 4", "refine_window is 4"),
+    ("match", "--preset y", "preset is 'y': give sparse, default, dense"),
+    ("match", "--min_images -1", "min_images is -1"),
+    ("match", "--offsets 1,0", "offsets is (1, 0)"),
+    ("match", "--max_error 0", "max_error is 0.0"),
+    ("match", "--TwoViewGeometry.confidence 2", "confidence is 2.0"),
+    ("match", "--camera_params 1,2", "camera_params '1,2' do not fit"),
+    ("match", "--ImageReader.camera_model PINHOL", "unknown camera model 'PINHOL'"),
+    ("match", "--num_threads 0", "num_threads is 0"),
+    ("match", "--random_seed -1", "seed is -1"),
+    ("match", "--on_existing keep", "on_existing is 'keep': give error, append, replace"),
+    ("map", "--mapper auto", "mapper is 'auto': give incremental, global"),
+    ("map", "--forward_motion --mapper global", "give --mapper incremental"),
+    ("reconstruct", "--mapper best", "mapper is 'best': give auto, incremental, global"),
+    ("reconstruct", "--pose_tracks_per_image 1", "pose_tracks_per_image is 1"),
+    ("reconstruct", "--image_name a.b_%d.png", "image_name 'a.b_%d.png'"),
+    ("reconstruct", "--min_angle 90", "min_angle is 90.0"),
+    ("densify", "--min_observations 1", "min_observations is 1"),
+    ("densify", "--cosine 5", "cosine is 5.0"),
+    ("compare", "--max_keypoints 1", "max_keypoints is 1"),
+    ("compare", "--iterations 0", "iterations is 0"),
+    ("compare", "--trainer train", "trainer 'train': give"),
+    ("compare", "--frontends surf", "front-end 'surf': give one of av1,"),
+    ("compare", "--smoothness -1", "smoothness is -1.0"),
+    ("encode", "--encoder x", "encoder is 'x'"),
+    ("info", "--operating_point 32", "operating_point is 32"),
+    ("motion", "--num_threads 0", "num_threads is 0"),
+    ("export", "--format xml", "format is 'xml': give hloc"),
+    ("view", "--draw arrows", "draw is 'arrows'"),
+    ("view", "--cosine 5", "cosine is 5.0"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("command", "words", "message"), BAD)
+def test_options_are_refused_before_anything_is_opened(
+    command: str, words: str, message: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, *NEEDED[command], *words.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("colmap-av1: error: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert "no such file" not in err
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("match --num_image 5", "there is no option --num_image: did you mean --num_images? (see "),
+        ("match --num-image=5", "there is no option --num_image: did you mean --num_images? (see "),
+        ("match --vidoe a.mp4", "there is no option --vidoe: did you mean --video? (see "),
+        ("reconstruct --preset sparse", "there is no option --preset"),
+        ("densify --zzzzzzzzz 1", "there is no option --zzzzzzzzz (see "),
+        ("info --video a.mp4 b.mp4", "unrecognized arguments: b.mp4 (see "),
+        ("info --video a.mp4 -q", "unrecognized arguments: -q (see "),
+        ("view --video", "argument --video/--video_path: expected one argument (see "),
+    ],
+)
+def test_unknown_options_are_told_by_their_command_with_the_nearest_name(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.endswith(f"(see colmap-av1 {words.split(maxsplit=1)[0]} --help)\n")
+    assert err.count("\n") == 1
+
+
+def help_of(command: str, word: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit, match="0"):
+        main([command, word])
+    return capsys.readouterr().out
+
+
+def options_in(text: str) -> set[str]:
+    lines = [line for line in text.splitlines() if line.startswith("  -")]
+    return set(re.findall(r"--([a-z_-]+)", "\n".join(lines)))
+
+
+@pytest.mark.parametrize("command", ["match", "reconstruct", "densify", "compare", "view"])
+def test_help_shows_few_options_and_help_all_the_rest(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short, full = help_of(command, "--help", capsys), help_of(command, "--help-all", capsys)
+    few, every = options_in(short), options_in(full)
+    assert few < every
+    assert len(every) > 1.5 * len(few)
+    assert len(few - {"help", "help-all", "database_path", "video_path", "output_path"}) <= 24
+    assert {"help", "help-all", "quiet"} <= few
+    assert "--help-all shows all options" in short
+    assert "--help-all shows all options" not in full
+    assert options_in(help_of(command, "--help_all", capsys)) == every
+
+
+def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixture[str]) -> None:
+    assert options_in(help_of("match", "-h", capsys)) == {
+        *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
+        *("image_path", "num_images", "every", "fps", "frame_list", "on_existing", "encoder"),
+        *("refine", "preset", "camera_model", "camera_params", "num_threads"),
+    }
+
+
+def test_help_of_other_commands_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of("info", "--help", capsys)
+    assert {"operating_point", "num_threads", "strict", "max_frame_size"} <= options_in(text)
+    assert "help-all" not in text
+
+
+def test_help_has_a_group_for_each_kind_of_options(capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of("reconstruct", "--help-all", capsys)
+    titles = [line[:-1] for line in text.splitlines() if re.fullmatch(r"\w.*:", line)]
+    assert titles[:3] == ["options", "database and stream", "images"]
+    assert {"tracks", "two-view geometry", "poses", "points", "run"} <= set(titles)
+    assert "selection of tracks" not in titles
+    assert "Shown frames" not in text
+    assert "%" in text  # of frame_%06d.png, not taken for a format
+
+
+def parse(words: str, kind: type[Options]) -> Options:
+    command = Parser(prog="test")
+    add_options(command, kind)
+    return given(command.parse_args(words.split()), kind)
+
+
+def test_options_that_hold_others_are_built_from_words() -> None:
+    words = "--min_length 6 --min_images 2 --num_threads 3 --random_seed 4 --strict --fps 2"
+    options = parse(words, MatchOptions)
+    assert isinstance(options, MatchOptions)
+    assert options.tracks == TrackOptions(min_length=6)
+    assert options.density == DensityOptions(min_images=2)
+    assert options.run == RunOptions(num_threads=3, seed=4)
+    assert options.read == ReadOptions(strict=True)
+    assert options.reading == ReadOptions(strict=True, num_threads=3)
+    assert options.images.fps == 2
+    assert parse("", CompareOptions) == CompareOptions()
+    made = parse("--mapper global --min_angle 3 --cell 2", ReconstructOptions)
+    assert isinstance(made, ReconstructOptions)
+    assert (made.mapping.mapper, made.triangulate.min_angle) == ("global", 3)
+    assert made.match.tracks.cell == 2
+
+
+def test_length_of_a_track_is_counted_in_frames_alone() -> None:
+    options = parse("--min_length 6", MatchOptions)
+    assert isinstance(options, MatchOptions)
+    assert options.density == DensityOptions()
+
+
+def test_spellings_of_colmap_and_of_before() -> None:
+    words = (
+        "--ImageReader.camera_model PINHOLE --ImageReader.single_camera 0 "
+        "--TwoViewGeometry.max_error 3 --TwoViewGeometry.min_num_inliers 20 "
+        "--TwoViewGeometry.seed 5 --TwoViewGeometry.num_threads 2"
+    )
+    options = parse(words, MatchOptions)
+    assert isinstance(options, MatchOptions)
+    assert options.camera.camera_model == "PINHOLE"
+    assert not options.camera.single_camera
+    assert (options.verify.max_error, options.verify.min_num_inliers) == (3, 20)
+    assert options.run == RunOptions(num_threads=2, seed=5)
+    assert parse("--seed 5", MatchOptions) == parse("--random_seed 5", MatchOptions)
+
+
+@pytest.mark.parametrize(
+    ("kind", "unused"),
+    [
+        (DensifyOptions, "--num_images 3"),
+        (DensifyOptions, "--camera_model PINHOLE"),
+        (DensifyOptions, "--random_seed 1"),
+        (ReconstructOptions, "--preset dense"),
+        (ReconstructOptions, "--on_existing append"),
+        (CompareOptions, "--refine lk"),
+        (CompareOptions, "--single_camera 0"),
+    ],
+)
+def test_options_without_effect_are_not_offered(kind: type[Options], unused: str) -> None:
+    with pytest.raises(SystemExit):
+        parse(unused, kind)
+
+
+@dataclass(frozen=True)
+class _Filter(Options):
+    title: ClassVar[str] = "filter"
+
+    strength: float = option(0.5, "how strongly; None: never said", above=0)
+
+
+@dataclass(frozen=True)
+class _Everything(Options):
+    title: ClassVar[str] = "everything"
+
+    first: _Filter = part(_Filter(strength=2.0))
+    names: tuple[str, ...] = option(("a", "b"), "what to 100%", common=True)
+
+
+def test_a_new_field_or_kind_needs_nothing_else() -> None:
+    assert parse("", _Everything) == _Everything()
+    assert parse("--strength 3 --names c,d", _Everything) == _Everything(_Filter(3.0), ("c", "d"))
+    command = Parser(prog="test")
+    add_options(command, _Everything)
+    text = command.format_help()
+    assert "how strongly; none: never said [2.0]" in text
+    assert "what to 100% [a,b]" in text
+    assert [field.name for field in dataclasses.fields(_Everything)] == ["first", "names"]
+
+
+def test_one_name_cannot_set_two_options() -> None:
+    @dataclass(frozen=True)
+    class _Twice(Options):
+        first: _Filter = part(_Filter())
+        strength: float = option(1.0, "another")
+
+    command = Parser(prog="test")
+    with pytest.raises(argparse.ArgumentError, match="--strength"):
+        add_options(command, type("Twice", (_Twice,), {"__module__": __name__}))
