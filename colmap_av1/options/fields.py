@@ -99,9 +99,9 @@ class Options:
     colmap_prefix: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
+        hints = field_types(type(self))
         for field in dataclasses.fields(cast(Any, self)):
-            hint = field_types(type(self))[field.name]
-            value = getattr(self, field.name)
+            hint, value = hints[field.name], getattr(self, field.name)
             if not _fits(value, hint, declared_of(field)):
                 wanted = _wanted(value, hint, declared_of(field))
                 found = type(value).__name__ if isinstance(value, Options) else repr(value)

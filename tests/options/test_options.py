@@ -63,6 +63,7 @@ REFUSED: list[tuple[type, dict[str, Any], str]] = [
     (ImageOptions, {"every": 0}, "every is 0: give 1 or more"),
     (ImageOptions, {"num_images": 1}, "num_images is 1: give 2 or more"),
     (ImageOptions, {"fps": -1}, "fps is -1: give images per second above 0"),
+    (ImageOptions, {"fps": 1e30}, r"fps is 1e\+30: give 2147483647 at most"),
     (ImageOptions, {"every": 2, "fps": 3}, "every and fps both say"),
     (ImageOptions, {"num_images": 2, "frame_list": "a"}, "num_images and frame_list both say"),
     (ImageOptions, {"select": "depth"}, "select is 'depth': give time, parallax"),
