@@ -520,6 +520,13 @@ def test_of_two_tracks_in_one_cell_the_longer_goes_on(
     assert sorted(paths) == sorted(going_on * 12)
 
 
+def test_squares_are_not_larger_than_those_of_seeding() -> None:
+    frames = low_delay([(0.25, 0.5)] * 4)
+    fine = build_tracks(frames, replace(OPEN, seeding=2))
+    assert fine.xy.tobytes() == build_tracks(frames, replace(OPEN, seeding=2, cell=2)).xy.tobytes()
+    assert len(fine.offsets) > 3 * len(build_tracks(frames, OPEN).offsets)
+
+
 @pytest.mark.parametrize(("cell", "seeding"), [(4, 4), (2, 4), (1, 4), (2, 2), (1, 2), (1, 1)])
 def test_a_track_starts_in_every_empty_square(cell: int, seeding: int) -> None:
     steps = [(1.0, 0.5)] * 3
