@@ -21,8 +21,8 @@ PIPELINE = re.compile(r"[\w/]*(?:pipelines/)?\w+\.sh([^`\n]*)")
 
 def commands() -> dict[str, argparse.ArgumentParser]:
     """The parser of each command."""
-    action = next(a for a in _make_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    return dict(action.choices)
+    _, parsers = _make_parser()
+    return dict(parsers)
 
 
 def code_of(path: Path) -> str:
