@@ -6,18 +6,17 @@ import copy
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.camera import check_pixel_aspect, make_camera
-from colmap_av1.images.preparing import prepare_images, write_chosen
+from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     PairedImages,
@@ -25,9 +24,11 @@ from colmap_av1.matching.image_matches import (
     shared_focal_length,
     verify_images,
 )
+from colmap_av1.matching.links import LinkedImages, LinkReport, link_video
+from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import keep_frames
+from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
@@ -63,6 +64,7 @@ class MatchReport:
         configs: number of pairs by COLMAP's name of their two-view configuration.
         forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
             with no pair unless its options allow that, and the focal length cannot be found.
+        links: what connects images where motion does not.
         seconds: wall time of each stage.
         warnings: what the user should know, such as damage of the stream.
     """
@@ -85,6 +87,7 @@ class MatchReport:
     num_inliers: int
     configs: dict[str, int]
     forward_motion: bool
+    links: LinkReport
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -161,52 +164,93 @@ def match(
             clock=clock,
             progress=progress,
         )
-        source, display, chosen = prepared.source, prepared.display, prepared.chosen
-        size, pixel_aspect = prepared.size, prepared.pixel_aspect
-        warnings, num_coded_frames = prepared.tracked.warnings, prepared.tracked.num_coded_frames
-
-        with clock.measure("pairs"):
-            tracks = select_tracks(keep_frames(prepared.tracks, chosen.frames), options.density)
+        source, chosen, display = prepared.source, prepared.chosen, prepared.display
         # All tracks of a video are its largest arrays: they make room for the matches.
-        del prepared
-        paired = pair_images(video.path, tracks, chosen, options, clock=clock, progress=progress)
-        num_frames, lengths = tracks.num_frames, np.diff(tracks.offsets)
-        del tracks
-        cameras = _cameras(
-            *(database, listed, chosen.names, paired, options),
-            size=size,
-            pixel_aspect=pixel_aspect,
-            clock=clock,
+        prepared = _with_chosen_tracks(prepared, options, clock)
+        cameras, linked = _match_images(
+            prepared, database, listed, options, clock=clock, progress=progress
         )
-        matched = verify_images(paired, cameras.of_images, options, clock=clock, progress=progress)
 
         num_written = 0
         if folder is not None:
             check_video()
             with clock.measure("images"):
                 num_written = write_chosen(
-                    source.pictures, folder, chosen, options, display=display, progress=progress
+                    source.pictures,
+                    folder,
+                    chosen,
+                    options,
+                    display=display,
+                    progress=progress,
                 )
 
     with clock.measure("database"):
-        write_matched_images(database, chosen.names, cameras.new, matched, options.on_existing)
+        write_matched_images(
+            database, chosen.names, cameras.new, linked.matched, options.on_existing
+        )
     return MatchReport(
         database=database,
         video=video.path,
         stream=source.stream.path if source.is_kept else None,
         image_path=folder,
-        num_frames=num_frames,
-        num_coded_frames=num_coded_frames,
+        num_frames=prepared.tracks.num_frames,
+        num_coded_frames=prepared.tracked.num_coded_frames,
         num_written_images=num_written,
         focal_length=cameras.focal_length,
         seconds=clock.seconds,
-        warnings=(*warnings, *cameras.warnings),
-        **_figures(lengths, matched),
+        links=linked.report,
+        warnings=(*prepared.tracked.warnings, *cameras.warnings, *linked.report.warnings),
+        **_figures(prepared.tracks, linked.matched),
     )
 
 
-def _figures(lengths: NDArray[np.int64], matched: MatchedImages) -> dict[str, Any]:
-    """What `MatchReport` counts of tracks, of these lengths, and of matches."""
+def _match_images(
+    prepared: PreparedImages,
+    database: Path,
+    listed: Sequence[DatabaseImage],
+    options: MatchOptions,
+    *,
+    clock: Clock,
+    progress: Progress,
+) -> tuple[_Cameras, LinkedImages]:
+    """Match the images along their tracks, verify that, and link what motion does not connect."""
+    source, chosen, inter_share = prepared.source, prepared.chosen, prepared.tracked.inter_share
+    paired = pair_images(
+        *(source.pictures.path, prepared.tracks, chosen, options),
+        needed=not may_link(inter_share, chosen.frames, options.links),
+        clock=clock,
+        progress=progress,
+    )
+    cameras = _cameras(
+        *(database, listed, chosen.names, paired, options),
+        size=prepared.size,
+        pixel_aspect=prepared.pixel_aspect,
+        clock=clock,
+    )
+    matched = verify_images(paired, cameras.of_images, options, clock=clock, progress=progress)
+    linked = link_video(
+        *(source, matched, cameras.of_images, prepared.size, inter_share),
+        display=prepared.display,
+        options=options,
+        clock=clock,
+        progress=progress,
+    )
+    return cameras, linked
+
+
+def _with_chosen_tracks(
+    prepared: PreparedImages, options: MatchOptions, clock: Clock
+) -> PreparedImages:
+    """The images with the tracks that are matched, in place of all tracks of the video."""
+    with clock.measure("pairs"):
+        frames = prepared.chosen.frames
+        tracks = select_tracks(keep_frames(prepared.tracks, frames), options.density)
+    return replace(prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks))
+
+
+def _figures(tracks: Tracks, matched: MatchedImages) -> dict[str, Any]:
+    """What `MatchReport` counts of tracks and of matches."""
+    lengths = np.diff(tracks.offsets)
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]

@@ -17,11 +17,13 @@ from colmap_av1.model.reconstruct_stages import (
     Run,
     match_stage,
     pose_tracks,
+    read_links,
     read_tracks,
     track_stage,
 )
 from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
+from colmap_av1.tracks.tracks import cut_tracks, join_tracks
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -31,6 +33,9 @@ from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
+# Pixels that views from far apart in time may disagree by before it is said: the surfaces of
+# models that hold together agree to less than one, or two with long focal lengths.
+_FAR_APART = 4.0
 
 
 @dataclass(frozen=True)
@@ -50,9 +55,13 @@ class ReconstructReport:
         num_points: 3D points.
         num_observations: observations of all points.
         mean_error: mean reprojection error of the points in pixels.
+        far_views: median distance in pixels of what the pictures of images ten and more apart show
+            in common from where the poses put it; None where no such images see the same.
+        far_views_largest: the 90 % quantile of it over such pairs of images.
         focal_length: of the output's camera, in pixels.
         mapper: which of COLMAP's mappers found the poses.
         forward_motion: the camera moves along its axis, see `MatchReport`.
+        links: what connects images where motion does not, see `LinkReport`.
         resumed: stages that an earlier run had finished.
         seconds: wall time of each stage of this run.
         warnings: what the user should know.
@@ -70,9 +79,12 @@ class ReconstructReport:
     num_points: int
     num_observations: int
     mean_error: float
+    far_views: float | None
+    far_views_largest: float | None
     focal_length: float
     mapper: str
     forward_motion: bool
+    links: dict[str, Any]
     resumed: tuple[str, ...]
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -128,16 +140,17 @@ def reconstruct(
 
 def _run_stages(run: Run) -> ReconstructReport:
     tracked = track_stage(run)
-    tracks, chosen = read_tracks(run.stages)
-    longer = pose_tracks(run, tracks)
-    matched = match_stage(run, longer, chosen, tracked)
+    tracks, chosen, inter_share = read_tracks(run.stages)
+    matched = match_stage(run, pose_tracks(run, tracks), chosen, inter_share, tracked)
+    links, broken = read_links(run.stages)
+    tracks = cut_tracks(tracks, broken.tolist())
     posed = pose_stage(run, matched, len(chosen.names))
     kept = {"tracks": tracked, "matches": matched, "poses": posed}
     if run.options.mapping.adjust:
-        kept["adjustment"] = posed = adjustment_stage(run, longer, chosen, posed)
-    kept["model"] = model_stage(run, tracks, chosen, posed)
+        kept["adjustment"] = posed = adjustment_stage(run, tracks, links, chosen, posed)
+    kept["model"] = model_stage(run, join_tracks(tracks, links), chosen, posed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
-    notes = [*facts.pop("warnings"), *_notes(facts)]
+    notes = [*facts.pop("warnings"), *facts.pop("link_warnings"), *_notes(facts)]
     reported: dict[str, Any] = {
         f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
     }
@@ -168,6 +181,14 @@ def _notes(facts: dict[str, Any]) -> list[str]:
             f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "
             "turns or the scene is flat: the depth of the points may mean nothing; film while "
             "moving sideways"
+        )
+    if facts["far_views_largest"] is not None and facts["far_views_largest"] > _FAR_APART:
+        first, second = facts["far_views_apart"]
+        notes.append(
+            f"what images far apart in time show in common is up to "
+            f"{facts['far_views_largest']:.1f} px from where the poses put it, most between "
+            f"'{first}' and '{second}': surfaces may be doubled there; --links sift matches more "
+            "pictures"
         )
     if facts["agreeing"] < LEAST_AGREEING:
         notes.append(

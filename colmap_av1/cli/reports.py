@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from colmap_av1.database.check import CheckReport
@@ -18,6 +20,7 @@ Rows = list[tuple[str, str]]
 
 # Rarer reference distances are summed up.
 _LEAST_LISTED_SHARE = 0.005
+_NUM_LISTED_GAPS = 4
 
 
 def match_rows(report: MatchReport) -> Rows:
@@ -40,6 +43,7 @@ def match_rows(report: MatchReport) -> Rows:
         ("matches", str(report.num_matches)),
         ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
+        *_link_rows(**dataclasses.asdict(report.links)),
     ]
     if report.focal_length is not None:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
@@ -74,10 +78,32 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
         ("focal length", f"{report.focal_length:.2f} px"),
+        *_link_rows(**report.links),
     ]
+    if report.far_views is not None:
+        largest = f"{report.far_views_largest:.2f} px at 90 %"
+        rows.insert(6, ("far views agree to", f"{report.far_views:.2f} px, {largest}"))
     if report.resumed:
         rows.append(("finished before", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def _link_rows(
+    *,
+    num_images: int,
+    num_links: int,
+    num_revisits: int,
+    weak_gaps: Sequence[Sequence[int]],
+    **_: object,
+) -> Rows:
+    """What connects images where motion does not; none where pictures were not needed."""
+    if num_images == 0:
+        return []
+    shown = ", ".join(f"{a}-{b}" for a, b in weak_gaps[:_NUM_LISTED_GAPS])
+    more = ", ..." if len(weak_gaps) > _NUM_LISTED_GAPS else ""
+    gaps = f", weak gaps at frames {shown}{more}" if weak_gaps else ""
+    pairs = f"{num_links} pairs linked by {num_images} pictures, {num_revisits} seen again"
+    return [("links", f"{pairs}{gaps}")]
 
 
 def densify_rows(report: DensifyReport) -> Rows:

@@ -57,6 +57,7 @@ def pair_images(
     chosen: ChosenImages,
     options: MatchOptions,
     *,
+    needed: bool = True,
     clock: Clock,
     progress: Progress,
 ) -> PairedImages:
@@ -67,6 +68,7 @@ def pair_images(
         tracks: tracks of the whole video.
         chosen: the images.
         options: those of pairs are used.
+        needed: refuse a video of which no two images share enough tracks.
         clock: gets the stage "pairs".
         progress: called in the stage "pairs".
 
@@ -77,22 +79,27 @@ def pair_images(
         keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options.pairs)
         length = least_length(options.tracks)
-        if tracks.num_frames < length:
+        if needed and tracks.num_frames < length:
             raise VideoError(
                 f"{video}: tracks are of {length} frames or more, the video has "
                 f"{tracks.num_frames}: give a longer video, or --min_length 2"
             )
-        if len(pairs) == 0:
-            raise VideoError(
-                f"{video}: no two images share {options.pairs.min_matches} tracks, so there is "
-                "nothing to match: let more frames be images, or see 'colmap-av1 info --video' for "
-                "what the stream lacks; --reencode 1 converts it first"
-            )
+        if needed and len(pairs) == 0:
+            raise nothing_to_match(video, options)
         matches = []
         for i, j in pairs:
             matches.append(pair_matches(keypoints[i], keypoints[j]))
             progress("pairs", len(matches), len(pairs))
     return PairedImages(keypoints, pairs, matches)
+
+
+def nothing_to_match(video: Path, options: MatchOptions) -> VideoError:
+    """The error where no two images have enough matches."""
+    return VideoError(
+        f"{video}: no two images share {options.pairs.min_matches} tracks, so there is nothing to "
+        "match: let more frames be images, or see 'colmap-av1 info --video' for what the stream "
+        "lacks; --reencode 1 converts it first"
+    )
 
 
 def shared_focal_length(

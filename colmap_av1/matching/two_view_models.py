@@ -134,7 +134,7 @@ def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float,
 
     def refine(pose: Any, xa: _Floats, xb: _Floats) -> Model:
         pose, _ = poselib.refine_relative_pose(xa.T, xb.T, pose, *cameras, _REFINEMENT)
-        tested = _test(_epipolar_inliers, _essential(pose, *focal_lengths), points, search)
+        tested = _test(epipolar_inliers, _essential(pose, *focal_lengths), points, search)
         return replace(tested, pose=pose)
 
     # A part of the sample is enough: what is found is refined on more than all of it.
@@ -153,7 +153,7 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
 
     def refine(F: _Floats, xa: _Floats, xb: _Floats) -> Model:
         F, _ = poselib.refine_fundamental(xa.T, xb.T, F, _REFINEMENT)
-        return _test(_epipolar_inliers, F, points, search)
+        return _test(epipolar_inliers, F, points, search)
 
     F = _linear_fundamental(*points.first(search.options.max_samples))
     quick = refine(F, points.spread_a, points.spread_b)
@@ -163,7 +163,7 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
     F, _ = poselib.estimate_fundamental(
         xa.T, xb.T, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
     )
-    found = _test(_epipolar_inliers, F, points, search)
+    found = _test(epipolar_inliers, F, points, search)
     found = _again_on_inliers(refine, found, found.matrix, points, search)
     return min(found, quick, key=lambda model: _epipolar_loss(model, points))
 
@@ -193,14 +193,14 @@ def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Mo
             "loss_scale": search.options.max_error,
         }
         H, _ = poselib.refine_homography(xa.T, xb.T, H, robust)
-    found = _test(_transfer_inliers, H, points, search)
+    found = _test(transfer_inliers, H, points, search)
     decisive = planar_share(search.options) * num_rival / num_matches
     if not -_SEARCH_GAINS < found.count / num_matches - decisive < _SEARCH_LOSES:
         return found
     ransac = search.ransac(_MIN_ITERATIONS)
     ransac["max_iterations"] = _num_iterations(decisive, search.options)
     H, _ = poselib.estimate_homography(xa.T, xb.T, ransac, _REFINEMENT)
-    return _test(_transfer_inliers, H, points, search)
+    return _test(transfer_inliers, H, points, search)
 
 
 def planar_share(options: VerifyOptions) -> float:
@@ -218,7 +218,7 @@ def _again_on_inliers(
     """Refine a model that leaves out many matches once more, without those."""
     if found.matrix is None or found.count >= _TRUSTED_SHARE * points.a.shape[1]:
         return found
-    agree = _epipolar_inliers(
+    agree = epipolar_inliers(
         found.matrix, points.spread_a, points.spread_b, search.options.max_error
     )
     if np.count_nonzero(agree) < MIN_MATCHES:
@@ -324,7 +324,7 @@ def _test(
     return Model(matrix, inliers, int(np.count_nonzero(inliers)))
 
 
-def _epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+def epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
     """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
     algebraic, gradient = _epipolar_terms(F, xa, xb)
     return np.asarray(algebraic**2 <= max_error**2 * gradient)
@@ -339,7 +339,7 @@ def _epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Flo
     return algebraic, gradient
 
 
-def _transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+def transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
     """Matches that H maps to within `max_error` of their place in the second image."""
     mapped = H[:, :2] @ xa + H[:, 2:]
     # Multiplied out by the third coordinate, so no point at infinity divides by zero.

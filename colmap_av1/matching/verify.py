@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.two_view_models import (
     MAX_REFINED,
     Model,
     Search,
+    epipolar_inliers,
     find_fundamental,
     find_homography,
     find_pose,
     planar_share,
     spread_points,
+    transfer_inliers,
 )
 from colmap_av1.options import RunOptions, VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
@@ -337,3 +339,39 @@ def _on_rays(E: _Floats, a: _View, b: _View) -> _Floats:
 
 def _unit(matrix: _Floats) -> _Floats:
     return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def agreeing_matches(
+    geometry: TwoViewGeometry,
+    xa: NDArray[np.float32],
+    xb: NDArray[np.float32],
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    *,
+    max_error: float,
+) -> NDArray[np.bool_]:
+    """Which other matches agree with the geometry that was found for a pair of images.
+
+    Args:
+        geometry: the geometry, from the first image to the second.
+        xa: float32 [n, 2] pixels in the first image.
+        xb: float32 [n, 2] pixels in the second one.
+        cameras: camera of the first image and of the second one.
+        max_error: largest Sampson (E, F) or transfer (H) error in pixels.
+
+    Returns:
+        bool [n]; where a homography explains the pair as well, what agrees with it counts, too.
+    """
+    a, b = xa.T.astype(np.float64), xb.T.astype(np.float64)
+    agrees = np.zeros(a.shape[1], dtype=np.bool_)
+    if geometry.E is not None:
+        focal = sum(camera.mean_focal_length() for camera in cameras) / 2
+        rays = [
+            np.asarray(camera.cam_from_img(x.T), dtype=np.float64).reshape(-1, 2).T
+            for camera, x in zip(cameras, (a, b), strict=True)
+        ]
+        agrees |= epipolar_inliers(geometry.E, rays[0], rays[1], max_error / focal)
+    elif geometry.F is not None:
+        agrees |= epipolar_inliers(geometry.F, a, b, max_error)
+    if geometry.H is not None and geometry.config in FLAT_CONFIGS:
+        agrees |= transfer_inliers(geometry.H, a, b, max_error)
+    return agrees

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import write_images
 from colmap_av1.model.colmap_model import write_model
-from colmap_av1.model.reconstruct_poses import read_posed_images, triangulate_images
+from colmap_av1.model.far_views import FarViewCheck, FarViews
+from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
 from colmap_av1.model.reconstruct_stages import Run
 from colmap_av1.model.track_points import Colours, seen_in, to_model_points
 from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
@@ -21,6 +22,43 @@ from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
 _Image = NDArray[np.uint8]
+
+
+def _write_images(
+    run: Run, folder: Path, placed: PosedImages, colours: Colours
+) -> tuple[Colours, FarViews]:
+    """Write the images, undistorted; look at their colours and at views from far apart on the way.
+
+    Returns:
+        The colours with all pictures added, and how far views from far apart disagree.
+    """
+    options, progress = run.options, run.progress
+    camera = pinhole_camera(placed.camera)
+    undistort = undistortion(placed.camera, camera)
+    far = FarViewCheck(placed.images, camera)
+    index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
+    names = [image.name for image in placed.images]
+
+    def change(frame: int, picture: _Image) -> _Image:
+        index = index_of_frame[frame]
+        colours.add(index, picture)
+        picture = undistort(picture) if undistort is not None else picture
+        far.add(index, picture)
+        return picture
+
+    with run.clock.measure("images"):
+        write_images(
+            run.source.pictures,
+            folder,
+            names,
+            placed.frames.tolist(),
+            num_threads=options.match.run.num_threads,
+            operating_point=options.match.read.operating_point,
+            change=change,
+            progress=lambda done: progress("images", done, len(names)),
+        )
+    with run.clock.measure("far views"):
+        return colours, far.result()
 
 
 def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
@@ -33,7 +71,6 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
         distorted, frames = placed.camera, placed.frames
         camera = pinhole_camera(distorted)
         images = [replace(image, camera_id=1) for image in placed.images]
-        names = [image.name for image in images]
         seen, view = seen_in(tracks, frames)
         with clock.measure("points"):
             points = triangulate_images(
@@ -42,25 +79,9 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
                 options=options.triangulate,
                 progress=progress,
             )
-        colours = Colours(seen, view, points, len(images))
-        undistort = undistortion(distorted, camera)
-        image_of_frame = {int(frame): i for i, frame in enumerate(frames)}
-
-        def change(frame: int, picture: _Image) -> _Image:
-            colours.add(image_of_frame[frame], picture)
-            return undistort(picture) if undistort is not None else picture
-
-        with clock.measure("images"):
-            write_images(
-                source.pictures,
-                partial / "images",
-                names,
-                frames.tolist(),
-                num_threads=options.match.run.num_threads,
-                operating_point=options.match.read.operating_point,
-                change=change,
-                progress=lambda done: progress("images", done, len(names)),
-            )
+        colours, far_views = _write_images(
+            run, partial / "images", placed, Colours(seen, view, points, len(images))
+        )
         check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
@@ -73,6 +94,9 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
             "num_observations": len(points.observation),
             "mean_error": float(points.error.mean()),
             "focal_length": float(camera.params[0]),
+            "far_views": far_views.median,
+            "far_views_largest": far_views.largest,
+            "far_views_apart": far_views.worst,
             "agreeing": points.num_agreeing / max(points.num_tracks, 1),
         }
 

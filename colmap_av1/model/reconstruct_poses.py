@@ -15,12 +15,12 @@ from colmap_av1.errors import ModelError
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.model.colmap_model import ModelImage, posed_images, read_model, write_model
 from colmap_av1.model.mapper import adjust_model, map_poses
-from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run
+from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_frames
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -120,8 +120,12 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     )
 
 
-def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
+def adjustment_stage(
+    run: Run, tracks: Tracks, links: Tracks, chosen: ChosenImages, posed: Kept
+) -> Kept:
     """Adjust the poses on more tracks than the mapper can take: long ones, spread over the images.
+
+    Links take part whole: without them places seen again would drift apart once more.
 
     The mapper's own adjustments have no robust loss, and drop what drifts.
     """
@@ -130,7 +134,8 @@ def adjustment_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, chosen)
-        spread = select_tracks(keep_frames(tracks, placed.frames), _ADJUSTED)
+        longer = keep_frames(pose_tracks(run, tracks), placed.frames)
+        spread = join_tracks(select_tracks(longer, _ADJUSTED), keep_frames(links, placed.frames))
         with run.clock.measure("adjustment"):
             seen, view = seen_in(spread, placed.frames)
             points = triangulate_images(

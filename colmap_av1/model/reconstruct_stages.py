@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ImageError, OptionError
@@ -22,7 +23,9 @@ from colmap_av1.matching.image_matches import (
     shared_focal_length,
     verify_images,
 )
+from colmap_av1.matching.links import link_video
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
+from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.model.track_points import chaining_for_points
 from colmap_av1.options import DensityOptions, ReconstructOptions
 from colmap_av1.tracks.selection import select_tracks
@@ -40,6 +43,7 @@ from colmap_av1.video.unchanged import check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
+_LINKS = "links.npz"
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,9 @@ def track_stage(run: Run) -> Kept:
             raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
         with (partial / "tracks.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
-            np.savez(file, **vars(tracks), names=np.array(chosen.names), frames=chosen.frames)
+            names = np.array(chosen.names)
+            share = tracked.inter_share
+            np.savez(file, **vars(tracks), names=names, frames=chosen.frames, inter_share=share)
         check_unchanged(*source.files)
         return {
             "num_frames": tracks.num_frames,
@@ -111,14 +117,24 @@ def track_stage(run: Run) -> Kept:
     )
 
 
-def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages]:
-    """The tracks and images that `track_stage` kept."""
+def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages, NDArray[np.float32]]:
+    """The tracks, images and shares of inter units that `track_stage` kept."""
     with np.load(stages / "tracks.npz") as file:
-        arrays = {field.name: file[field.name] for field in dataclasses.fields(Tracks)}
         chosen = ChosenImages([str(name) for name in file["names"]], file["frames"])
+        return _tracks_of(file), chosen, file["inter_share"]
+
+
+def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
+    """The links as tracks, and the frames before the gaps that no other track crosses."""
+    with np.load(stages / _LINKS) as file:
+        return _tracks_of(file), file["broken"]
+
+
+def _tracks_of(file: Any) -> Tracks:
+    arrays = {field.name: file[field.name] for field in dataclasses.fields(Tracks)}
     for name in ("num_frames", "width", "height"):
         arrays[name] = int(arrays[name])
-    return Tracks(**arrays), chosen
+    return Tracks(**arrays)
 
 
 def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
@@ -126,8 +142,14 @@ def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
     return keep_long_tracks(tracks, least_length(run.options.match.tracks))
 
 
-def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -> Kept:
-    """Write the database of the tracks that the poses come from."""
+def match_stage(
+    run: Run,
+    tracks: Tracks,
+    chosen: ChosenImages,
+    inter_share: NDArray[np.float32],
+    tracked: Kept,
+) -> Kept:
+    """Write the database of the tracks that the poses come from, and of links."""
     options, clock, progress = run.options, run.clock, run.progress
     density = DensityOptions(
         preset="sparse",
@@ -140,28 +162,47 @@ def match_stage(run: Run, tracks: Tracks, chosen: ChosenImages, tracked: Kept) -
             sparse = select_tracks(keep_frames(tracks, chosen.frames), density)
         video = run.source.pictures
         paired = pair_images(
-            video.path, sparse, chosen, options.match, clock=clock, progress=progress
+            *(video.path, sparse, chosen, options.match),
+            needed=not may_link(inter_share, chosen.frames, options.match.links),
+            clock=clock,
+            progress=progress,
         )
         size = (tracks.width, tracks.height)
         pixel_aspect = video.display.pixel_aspect
         focal_length = shared_focal_length(paired, size, pixel_aspect, options.match, clock=clock)
         camera = make_camera(options.match.camera, *size, pixel_aspect, focal_length)
         matched = verify_images(paired, camera, options.match, clock=clock, progress=progress)
+        linked = link_video(
+            *(run.source, matched, [camera] * len(chosen.names), size, inter_share),
+            display=None,
+            options=options.match,
+            clock=clock,
+            progress=progress,
+        )
+        matched = linked.matched
         with clock.measure("database"):
             write_matched_images(partial / "database.db", chosen.names, camera, matched)
+        kept = partial / run.stages.name
+        kept.mkdir()
+        with (kept / _LINKS).open("wb") as file:
+            broken = np.array([before for before, _ in linked.report.broken_gaps], np.int32)
+            np.savez(file, **vars(linked.tracks), broken=broken)
         return {
+            "links": dataclasses.asdict(linked.report),
+            "link_warnings": list(linked.report.warnings),
             "num_pose_tracks": len(sparse.offsets) - 1,
             "guessed": not camera.has_prior_focal_length,
             **_pair_facts(matched),
         }
 
-    given = (density, options.match.pairs, options.match.verify, options.match.camera)
+    match = options.match
+    given = (density, match.pairs, match.verify, match.camera, match.links)
     return run_stage(
         run.stages,
         "matches",
         [tracked.digest, given, options.match.run.seed],
         into=run.output,
-        products=["database.db"],
+        products=["database.db", f"{run.stages.name}/{_LINKS}"],
         make=make,
     )
 

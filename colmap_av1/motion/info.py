@@ -151,6 +151,7 @@ class Structure:
         num_key_frames: key frames and intra-only frames among the coded ones.
         later_units: units of all frames but the first.
         inter_units: those of them that are inter coded.
+        inter_share_of: share of inter units in each shown frame, by its display index.
     """
 
     num_coded: int = 0
@@ -158,6 +159,7 @@ class Structure:
     num_key_frames: int = 0
     later_units: int = 0
     inter_units: int = 0
+    inter_share_of: dict[int, float] = field(default_factory=dict)
 
     @property
     def inter_share(self) -> float:
@@ -169,10 +171,13 @@ class Structure:
         self.num_coded += 1
         self.num_shown = max(self.num_shown, frame.display_index + 1)
         self.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
+        inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
+        inter_units = int(np.count_nonzero(inter))
+        if frame.display_index >= 0:
+            self.inter_share_of[frame.display_index] = inter_units / frame.is_inter.size
         if self.num_coded > 1:
             self.later_units += frame.is_inter.size
-            inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
-            self.inter_units += int(np.count_nonzero(inter))
+            self.inter_units += inter_units
 
     def reasons(self, bits_per_pixel: float) -> tuple[str, ...]:
         """Why streams of such a structure and rate are poor for matching; empty if they are not."""

@@ -9,7 +9,7 @@ from colmap_av1.options.commands import (
 )
 from colmap_av1.options.compare import CompareOptions, LearnedOptions
 from colmap_av1.options.images import ImageOptions
-from colmap_av1.options.matching import PairOptions, VerifyOptions
+from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.options.model import (
     ExportOptions,
     MapOptions,
@@ -31,6 +31,7 @@ __all__ = [
     "ExportOptions",
     "ImageOptions",
     "LearnedOptions",
+    "LinkOptions",
     "MapOptions",
     "Mapper",
     "MapperOptions",

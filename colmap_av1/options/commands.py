@@ -10,7 +10,7 @@ from colmap_av1.errors import OptionError
 from colmap_av1.options.camera import CameraOptions
 from colmap_av1.options.fields import Options, option, part
 from colmap_av1.options.images import ImageOptions
-from colmap_av1.options.matching import PairOptions, VerifyOptions
+from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.options.model import MapperOptions, TriangulateOptions
 from colmap_av1.options.run import RunOptions
 from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
@@ -33,6 +33,7 @@ class MatchOptions(Options):
     refine: RefineOptions = part(RefineOptions())
     density: DensityOptions = part(DensityOptions())
     pairs: PairOptions = part(PairOptions())
+    links: LinkOptions = part(LinkOptions())
     verify: VerifyOptions = part(VerifyOptions())
     camera: CameraOptions = part(CameraOptions())
     run: RunOptions = part(RunOptions())

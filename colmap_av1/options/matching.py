@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, option
@@ -41,6 +41,25 @@ class PairOptions(Options):
         super().__post_init__()
         if not self.offsets:
             raise OptionError("offsets is (): give one or more distances")
+
+
+@dataclass(frozen=True)
+class LinkOptions(Options):
+    """Links by pictures, where motion does not connect images that see the same."""
+
+    title: ClassVar[str] = "links"
+
+    links: Literal["auto", "none", "sift"] = option(
+        "auto",
+        "auto: match pictures across gaps that motion does not carry over and, in videos much "
+        "longer than tracks reach, between places seen again; sift: look for places seen again in "
+        "any video; none: use motion alone",
+        common=True,
+    )
+    max_link_features: int = option(1500, "most features of a picture", least=50)
+    link_candidates: int = option(
+        10, "images most like it with which each key image is matched", least=1
+    )
 
 
 @dataclass(frozen=True)

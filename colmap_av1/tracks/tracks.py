@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -168,6 +168,39 @@ def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
     """The tracks that are seen in `min_length` frames or more, in their former order."""
     lengths = np.diff(tracks.offsets)
     return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
+
+
+def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
+    """The tracks, cut in two wherever they pass from one of these frames to the next.
+
+    Args:
+        tracks: any tracks.
+        after: display indices of the frames before each cut.
+
+    Returns:
+        All observations in their former order; the same object where nothing is cut.
+    """
+    if len(after) == 0:
+        return tracks
+    part = np.searchsorted(np.sort(np.asarray(after)), tracks.frame, side="left")
+    starts = np.zeros(len(tracks.frame) + 1, dtype=np.bool_)
+    starts[tracks.offsets] = True
+    starts[1:-1] |= np.diff(part) != 0
+    return replace(tracks, offsets=np.flatnonzero(starts).astype(np.int64))
+
+
+def join_tracks(a: Tracks, b: Tracks) -> Tracks:
+    """All tracks of one video that two sets hold, those of the first first."""
+    if len(b.offsets) == 1:
+        return a
+    return replace(
+        a,
+        offsets=np.concatenate([a.offsets, b.offsets[1:] + a.offsets[-1]]),
+        frame=np.concatenate([a.frame, b.frame]),
+        xy=np.concatenate([a.xy, b.xy]),
+        sigma=np.concatenate([a.sigma, b.sigma]),
+        confirmed=np.concatenate([a.confirmed, b.confirmed]),
+    )
 
 
 def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:

@@ -61,11 +61,14 @@ class TrackedVideo:
     Attributes:
         tracks: tracks through all shown frames.
         num_coded_frames: frames with block data, hidden ones included.
+        inter_share: float32 [num_frames] share of inter units in each frame that players show; of
+            frames hidden before it the least.
         warnings: what the user should know, such as damage of the stream.
     """
 
     tracks: Tracks
     num_coded_frames: int
+    inter_share: NDArray[np.float32]
     warnings: tuple[str, ...]
 
 
@@ -198,7 +201,24 @@ def track_video(
     reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
     if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
-    return TrackedVideo(tracks, structure.num_coded, tuple(notes))
+    inter_share = _inter_share(structure, num_frames, source.pictures.presented)
+    return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
+
+
+def _inter_share(
+    structure: Structure, num_frames: int, presented: NDArray[np.int32] | None
+) -> NDArray[np.float32]:
+    """Share of inter units in each frame that players show, see `TrackedVideo`."""
+    share = np.array([structure.inter_share_of.get(i, 0.0) for i in range(num_frames)], np.float32)
+    if presented is None:
+        return share
+    presented = presented[presented < num_frames]
+    if len(presented) == 0:
+        return share[:0]
+    # From the frame after the last one shown up to each.
+    starts = np.concatenate([presented[:1], presented[:-1] + 1])
+    ends = presented + 1
+    return np.array([share[a:b].min() for a, b in zip(starts, ends, strict=True)], np.float32)
 
 
 def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:

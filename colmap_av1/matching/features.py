@@ -1,0 +1,81 @@
+"""Light SIFT features of pictures, for the few places that motion cannot connect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+# Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from
+# far apart share.
+_FIRST_OCTAVE = 0
+# COLMAP's own limits for matches of SIFT: angle of the nearest descriptor, in radians, and its
+# ratio to that of the second nearest.
+_MAX_ANGLE = 0.7
+_MAX_RATIO = 0.8
+_NUM_DIMENSIONS = 128
+_WARNINGS = 1  # glog's number of the level
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one picture.
+
+    Attributes:
+        xy: float32 [n, 2] position in pixels, origin at the picture's top-left corner: the first
+            pixel's centre is (0.5, 0.5).
+        descriptors: float32 [n, 128] of unit length.
+    """
+
+    xy: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+
+
+class FeatureExtractor:
+    """Extracts SIFT features by pycolmap, on one thread."""
+
+    def __init__(self, max_num_features: int) -> None:
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.num_threads = 1
+        options.sift.first_octave = _FIRST_OCTAVE
+        options.sift.max_num_features = max_num_features
+        # COLMAP says on standard error that it makes one.
+        level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _WARNINGS
+        try:
+            self._extractor: Any = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        finally:
+            pycolmap.logging.minloglevel = level
+
+    def extract(self, picture: NDArray[np.uint8]) -> Features:
+        """The features of a picture: uint8 [height, width, 3], BGR."""
+        grey = np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        keypoints, found = self._extractor.extract_from_uint8_array(grey)
+        xy = np.array([(k.x, k.y) for k in keypoints], dtype=np.float32).reshape(-1, 2)
+        descriptors = np.asarray(found.data, dtype=np.float32).reshape(-1, _NUM_DIMENSIONS)
+        length = np.linalg.norm(descriptors, axis=1, keepdims=True)
+        return Features(xy, descriptors / np.maximum(length, 1e-6))
+
+
+def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
+    """Match features that are nearest to each other, by COLMAP's limits.
+
+    Returns:
+        uint32 [n, 2] indices of features (in a, in b), ascending in the first.
+    """
+    if min(len(a.xy), len(b.xy)) < 2:
+        return np.empty((0, 2), dtype=np.uint32)
+    likeness = a.descriptors @ b.descriptors.T
+    rows = np.arange(len(likeness))
+    nearest = likeness.argmax(axis=1)
+    is_mutual = likeness.argmax(axis=0)[nearest] == rows
+    best = likeness[rows, nearest]
+    likeness[rows, nearest] = -1
+    second = likeness.max(axis=1)
+    angle, second_angle = (np.arccos(np.clip(x, -1, 1)) for x in (best, second))
+    kept = is_mutual & (angle <= _MAX_ANGLE) & (angle <= _MAX_RATIO * second_angle)
+    return np.column_stack([rows[kept], nearest[kept]]).astype(np.uint32)

@@ -1,0 +1,152 @@
+"""Features of pictures matched between images, and what they say of the motion across gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.matching.features import FeatureExtractor, Features, match_features
+from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_geometry import TwoViewGeometry
+from colmap_av1.matching.verify import agreeing_matches, verify_pairs
+from colmap_av1.options import LinkOptions, RunOptions, VerifyOptions
+from colmap_av1.util.progress import Progress
+
+Image = NDArray[np.uint8]
+# Gives the pictures of images, by index, ascending.
+Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
+# Inliers of a pair across a gap, and of a place seen again, which must be surer: nothing says that
+# the camera was there.
+_MIN_GAP_INLIERS = 20
+_MIN_REVISIT_INLIERS = 25
+# Links of a place seen again come in groups: key images beside each other see it, too.
+_SUPPORT_REACH = 2
+# The motion across a gap is believed where this share of its matches agrees with the pictures'
+# geometry, to this many pixels.
+_MIN_AGREEING = 0.6
+_MAX_ERROR = 3.0
+
+
+@dataclass(frozen=True)
+class Links:
+    """Verified matches of features.
+
+    Attributes:
+        pairs: int32 [m, 2] indices of images, first < second, ascending.
+        matches: for each pair, uint32 [n, 2] indices of features.
+        geometries: for each pair, its two-view geometry; its inliers are indices of features.
+    """
+
+    pairs: NDArray[np.int32]
+    matches: list[NDArray[np.uint32]]
+    geometries: list[TwoViewGeometry]
+
+
+def extract_features(
+    wanted: list[int],
+    pictures: Pictures,
+    size: tuple[int, int],
+    options: LinkOptions,
+    progress: Progress,
+) -> dict[int, Features]:
+    """Features of the pictures of images, in pixels of the images."""
+    extractor = FeatureExtractor(options.max_link_features)
+    found: dict[int, Features] = {}
+    for image, picture in pictures(wanted):
+        features = extractor.extract(picture)
+        scale = np.array([size[0] / picture.shape[1], size[1] / picture.shape[0]], np.float32)
+        found[image] = replace(features, xy=features.xy * scale)
+        progress("links", len(found), len(wanted))
+    return found
+
+
+def match_pairs(
+    pairs: NDArray[np.int32],
+    features: dict[int, Features],
+    keypoints: Sequence[ImageKeypoints],
+    *,
+    cameras: Sequence[Any],
+    verify: VerifyOptions,
+    run: RunOptions,
+    progress: Progress,
+) -> Links:
+    """Match the features of pairs of images and keep what agrees with a rigid scene."""
+    nothing = np.empty((0, 2), np.float32)
+    views = [
+        ImageKeypoints(k.frame, xy, np.arange(len(xy), dtype=np.int64))
+        for k, xy in (
+            (k, features[i].xy if i in features else nothing) for i, k in enumerate(keypoints)
+        )
+    ]
+    there = [i in features and j in features for i, j in pairs.tolist()]
+    pairs = pairs[np.array(there, dtype=np.bool_)]
+    matches = []
+    for i, j in pairs.tolist():
+        matches.append(match_features(features[i], features[j]))
+        progress("link matches", len(matches), len(pairs))
+    options = replace(verify, min_num_inliers=max(verify.min_num_inliers, _MIN_GAP_INLIERS))
+    geometries = verify_pairs(views, pairs, matches, cameras, options, run=run)
+    kept = [k for k, g in enumerate(geometries) if len(g.inlier_matches) > 0]
+    return Links(pairs[kept], [matches[k] for k in kept], [geometries[k] for k in kept])
+
+
+def supported_links(
+    links: Links, revisits: set[tuple[int, int]], key: list[int]
+) -> tuple[Links, int]:
+    """The links without places seen again that nothing beside them confirms, and how many stay."""
+    place = {image: index for index, image in enumerate(key)}
+    pairs = [(i, j) for i, j in links.pairs.tolist()]
+    sure = {
+        (place[i], place[j])
+        for (i, j), g in zip(pairs, links.geometries, strict=True)
+        if (i, j) in revisits and len(g.inlier_matches) >= _MIN_REVISIT_INLIERS
+    }
+    around = range(-_SUPPORT_REACH, _SUPPORT_REACH + 1)
+    supported = {
+        (a, b)
+        for a, b in sure
+        if any((a + da, b + db) in sure for da in around for db in around if (da, db) != (0, 0))
+    }
+    kept = [
+        k
+        for k, (i, j) in enumerate(pairs)
+        if (i, j) not in revisits or (place[i], place[j]) in supported
+    ]
+    return (
+        Links(
+            links.pairs[kept], [links.matches[k] for k in kept], [links.geometries[k] for k in kept]
+        ),
+        len(supported),
+    )
+
+
+def judge_gaps(
+    gaps: NDArray[np.int64], links: Links, matched: MatchedImages, cameras: Sequence[Any]
+) -> tuple[list[int], list[int]]:
+    """Gaps whose motion is not believed, and those of them that no link crosses."""
+    of_pair = {pair: k for k, pair in enumerate(map(tuple, matched.pairs.tolist()))}
+    broken, unlinked = [], []
+    for gap in gaps.tolist():
+        num_matches = num_agreeing = 0
+        crossing = np.flatnonzero((links.pairs[:, 0] <= gap) & (links.pairs[:, 1] > gap))
+        for k in crossing.tolist():
+            i, j = links.pairs[k].tolist()
+            if (i, j) not in of_pair:
+                continue
+            matches = matched.matches[of_pair[i, j]]
+            num_matches += len(matches)
+            xy = matched.keypoints[i].xy[matches[:, 0]], matched.keypoints[j].xy[matches[:, 1]]
+            agrees = agreeing_matches(
+                links.geometries[k], *xy, (cameras[i], cameras[j]), max_error=_MAX_ERROR
+            )
+            num_agreeing += int(np.count_nonzero(agrees))
+        if num_agreeing < _MIN_AGREEING * num_matches or num_matches == 0:
+            broken.append(gap)
+        if len(crossing) == 0:
+            unlinked.append(gap)
+    return broken, unlinked

@@ -1,0 +1,264 @@
+"""Links: matches of pictures where motion does not connect images that see the same.
+
+Motion vectors link neighbours in time. Where a camera jerks, a picture is blurred or a place is
+seen again, a few pictures get light SIFT features. What these say of a gap decides, too, whether
+the motion across it is believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.matching.features import Features
+from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
+from colmap_av1.matching.link_matches import (
+    Image,
+    Pictures,
+    extract_features,
+    judge_gaps,
+    match_pairs,
+    supported_links,
+)
+from colmap_av1.matching.link_merging import links_as_tracks, merge_links, no_tracks
+from colmap_av1.matching.retrieval import similar_images
+from colmap_av1.matching.weak_gaps import weak_gaps
+from colmap_av1.options import LinkOptions, MatchOptions, RunOptions, VerifyOptions
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import VideoSource, decodable_frames
+from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.video.display import Display
+
+# Images on either side of a weak gap whose pictures are matched, by their distance from it: the
+# nearest see most in common across, those farther off give the scale.
+_AROUND_GAP = (0, 1, 2, 4, 7)
+# Key images for places seen again lie this share of the span that tracks reach apart.
+_KEY_SHARE = 0.2
+# Places are seen again only in videos that are longer than tracks reach by this factor.
+_LONG = 8
+# Gaps that a warning names.
+_NUM_NAMED = 4
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """What linking found.
+
+    Attributes:
+        num_images: images whose pictures were looked at.
+        num_tried: pairs whose features were matched.
+        num_links: pairs that were linked.
+        num_revisits: those of them that see a place again.
+        weak_gaps: (frame, frame) on either side of gaps that motion does not carry over.
+        broken_gaps: those whose motion contradicts the pictures, or is not confirmed by them: its
+            matches are left out.
+        open_gaps: those across which neither motion nor pictures connect the images.
+    """
+
+    num_images: int = 0
+    num_tried: int = 0
+    num_links: int = 0
+    num_revisits: int = 0
+    weak_gaps: tuple[tuple[int, int], ...] = ()
+    broken_gaps: tuple[tuple[int, int], ...] = ()
+    open_gaps: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know: images that nothing connects."""
+        if not self.open_gaps:
+            return ()
+        shown = ", ".join(f"{a} and {b}" for a, b in self.open_gaps[:_NUM_NAMED])
+        more = len(self.open_gaps) - _NUM_NAMED
+        return (
+            f"nothing connects frames {shown}{f' and {more} more pairs' if more > 0 else ''}: the "
+            "camera jerks, or the pictures are blurred or cut there, and show nothing in common; "
+            "what lies on either side becomes models of its own",
+        )
+
+
+@dataclass(frozen=True)
+class LinkedImages:
+    """Images matched along tracks and by links.
+
+    Attributes:
+        matched: the images with all their keypoints and verified matches.
+        tracks: the links as tracks, through the frames of the images that have features.
+        report: what was found.
+    """
+
+    matched: MatchedImages
+    tracks: Tracks
+    report: LinkReport
+
+
+def link_video(
+    source: VideoSource,
+    matched: MatchedImages,
+    cameras: Sequence[Any],
+    size: tuple[int, int],
+    inter_share: NDArray[np.float32],
+    *,
+    display: Display | None,
+    options: MatchOptions,
+    clock: Clock,
+    progress: Progress,
+) -> LinkedImages:
+    """Link the images of a video, see `link_images`; pictures are decoded only where needed.
+
+    Args:
+        source: the video.
+        matched: its images matched along tracks.
+        cameras: the camera of each image; images share one where it is the same object.
+        size: (width, height) of the images in pixels.
+        inter_share: see `TrackedVideo`.
+        display: how pictures are shown in the images; None: as players show them.
+        options: those of links, verification and reading are used.
+        clock: gets the stage "links".
+        progress: told about the stage "links".
+
+    Raises:
+        VideoError: neither motion nor pictures connect any two images.
+    """
+    frames = np.array([k.frame for k in matched.keypoints], dtype=np.int32)
+    image_of_frame = {int(frame): image for image, frame in enumerate(frames)}
+
+    def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
+        left = set(wanted)
+        num_frames = int(frames[wanted[-1]]) + 1
+        for frame, picture in decodable_frames(source.pictures, num_frames, options, display):
+            image = image_of_frame.get(frame)
+            if image in left:
+                yield image, picture
+
+    with clock.measure("links"):
+        linked = link_images(
+            matched,
+            cameras,
+            size,
+            weak_gaps(inter_share, frames),
+            pictures,
+            num_frames=len(inter_share),
+            options=options.links,
+            verify=options.verify,
+            run=options.run,
+            progress=progress,
+        )
+    if len(linked.matched.pairs) == 0:
+        raise nothing_to_match(source.pictures.path, options)
+    return linked
+
+
+def link_images(
+    matched: MatchedImages,
+    cameras: Sequence[Any],
+    size: tuple[int, int],
+    weak: NDArray[np.bool_],
+    pictures: Pictures,
+    *,
+    num_frames: int,
+    options: LinkOptions,
+    verify: VerifyOptions,
+    run: RunOptions,
+    progress: Progress,
+) -> LinkedImages:
+    """Link images by their pictures where motion does not connect them.
+
+    Args:
+        matched: the images matched along tracks.
+        cameras: the camera of each image; images share one where it is the same object.
+        size: (width, height) of the images in pixels.
+        weak: bool [num_images - 1] gaps between images that motion does not carry over.
+        pictures: gives the pictures of images; called only where links are needed.
+        num_frames: frames of the video.
+        options: whether and how.
+        verify: how two-view geometries are estimated.
+        run: threads and seed.
+        progress: told about the stage "links".
+    """
+    frames = np.array([k.frame for k in matched.keypoints], dtype=np.int32)
+    gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
+    key = _key_images(matched, options)
+    around = [_images_around(int(gap), len(frames)) for gap in gaps]
+    wanted = sorted({image for images in [*around, key] for image in images})
+    if not wanted:
+        return LinkedImages(matched, no_tracks(num_frames, size), LinkReport())
+    features = extract_features(wanted, pictures, size, options, progress)
+    gap_pairs = {(i, j) for images in around for i in images for j in images if i < j}
+    revisit_pairs = _revisit_pairs(matched, key, features, options, run.seed) - gap_pairs
+    tried = np.array(sorted(gap_pairs | revisit_pairs), dtype=np.int32).reshape(-1, 2)
+    links = match_pairs(
+        tried,
+        features,
+        matched.keypoints,
+        cameras=cameras,
+        verify=verify,
+        run=run,
+        progress=progress,
+    )
+    links, num_revisits = supported_links(links, revisit_pairs, key)
+    broken, unlinked = judge_gaps(gaps, links, matched, cameras)
+    merged = merge_links(matched, links, features, broken)
+
+    def between(which: Sequence[int]) -> tuple[tuple[int, int], ...]:
+        return tuple((int(frames[g]), int(frames[g + 1])) for g in which)
+
+    report = LinkReport(
+        num_images=len(wanted),
+        num_tried=len(tried),
+        num_links=len(links.pairs),
+        num_revisits=num_revisits,
+        weak_gaps=between(gaps.tolist()),
+        broken_gaps=between(broken),
+        open_gaps=between(unlinked),
+    )
+    tracks = links_as_tracks(links, features, frames, num_frames, size)
+    return LinkedImages(merged, tracks, report)
+
+
+def _images_around(gap: int, num_images: int) -> list[int]:
+    """Images whose pictures are matched across a gap."""
+    found = {gap - d for d in _AROUND_GAP} | {gap + 1 + d for d in _AROUND_GAP}
+    return sorted(i for i in found if 0 <= i < num_images)
+
+
+def _reach(matched: MatchedImages) -> int:
+    """Span in images that the tracks of half of the images reach."""
+    reach = np.ones(len(matched.keypoints), dtype=np.int64)
+    for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
+        if len(geometry.inlier_matches):
+            reach[i] = max(reach[i], j - i)
+    # The last images have no room for their reach.
+    return max(1, int(np.median(reach[: max(1, 2 * len(reach) // 3)])))
+
+
+def _key_images(matched: MatchedImages, options: LinkOptions) -> list[int]:
+    """Images that places seen again are looked for in; none where there can be none."""
+    num_images, reach = len(matched.keypoints), _reach(matched)
+    if options.links == "none" or (options.links == "auto" and num_images < _LONG * reach):
+        return []
+    step = max(1, round(_KEY_SHARE * reach))
+    return list(range(step // 2, num_images, step))
+
+
+def _revisit_pairs(
+    matched: MatchedImages,
+    key: list[int],
+    features: dict[int, Features],
+    options: LinkOptions,
+    seed: int,
+) -> set[tuple[int, int]]:
+    """Pairs of key images that look alike and that tracks do not connect."""
+    present = [image for image in key if image in features]
+    if len(present) < 2:
+        return set()
+    index = np.array(present)
+    allowed = np.abs(index[:, None] - index) > _reach(matched)
+    similar = similar_images(
+        [features[i] for i in present], allowed, options.link_candidates, seed=seed
+    )
+    return {(present[a], present[b]) for a, b in similar.tolist()}

@@ -1,0 +1,65 @@
+"""Images that look alike, found on a vocabulary trained on the video itself.
+
+Vectors of locally aggregated descriptors (Jegou et al., "Aggregating local descriptors into a
+compact image representation", CVPR 2010). pycolmap's `VisualIndex` gives no result of a query to
+Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+from colmap_av1.matching.features import Features
+
+_NUM_WORDS = 64
+# Descriptors that the vocabulary is trained on.
+_NUM_TRAINING = 20_000
+_NUM_ITERATIONS = 10
+
+
+def similar_images(
+    features: Sequence[Features], allowed: NDArray[np.bool_], num_nearest: int, *, seed: int = 0
+) -> NDArray[np.int32]:
+    """Pair each image with those most like it.
+
+    Args:
+        features: features of each image.
+        allowed: bool [n, n] which images may be paired; symmetric.
+        num_nearest: images that each is paired with at most.
+        seed: of the vocabulary.
+
+    Returns:
+        int32 [m, 2] indices of images, first < second, ascending.
+    """
+    vectors = _aggregate(features, seed)
+    likeness = np.where(allowed, vectors @ vectors.T, -np.inf)
+    order = np.argsort(-likeness, axis=1, kind="stable")[:, :num_nearest]
+    pairs = {
+        (min(i, j), max(i, j))
+        for i, row in enumerate(order.tolist())
+        for j in row
+        if i != j and allowed[i, j]
+    }
+    return np.array(sorted(pairs), dtype=np.int32).reshape(-1, 2)
+
+
+def _aggregate(features: Sequence[Features], seed: int) -> NDArray[np.float32]:
+    """One vector of unit length for each image: [n, words * 128]; of zeros without a feature."""
+    descriptors = np.concatenate([f.descriptors for f in features])
+    vectors = np.zeros((len(features), _NUM_WORDS, descriptors.shape[1]), dtype=np.float32)
+    rng = np.random.default_rng(seed)
+    training = descriptors[rng.permutation(len(descriptors))[:_NUM_TRAINING]]
+    if len(training) < _NUM_WORDS:
+        return vectors.reshape(len(features), -1)
+    words, _ = kmeans2(training, _NUM_WORDS, iter=_NUM_ITERATIONS, minit="points", seed=seed)
+    half_length = 0.5 * (words * words).sum(axis=1)
+    for index, image in enumerate(features):
+        word = (image.descriptors @ words.T - half_length).argmax(axis=1)
+        np.add.at(vectors[index], word, image.descriptors - words[word])
+    vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-9)
+    flat = vectors.reshape(len(features), -1)
+    return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9))

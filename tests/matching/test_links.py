@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+import copy
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import PROJECT, Encode, make_frames
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from synthetic_scene import alignment_error
+
+from colmap_av1.database.reading import image_ids_from_pair_id
+from colmap_av1.errors import VideoError
+from colmap_av1.evaluate import model_poses
+from colmap_av1.match import match
+from colmap_av1.matching.features import FeatureExtractor, Features, match_features
+from colmap_av1.matching.link_matches import Links
+from colmap_av1.matching.link_merging import links_as_tracks
+from colmap_av1.matching.retrieval import similar_images
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.weak_gaps import weak_frames, weak_gaps
+from colmap_av1.model.colmap_model import camera_centres
+from colmap_av1.options import ImageOptions, LinkOptions, MatchOptions, ReconstructOptions
+from colmap_av1.reconstruct import reconstruct
+from colmap_av1.video.decoding import decode_frames
+
+SCENE = PROJECT / "examples" / "scene.mp4"
+TRUTH = PROJECT / "examples" / "scene_truth.npz"
+# Frames left out of the rendered clip, so that it jerks there.
+LEFT_OUT = range(24, 40)
+
+
+def pictures(video: Path = SCENE) -> list[NDArray[np.uint8]]:
+    return [image for _, image in decode_frames(video)]
+
+
+@pytest.fixture(scope="module")
+def jerk(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rendered clip without some frames in its middle."""
+    kept = [image for i, image in enumerate(pictures()) if i not in LEFT_OUT]
+    return encode(np.array(kept), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
+
+
+def test_weak_frames_are_those_without_motion_among_others() -> None:
+    usual = np.full(30, 0.85, np.float32)
+    usual[0] = 0
+    assert not weak_frames(usual).any()
+    jerk = usual.copy()
+    jerk[12] = 0.18
+    assert np.flatnonzero(weak_frames(jerk)).tolist() == [12]
+    # A drive: half of the units are inter coded everywhere, a slow frame has a third.
+    drive = np.full(30, 0.5, np.float32)
+    drive[[0, 8, 20]] = 0, 0.33, 0.15
+    assert np.flatnonzero(weak_frames(drive)).tolist() == [20]
+    # Where the camera is always too fast, no motion is to be trusted.
+    assert weak_frames(np.full(9, 0.04, np.float32))[1:].all()
+
+
+def test_weak_gaps_lie_between_images() -> None:
+    share = np.full(20, 0.9, np.float32)
+    share[[7, 13]] = 0.05
+    gaps = weak_gaps(share, np.array([0, 3, 6, 9, 12, 15, 18]))
+    assert np.flatnonzero(gaps).tolist() == [2, 4]
+
+
+def test_features_agree_with_the_truth() -> None:
+    images = pictures()
+    extractor = FeatureExtractor(1500)
+    a, b = extractor.extract(images[0]), extractor.extract(images[30])
+    matches = match_features(a, b)
+    assert len(matches) > 100
+    with np.load(TRUTH) as truth:
+        K = np.array(
+            [[truth["fx"], 0, truth["cx"]], [0, truth["fy"], truth["cy"]], [0, 0, 1]], np.float64
+        )
+        pose_a, pose_b = truth["cam_from_world"][[0, 30]]
+    R = pose_b[:, :3] @ pose_a[:, :3].T
+    t = pose_b[:, 3] - R @ pose_a[:, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+    xa = np.column_stack([a.xy[matches[:, 0]], np.ones(len(matches))])
+    xb = np.column_stack([b.xy[matches[:, 1]], np.ones(len(matches))])
+    lines = xa @ F.T
+    distance = np.abs((xb * lines).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
+    assert np.median(distance) < 0.5
+
+
+def test_no_features_match_nothing() -> None:
+    extractor = FeatureExtractor(100)
+    plain = extractor.extract(np.full((64, 64, 3), 128, np.uint8))
+    assert plain.xy.shape == (0, 2)
+    assert len(match_features(plain, extractor.extract(pictures()[0]))) == 0
+
+
+def test_similar_images_see_the_same() -> None:
+    extractor = FeatureExtractor(800)
+    there = [extractor.extract(image) for image in pictures()[::6]]
+    back = [copy.deepcopy(f) for f in reversed(there)]
+    features = [*there, *back]
+    count = len(features)
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) >= 3
+    pairs = similar_images(features, apart, 1)
+    assert np.array_equal(pairs, similar_images(features, apart, 1))
+    found = {tuple(pair) for pair in pairs.tolist()}
+    # Each place is seen again on the way back.
+    assert all((i, count - 1 - i) in found for i in range(count // 2 - 2))
+
+
+def test_images_without_features_are_like_none() -> None:
+    extractor = FeatureExtractor(100)
+    plain = extractor.extract(np.full((64, 64, 3), 128, np.uint8))
+    allowed = ~np.eye(3, dtype=bool)
+    assert len(similar_images([plain] * 3, allowed, 1)) <= 3
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(0, 4), st.integers(0, 4)),
+        max_size=30,
+    )
+)
+def test_tracks_of_links_see_no_frame_twice(edges: list[tuple[int, int, int, int]]) -> None:
+    rng = np.random.default_rng(0)
+    nothing = np.zeros((5, 128), np.float32)
+    features = {
+        i: Features(rng.uniform(0, 100, (5, 2)).astype(np.float32), nothing) for i in range(4)
+    }
+    by_pair: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    for i, j, a, b in edges:
+        if i < j:
+            by_pair.setdefault((i, j), set()).add((a, b))
+    pairs = sorted(by_pair)
+    matches = [np.array(sorted(by_pair[p]), np.uint32).reshape(-1, 2) for p in pairs]
+    geometries = [TwoViewGeometry(TwoViewConfig.CALIBRATED, m) for m in matches]
+    links = Links(np.array(pairs, np.int32).reshape(-1, 2), matches, geometries)
+    frames = np.array([0, 10, 20, 30], np.int32)
+    tracks = links_as_tracks(links, features, frames, 40, (100, 100))
+    for start, stop in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True):
+        seen = tracks.frame[start:stop]
+        assert len(seen) >= 2
+        assert np.all(np.diff(seen) > 0)
+    assert len(tracks.xy) == tracks.offsets[-1]
+
+
+def test_jerk_is_linked(jerk: Path, tmp_path: Path) -> None:
+    report = match(tmp_path / "a.db", jerk)
+    before = LEFT_OUT.start - 1
+    assert report.links.weak_gaps == ((before, before + 1),)
+    assert report.links.open_gaps == ()
+    assert report.links.num_links > 20
+    assert report.warnings == ()
+    alone = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
+    assert alone.links.num_images == 0
+    assert report.num_pairs > alone.num_pairs
+
+
+def test_links_are_the_same_each_time(jerk: Path, tmp_path: Path) -> None:
+    match(tmp_path / "a.db", jerk)
+    match(tmp_path / "b.db", jerk)
+    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
+
+
+def test_nothing_is_decoded_where_motion_connects_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> Iterator[None]:
+        raise AssertionError("a picture is decoded")
+
+    monkeypatch.setattr("colmap_av1.matching.links.decodable_frames", refuse)
+    report = match(tmp_path / "a.db", SCENE)
+    assert report.links.num_images == 0
+
+
+@pytest.mark.slow
+def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
+    made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
+    kept = [i for i in range(60) if i not in LEFT_OUT]
+    assert made.num_registered == len(kept)
+    assert made.far_views is not None
+    assert made.far_views < 0.6
+    poses = model_poses(pycolmap.Reconstruction(str(made.output / "sparse" / "0")), len(kept))
+    with np.load(TRUTH) as truth:
+        known = truth["cam_from_world"][kept]
+    centres, found = camera_centres(known), camera_centres(poses)
+    extent = np.linalg.norm(np.ptp(centres, axis=0))
+    assert alignment_error(found, centres) < 0.005 * extent
+
+
+def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
+    """A cut from one place to another that shows nothing of the first."""
+    first = np.array([image[:128, :192] for image in pictures()[:14]])
+    video = encode(np.concatenate([first, make_frames(14)]), tmp_path / "cut.mp4")
+    report = match(tmp_path / "a.db", video)
+    assert report.links.open_gaps == ((13, 14),)
+    assert any("nothing connects frames 13 and 14" in warning for warning in report.warnings)
+    with closing(sqlite3.connect(tmp_path / "a.db")) as database:
+        frame = {
+            number: int(name[6:12])
+            for number, name in database.execute("SELECT image_id, name FROM images")
+        }
+        rows = database.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")
+        pairs = [image_ids_from_pair_id(pair) for (pair,) in rows]
+    assert pairs
+    assert all((frame[a] <= 13) == (frame[b] <= 13) for a, b in pairs)
+
+
+def test_frames_of_one_colour(encode: Encode, tmp_path: Path) -> None:
+    """Links are looked for and there is nothing to see."""
+    grey = np.full((12, 128, 192, 3), 90, np.uint8)
+    with pytest.raises(VideoError, match="so there is nothing to match"):
+        match(
+            tmp_path / "a.db",
+            encode(grey, tmp_path / "grey.mp4"),
+            options=MatchOptions(links=LinkOptions(links="sift"), images=ImageOptions(every=1)),
+        )
