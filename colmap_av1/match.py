@@ -53,7 +53,7 @@ class MatchReport:
         num_written_images: image files written; others were there or not asked for.
         num_tracks: tracks in the video.
         track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
-            to 1 (longest).
+            to 1 (longest); empty without a track.
         num_observations: keypoints of all images.
         focal_length: in heights of a pixel, where it was estimated from the tracks; None where it
             was given, or the motion does not determine it and the camera has COLMAP's first guess.
@@ -251,13 +251,15 @@ def _with_chosen_tracks(
 def _figures(tracks: Tracks, matched: MatchedImages) -> dict[str, Any]:
     """What `MatchReport` counts of tracks and of matches."""
     lengths = np.diff(tracks.offsets)
-    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
+    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower") if len(lengths) else ()
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
     return {
         "num_images": len(matched.keypoints),
         "num_tracks": len(lengths),
-        "track_lengths": dict(zip(_LENGTH_QUANTILES, quantiles.tolist(), strict=True)),
+        "track_lengths": {
+            q: int(length) for q, length in zip(_LENGTH_QUANTILES, quantiles, strict=False)
+        },
         "num_observations": sum(len(k.xy) for k in matched.keypoints),
         "num_pairs": len(matched.geometries),
         "num_verified_pairs": sum(count > 0 for count in num_inliers),

@@ -30,6 +30,7 @@ from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
     ImageOptions,
+    LinkOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -226,8 +227,14 @@ def test_options_that_do_not_fit_leave_nothing(
 def test_every_frame_intra(encode: Encode, tmp_path: Path) -> None:
     intra = encode(make_frames(6), tmp_path / "intra.mp4", *AV1[:-1], "1")
     with pytest.raises(VideoError, match="nothing to match"):
-        match(tmp_path / "a.db", intra)
+        match(tmp_path / "a.db", intra, options=MatchOptions(links=LinkOptions(links="none")))
     assert not (tmp_path / "a.db").exists()
+    # Without motion pictures connect the images.
+    report = match(tmp_path / "a.db", intra)
+    assert report.num_tracks == 0
+    assert report.track_lengths == {}
+    assert report.links.num_links == report.num_pairs > 0
+    assert any("every frame is intra coded" in warning for warning in report.warnings)
 
 
 def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:

@@ -7,9 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from colmap_av1.matching.features import Features
 from colmap_av1.matching.image_matches import MatchedImages
@@ -72,6 +69,8 @@ def _with_features(
 
     A feature that lies on a track's keypoint joins it; of several the nearest does.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
+
     place = np.full(len(xy), -1, dtype=np.int64)
     taken: dict[int, tuple[float, int]] = {}
     if len(keypoints.xy):
@@ -121,6 +120,9 @@ def links_as_tracks(
     size: tuple[int, int],
 ) -> Tracks:
     """The links as tracks: features that are joined by links; those seen twice in a frame go."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - slow to import
+
     images = sorted(features)
     counts = [len(features[i].xy) for i in images]
     first = dict(zip(images, np.concatenate([[0], np.cumsum(counts)])[:-1].tolist(), strict=True))

@@ -27,7 +27,7 @@ from colmap_av1.matching.link_matches import (
 from colmap_av1.matching.link_merging import links_as_tracks, merge_links, no_tracks
 from colmap_av1.matching.retrieval import similar_images
 from colmap_av1.matching.weak_gaps import weak_gaps
-from colmap_av1.options import LinkOptions, MatchOptions, RunOptions, VerifyOptions
+from colmap_av1.options import LinkOptions, MatchOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import VideoSource, decodable_frames
 from colmap_av1.util.progress import Clock, Progress
@@ -40,6 +40,9 @@ _AROUND_GAP = (0, 1, 2, 4, 7)
 _KEY_SHARE = 0.2
 # Places are seen again only in videos that are longer than tracks reach by this factor.
 _LONG = 8
+_LEAST_IMAGES = 120
+# Key images lie at least so many images apart: this bounds what links cost in any video.
+_LEAST_STEP = 3
 # Gaps that a warning names.
 _NUM_NAMED = 4
 
@@ -108,7 +111,9 @@ def link_video(
     clock: Clock,
     progress: Progress,
 ) -> LinkedImages:
-    """Link the images of a video, see `link_images`; pictures are decoded only where needed.
+    """Link the images of a video by their pictures where motion does not connect them.
+
+    No picture is decoded where motion connects all.
 
     Args:
         source: the video.
@@ -135,69 +140,47 @@ def link_video(
             if image in left:
                 yield image, picture
 
-    with clock.measure("links"):
-        linked = link_images(
-            matched,
-            cameras,
-            size,
-            weak_gaps(inter_share, frames),
-            pictures,
-            num_frames=len(inter_share),
-            options=options.links,
-            verify=options.verify,
-            run=options.run,
-            progress=progress,
-        )
+    plan = _plan(matched, weak_gaps(inter_share, frames), options.links)
+    if plan.wanted:
+        with clock.measure("links"):
+            linked = _link_images(
+                *(plan, matched, cameras, size, pictures),
+                num_frames=len(inter_share),
+                options=options,
+                progress=progress,
+            )
+    else:
+        linked = LinkedImages(matched, no_tracks(len(inter_share), size), LinkReport())
     if len(linked.matched.pairs) == 0:
         raise nothing_to_match(source.pictures.path, options)
     return linked
 
 
-def link_images(
+def _link_images(
+    plan: _Plan,
     matched: MatchedImages,
     cameras: Sequence[Any],
     size: tuple[int, int],
-    weak: NDArray[np.bool_],
     pictures: Pictures,
     *,
     num_frames: int,
-    options: LinkOptions,
-    verify: VerifyOptions,
-    run: RunOptions,
+    options: MatchOptions,
     progress: Progress,
 ) -> LinkedImages:
-    """Link images by their pictures where motion does not connect them.
-
-    Args:
-        matched: the images matched along tracks.
-        cameras: the camera of each image; images share one where it is the same object.
-        size: (width, height) of the images in pixels.
-        weak: bool [num_images - 1] gaps between images that motion does not carry over.
-        pictures: gives the pictures of images; called only where links are needed.
-        num_frames: frames of the video.
-        options: whether and how.
-        verify: how two-view geometries are estimated.
-        run: threads and seed.
-        progress: told about the stage "links".
-    """
+    """Link the images of a plan, see `link_video`."""
     frames = np.array([k.frame for k in matched.keypoints], dtype=np.int32)
-    gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
-    key = _key_images(matched, options)
-    around = [_images_around(int(gap), len(frames)) for gap in gaps]
-    wanted = sorted({image for images in [*around, key] for image in images})
-    if not wanted:
-        return LinkedImages(matched, no_tracks(num_frames, size), LinkReport())
-    features = extract_features(wanted, pictures, size, options, progress)
-    gap_pairs = {(i, j) for images in around for i in images for j in images if i < j}
-    revisit_pairs = _revisit_pairs(matched, key, features, options, run.seed) - gap_pairs
+    gaps, key = plan.gaps, plan.key
+    features = extract_features(plan.wanted, pictures, size, options.links, progress)
+    gap_pairs = {(i, j) for images in plan.around for i in images for j in images if i < j}
+    revisit_pairs = _revisit_pairs(matched, key, features, options) - gap_pairs
     tried = np.array(sorted(gap_pairs | revisit_pairs), dtype=np.int32).reshape(-1, 2)
     links = match_pairs(
         tried,
         features,
         matched.keypoints,
         cameras=cameras,
-        verify=verify,
-        run=run,
+        verify=options.verify,
+        run=options.run,
         progress=progress,
     )
     links, num_revisits = supported_links(links, revisit_pairs, key)
@@ -208,7 +191,7 @@ def link_images(
         return tuple((int(frames[g]), int(frames[g + 1])) for g in which)
 
     report = LinkReport(
-        num_images=len(wanted),
+        num_images=len(plan.wanted),
         num_tried=len(tried),
         num_links=len(links.pairs),
         num_revisits=num_revisits,
@@ -218,6 +201,32 @@ def link_images(
     )
     tracks = links_as_tracks(links, features, frames, num_frames, size)
     return LinkedImages(merged, tracks, report)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which pictures are looked at.
+
+    Attributes:
+        gaps: int64 [n] weak gaps, by the image before each.
+        around: the images whose pictures are matched across each.
+        key: images that places seen again are looked for in.
+    """
+
+    gaps: NDArray[np.int64]
+    around: list[list[int]]
+    key: list[int]
+
+    @property
+    def wanted(self) -> list[int]:
+        """All images whose pictures are needed, ascending."""
+        return sorted({image for images in [*self.around, self.key] for image in images})
+
+
+def _plan(matched: MatchedImages, weak: NDArray[np.bool_], options: LinkOptions) -> _Plan:
+    gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
+    around = [_images_around(int(gap), len(matched.keypoints)) for gap in gaps]
+    return _Plan(gaps, around, _key_images(matched, options))
 
 
 def _images_around(gap: int, num_images: int) -> list[int]:
@@ -239,9 +248,10 @@ def _reach(matched: MatchedImages) -> int:
 def _key_images(matched: MatchedImages, options: LinkOptions) -> list[int]:
     """Images that places seen again are looked for in; none where there can be none."""
     num_images, reach = len(matched.keypoints), _reach(matched)
-    if options.links == "none" or (options.links == "auto" and num_images < _LONG * reach):
+    is_long = num_images >= max(_LONG * reach, _LEAST_IMAGES)
+    if options.links == "none" or (options.links == "auto" and not is_long):
         return []
-    step = max(1, round(_KEY_SHARE * reach))
+    step = max(_LEAST_STEP, round(_KEY_SHARE * reach))
     return list(range(step // 2, num_images, step))
 
 
@@ -249,8 +259,7 @@ def _revisit_pairs(
     matched: MatchedImages,
     key: list[int],
     features: dict[int, Features],
-    options: LinkOptions,
-    seed: int,
+    options: MatchOptions,
 ) -> set[tuple[int, int]]:
     """Pairs of key images that look alike and that tracks do not connect."""
     present = [image for image in key if image in features]
@@ -259,6 +268,9 @@ def _revisit_pairs(
     index = np.array(present)
     allowed = np.abs(index[:, None] - index) > _reach(matched)
     similar = similar_images(
-        [features[i] for i in present], allowed, options.link_candidates, seed=seed
+        [features[i] for i in present],
+        allowed,
+        options.links.link_candidates,
+        seed=options.run.seed,
     )
     return {(present[a], present[b]) for a, b in similar.tolist()}

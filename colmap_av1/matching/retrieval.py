@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 
 from colmap_av1.matching.features import Features
 
@@ -50,6 +49,8 @@ def similar_images(
 def _aggregate(features: Sequence[Features], seed: int) -> NDArray[np.float32]:
     """One vector of unit length for each image: [n, words * 128]; of zeros without a feature."""
     descriptors = np.concatenate([f.descriptors for f in features])
+    from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - slow to import
+
     vectors = np.zeros((len(features), _NUM_WORDS, descriptors.shape[1]), dtype=np.float32)
     rng = np.random.default_rng(seed)
     training = descriptors[rng.permutation(len(descriptors))[:_NUM_TRAINING]]

@@ -157,7 +157,7 @@ def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixtur
     assert options_in(help_of("match", "-h", capsys)) == {
         *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
         *("image_path", "num_images", "every", "fps", "frame_list", "on_existing", "encoder"),
-        *("refine", "preset", "camera_model", "camera_params", "num_threads"),
+        *("refine", "preset", "links", "camera_model", "camera_params", "num_threads"),
     }
 
 
