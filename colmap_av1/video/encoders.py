@@ -19,6 +19,8 @@ from colmap_av1.options.video import NUM_QUALITIES
 _PROBE_FRAMES = 8
 _PROBE_TIMEOUT = 30.0
 _LIBAOM_REALTIME = 5
+# ffmpeg's own option goes no further, libaom does.
+_FFMPEG_FASTEST = 8
 # A frame further than any video is long: the first is the only intra frame.
 KEY_FRAME_DISTANCE = "9999"
 # So that every message says how grave it is.
@@ -81,8 +83,9 @@ def _vaapi(quality: int, speed: int) -> list[str]:
 def _libaom(quality: int, speed: int) -> list[str]:
     # Its realtime mode starts at speed 5.
     usage = "realtime" if speed >= _LIBAOM_REALTIME else "good"
-    how = ["-usage", usage, "-cpu-used", str(speed), "-lag-in-frames", "0", "-row-mt", "1"]
-    return [*how, "-crf", str(quality), "-b:v", "0"]
+    how = ["-usage", usage, "-cpu-used", str(min(speed, _FFMPEG_FASTEST)), "-lag-in-frames", "0"]
+    how += ["-row-mt", "1", "-crf", str(quality), "-b:v", "0"]
+    return how if speed <= _FFMPEG_FASTEST else [*how, "-aom-params", f"cpu-used={speed}"]
 
 
 def _svt(quality: int, speed: int) -> list[str]:

@@ -1,20 +1,25 @@
-"""Measure what encoders, their speeds and qualities are worth for tracks and maps.
+"""Measure what encoders, their speeds and qualities are worth for the model at the end.
 
-python examples/benchmarks/encoders.py --cache benchmark_tracks
+python examples/benchmarks/encoders.py --cache benchmark_encoders
 
-Each clip is encoded with each setting; tracks are measured against true poses where these and the
-intrinsics are known, where neither is against the model of SIFT and exhaustive matching; a spread
-subset of them is mapped.
-Hardware encoders are measured where they work. The cache is that of tracks.py.
+Each clip is converted with each setting; the tracks of the stream are counted and, where cameras
+are known, measured against them; `reconstruct` makes a model of the stream's motion and the clip's
+own pictures. Hardware encoders are measured where they work. Rows go to encoders.csv beside this
+script, in place of those of the same clip and setting.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import os
+import re
+import shutil
+import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +32,15 @@ from colmap_av1 import (
     ColmapAv1Error,
     EncodeError,
     EncodeOptions,
-    MapOptions,
+    ImageOptions,
+    MatchOptions,
+    ReconstructOptions,
     build_tracks,
     read_motion,
+    reconstruct,
 )
-from colmap_av1.evaluate import (
-    epipolar_errors,
-    measure_mapper,
-    model_figures,
-    prepare_footage,
-    run_frontend,
-    run_measured,
-)
+from colmap_av1.evaluate import epipolar_errors, model_poses, pose_errors, run_measured
+from colmap_av1.evaluate.metrics.sequence import Sequence, read_sequence
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
@@ -47,55 +49,92 @@ from colmap_av1.video.encoders import find_encoder
 
 HARDWARE = ("nvenc", "qsv", "amf", "vaapi")
 SETTINGS = (
-    *(EncodeOptions("libaom", 20, speed) for speed in (4, 6, 8)),
-    *(EncodeOptions("libaom", quality, 6) for quality in (30, 40)),
-    *(EncodeOptions("svt", 20, speed) for speed in (8, 10)),
-    EncodeOptions("svt", 40, 8),
+    *(EncodeOptions("libaom", 20, speed) for speed in (6, 7, 8, 9, 10)),
+    EncodeOptions("libaom", 32, 8),
+    *(EncodeOptions("svt", 20, speed) for speed in (8, 10, 12)),
 )
-CLIPS = ("street", "log_building", "kitchen")
-SPANS = (1, 8)
-LONG = (4, 8)
+# Every n-th frame is an image.
+CLIPS = {
+    "log_building": 1,
+    "ditch": 1,
+    "holiday_display": 1,
+    "street": 1,
+    "shelfbox": 1,
+    "kitchen": 2,
+}
+TABLE = Path(__file__).with_suffix(".csv")
+# Matches of SIFT between images that lie far apart, held against the poses; not part of this
+# project.
+FAR_VIEWS = ruler.SEQUENCES.parent / "tools" / "loop_consistency.py"
+FAR = 10
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one setting gives on one clip."""
+    """What one setting gives on one clip; empty where it is not known.
 
-    setting: str
-    cpu_per_frame: float
-    bytes_per_frame: float
-    num_tracks: dict[int, int]
-    errors: dict[int, float] | None
-    num_registered: int
-    num_images: int
-    mean_error: float
+    CPU seconds are those of ffmpeg for a megapixel of one frame, decoding of the source included;
+    tracks those of so many frames and more; epipolar errors medians in pixels after so many frames;
+    far views medians in pixels over pairs of images, see FAR_VIEWS.
+    """
+
+    clip: str
+    encoder: str
+    speed: int | None
+    quality: int | None
+    cpu_per_megapixel: float
+    kb_per_frame: float
+    tracks_of_4: int
+    tracks_of_8: int
+    epipolar_1: float | None
+    epipolar_8: float | None
+    registered: int | None = None
+    images: int | None = None
+    points: int | None = None
+    error: float | None = None
+    ate: float | None = None
+    far_views: float | None = None
+    far_views_90: float | None = None
+    reconstruct_cpu: float | None = None
 
 
 def main() -> int:
-    """Measure every setting on every clip and print the tables."""
+    """Measure every setting on every clip, and keep and print the tables."""
     parser = argparse.ArgumentParser(
-        description="Measure what encoders are worth for tracks and maps.",
+        description="Measure what encoders are worth for the model at the end.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
         "--cache", type=Path, help="folder that keeps all results; without, a temporary one"
     )
-    parser.add_argument("--clips", nargs="+", choices=CLIPS, default=CLIPS, metavar="NAME")
+    parser.add_argument("--clips", nargs="+", choices=CLIPS, default=list(CLIPS), metavar="NAME")
+    names = [name_of(setting) for setting in SETTINGS]
+    parser.add_argument("--settings", nargs="+", choices=names, default=names, metavar="NAME")
     arguments = parser.parse_args()
     console = Console(stderr=True)
-    settings = [*filter(works, (EncodeOptions(name) for name in HARDWARE)), *SETTINGS]
+    wanted = [setting for setting in SETTINGS if name_of(setting) in arguments.settings]
+    settings = [*filter(works, (EncodeOptions(name) for name in HARDWARE)), *wanted]
     with ExitStack() as stack:
         cache = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        for case in ruler.CASES:
-            if case.name not in arguments.clips:
+        for clip in arguments.clips:
+            if not (ruler.SEQUENCES / clip).is_dir():
+                console.print(f"{clip}: not measured, {ruler.SEQUENCES / clip} is absent")
                 continue
-            if not (ruler.SEQUENCES / case.name).is_dir():
-                console.print(f"{case.name}: not measured, {ruler.SEQUENCES / case.name} is absent")
-                continue
-            rows, about = measure_clip(case, cache / case.name, settings, console)
-            print(f"### {case.name}\n\n{about}\n")
-            print(table(rows), flush=True)
+            for setting in settings:
+                console.print(f"{clip}: {name_of(setting)}", markup=False)
+                try:
+                    row = measure(clip, cache.absolute() / clip, setting)
+                except ColmapAv1Error as error:
+                    console.print(f"error: {clip}: {error}", markup=False)
+                    continue
+                keep_row(row)
+                print(row, flush=True)
     return 0
+
+
+def name_of(setting: EncodeOptions) -> str:
+    """How a setting is called on the command line."""
+    return f"{setting.encoder}-{setting.speed}-{setting.quality}"
 
 
 def works(setting: EncodeOptions) -> bool:
@@ -107,110 +146,156 @@ def works(setting: EncodeOptions) -> bool:
     return True
 
 
-def measure_clip(
-    case: ruler.Case, folder: Path, settings: list[EncodeOptions], console: Console
-) -> tuple[list[Row], str]:
-    """Rows of one clip, and a line on what they are measured against."""
-    folder.mkdir(parents=True, exist_ok=True)
-    material = ruler.real_sequence(case, folder, console)
-    camera = CameraOptions()
-    if material.camera is not None:
-        params = ",".join(map(str, material.camera.params))
-        camera = CameraOptions(camera_model=material.camera.model.name, camera_params=params)
-    how = {"num_frames": material.num_frames, "image_step": case.image_step, "camera": camera}
-    mapper = MapOptions(
-        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
+def measure(clip: str, folder: Path, setting: EncodeOptions) -> Row:
+    """Convert a clip with a setting and make a model of it."""
+    sequence = read_sequence(ruler.SEQUENCES / clip)
+    source = source_of(sequence, folder)
+    where = folder / name_of(setting)
+    stream, cpu_seconds = converted(source, where / "stream", setting)
+    tracks = build_tracks(read_motion(stream))
+    length = np.diff(tracks.offsets)
+    errors: dict[int, float] = {}
+    if sequence.camera is not None and sequence.cam_from_world is not None:
+        cameras = (sequence.cam_from_world, sequence.camera)
+        errors = {n: ruler.median(epipolar_errors(tracks, *cameras, n)) for n in (1, 8)}
+    return Row(
+        clip=clip,
+        encoder=str(setting.encoder),
+        speed=setting.speed,
+        quality=setting.quality,
+        cpu_per_megapixel=cpu_seconds * 1e6 / (tracks.num_frames * tracks.width * tracks.height),
+        kb_per_frame=stream.stat().st_size / 1000 / tracks.num_frames,
+        tracks_of_4=int(np.count_nonzero(length >= 4)),
+        tracks_of_8=int(np.count_nonzero(length >= 8)),
+        epipolar_1=errors.get(1),
+        epipolar_8=errors.get(8),
+        **modelled(sequence, source, stream, where / "model", setting),
     )
-    truth = ruler.known_truth(material)
-    if truth.poses is None:
-        footage = prepare_footage(material.video, folder / "footage", **how)
-        model = ruler.reference_model(footage, folder, mapper, console)
-        truth = ruler.with_reference(truth, model, material.num_frames)
-    source = lossless(material, folder)
-    rows = []
-    for setting in settings:
-        name = f"{setting.encoder}-{setting.speed}-{setting.quality}"
-        console.print(f"{case.name}: {name}", markup=False)
-        where = folder / "encoders" / name
-        try:
-            stream, encoding = encoded(source, where / "stream", setting)
-            footage = prepare_footage(stream, where / "footage", **how)
-            sparse = run_frontend("av1-sparse", footage, where / "sparse")
-            mapped = measure_mapper(sparse.database, footage.image_path, where / "model", mapper)
-        except ColmapAv1Error as error:
-            console.print(f"error: {case.name}: {name}: {error}", markup=False)
-            continue
-        tracks = build_tracks(read_motion(stream))
-        length = np.diff(tracks.offsets)
-        errors = None
-        if truth.geometry is not None:
-            errors = {
-                span: ruler.median(epipolar_errors(tracks, *truth.geometry, span)) for span in SPANS
-            }
-        figures = model_figures(read_model(mapped.model)) if mapped.model is not None else None
-        rows.append(
-            Row(
-                setting=f"{setting.encoder} {setting.speed or ''} | {setting.quality or ''}",
-                cpu_per_frame=encoding["cpu_seconds"] / material.num_frames,
-                bytes_per_frame=stream.stat().st_size / material.num_frames,
-                num_tracks={n: int(np.count_nonzero(length >= n)) for n in LONG},
-                errors=errors,
-                num_registered=figures.num_registered if figures is not None else 0,
-                num_images=len(footage.frames),
-                mean_error=figures.mean_error if figures is not None else float("nan"),
-            )
-        )
-    return rows, f"{material.num_frames} frames; {truth.about}."
 
 
-def lossless(material: ruler.Material, folder: Path) -> Path:
-    """The pictures the clip is made of, in one file."""
-    assert material.source is not None
-    words = material.source
-    video = folder / "lossless" / "video.mkv"
+def source_of(sequence: Sequence, folder: Path) -> Path:
+    """The clip as it was shot, or its frames as H.264 of such a rate that nothing is lost."""
+    if sequence.source.is_file():
+        return sequence.source
+    first = min(sequence.source.iterdir())
+    pattern = sequence.source / f"%0{len(first.stem)}d{first.suffix}"
+    video = folder / "source" / "video.mp4"
+    words = ("-framerate", str(sequence.fps), "-i", str(pattern), "-c:v", "libx264", "-preset")
+    words += ("veryfast", "-crf", "14", "-pix_fmt", "yuv420p")
 
     def make() -> dict[str, Any]:
-        ruler.ffmpeg(*words, "-an", "-c:v", "ffv1", "-pix_fmt", "yuv420p", str(video))
+        ruler.ffmpeg(*words, str(video))
         return {}
 
     run_stage_in(video.parent, words, make, products=[video], made_by=())
     return video
 
 
-def encoded(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path, dict[str, Any]]:
-    """The stream of a setting, and the time it took."""
+def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path, float]:
+    """The stream of a setting, and the CPU time of ffmpeg."""
     stream = folder / "stream.mp4"
 
     def make() -> dict[str, Any]:
-        measured = run_measured(encode_quietly, source, stream, setting, log=folder / "log.txt")
-        return {"seconds": measured.seconds, "cpu_seconds": measured.cpu_seconds}
+        before = os.times()
+        encode(source, stream, options=setting)
+        after = os.times()
+        spent = after.children_user + after.children_system
+        return {"cpu_seconds": spent - before.children_user - before.children_system}
 
     given = (file_digest(source), setting)
-    return stream, run_stage_in(folder, given, make, products=[stream], timed=True).facts
+    made_by = ("video",)
+    facts = run_stage_in(folder, given, make, products=[stream], made_by=made_by, timed=True).facts
+    return stream, facts["cpu_seconds"]
 
 
-def encode_quietly(source: Path, stream: Path, setting: EncodeOptions) -> None:
-    """Encode in a process that is measured."""
-    encode(source, stream, options=setting)
+def modelled(
+    sequence: Sequence, source: Path, stream: Path, folder: Path, setting: EncodeOptions
+) -> dict[str, Any]:
+    """The figures of the model, those of Row; none where there is no model."""
+    camera = CameraOptions()
+    if sequence.camera is not None:
+        params = ",".join(map(str, sequence.camera.params))
+        camera = CameraOptions(camera_model=sequence.camera.model.name, camera_params=params)
+    every = CLIPS[sequence.name]
+    images = ImageOptions(every=every if every > 1 else None)
+    match = MatchOptions(images=images, camera=camera, encode=setting, keep_stream=stream)
+
+    def make() -> dict[str, Any]:
+        output = folder / "output"
+        try:
+            made = run_measured(
+                reconstructed, source, output, ReconstructOptions(match=match), log=folder / "log"
+            )
+        except ColmapAv1Error as error:
+            return {"message": str(error)}
+        facts = {**made.result, "reconstruct_cpu": made.cpu_seconds}
+        if sequence.cam_from_world is not None:
+            poses = model_poses(read_model(output / "sparse" / "0"), sequence.num_frames)
+            errors = pose_errors(poses, sequence.cam_from_world)
+            facts["ate"] = errors.ate if errors is not None else None
+        facts |= far_views(output)
+        shutil.rmtree(output)
+        return facts
+
+    given = (file_digest(source), file_digest(stream), images, camera)
+    facts = run_stage_in(folder, given, make, products=[]).facts
+    facts.pop("message", None)
+    return facts
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown table of the settings."""
-    lines = [
-        "| encoder, speed | quality | CPU ms a frame | kB a frame | "
-        + " | ".join(f"tracks of {n}+" for n in LONG)
-        + f" | epipolar px at {' / '.join(map(str, SPANS))} frames | registered | mapped at |",
-        "|---|---|" + "---:|" * (4 + len(LONG)) + "---:|",
-    ]
-    for row in rows:
-        errors = "-"
-        if row.errors is not None:
-            errors = " / ".join(f"{row.errors[span]:.2f}" for span in SPANS)
-        counts = " | ".join(f"{row.num_tracks[n]:,}" for n in LONG)
-        cost = f"{1000 * row.cpu_per_frame:.0f} | {row.bytes_per_frame / 1000:.1f}"
-        mapped = f"{row.num_registered} of {row.num_images} | {row.mean_error:.2f} px"
-        lines.append(f"| {row.setting} | {cost} | {counts} | {errors} | {mapped} |")
-    return "\n".join(lines) + "\n"
+def reconstructed(source: Path, output: Path, options: ReconstructOptions) -> dict[str, Any]:
+    """Make a model, in a process that is measured."""
+    report = reconstruct(source, output, options=options)
+    return {
+        "registered": report.num_registered,
+        "images": report.num_images,
+        "points": report.num_points,
+        "error": report.mean_error,
+    }
+
+
+def far_views(output: Path) -> dict[str, float]:
+    """How well views far apart agree, where that can be measured."""
+    if not FAR_VIEWS.is_file():
+        return {}
+    command = [sys.executable, str(FAR_VIEWS), str(output / "sparse" / "0"), str(output / "images")]
+    said = subprocess.run([*command, str(FAR)], capture_output=True, text=True, check=False).stdout
+    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
+    return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
+
+
+def keep_row(row: Row) -> None:
+    """Put a row into the table, in place of that of the same clip and setting."""
+    names = [field.name for field in fields(Row)]
+    rows = []
+    if TABLE.is_file():
+        with TABLE.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    new = {name: spelled(value) for name, value in asdict(row).items()}
+    key = names[:4]
+    rows = [r for r in rows if any(r[name] != new[name] for name in key)]
+    order = list(CLIPS)
+    rows.append(new)
+    rows.sort(
+        key=lambda r: (
+            order.index(r["clip"]),
+            r["encoder"],
+            r["quality"],
+            len(r["speed"]),
+            r["speed"],
+        )
+    )
+    with TABLE.open("w", newline="") as file:
+        table = csv.DictWriter(file, names, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+def spelled(value: object) -> str:
+    """A cell of the table."""
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

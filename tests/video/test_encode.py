@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -95,6 +96,49 @@ def test_varying_frame_rate_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_p
     report = encode_video(uneven, tmp_path / "out.mp4")
     assert report.num_frames == 12
     np.testing.assert_allclose(times(report.output), times(uneven), atol=2e-3)
+
+
+@pytest.mark.parametrize("encoder", ["libaom", "svt"])
+def test_ten_bits_of_high_dynamic_range(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, encoder: str
+) -> None:
+    """As newer phones film, 60 frames a second."""
+    plain = encode(make_frames(12, 96, 64), tmp_path / "plain.mkv", "-c:v", "ffv1")
+    colours = ("-colorspace", "bt2020nc", "-color_primaries", "bt2020", "-color_trc", "smpte2084")
+    video = ffmpeg(
+        *("-i", plain, "-vf", "setpts=N/60/TB", "-fps_mode", "passthrough"),
+        *("-enc_time_base", "1/600", "-c:v", "libx265", "-tag:v", "hvc1", "-x265-params"),
+        *("log-level=error", "-pix_fmt", "yuv420p10le", *colours),
+        tmp_path / "phone.mov",
+    )
+    options = EncodeOptions(encoder=encoder, quality=5)
+    report = encode_video(video, tmp_path / "out.mp4", options=options)
+    assert report.num_frames == 12
+    np.testing.assert_allclose(times(report.output), np.arange(12) / 60, atol=2e-3)
+    with av.open(str(report.output)) as container:
+        assert container.streams.video[0].format.name == "yuv420p"
+    for (_, before), (_, after) in zip(
+        decode_frames(video), decode_frames(report.output), strict=True
+    ):
+        # Colours may be read by other rules: what matters is where things are.
+        grey = [cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in (before, after)]
+        assert np.corrcoef(grey[0].ravel(), grey[1].ravel())[0, 1] > 0.98
+    found = match(tmp_path / "a.db", video, options=MatchOptions(encode=options))
+    assert found.num_images == 12
+    assert found.num_verified_pairs > 0
+
+
+def test_slow_motion_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """240 frames a second, some of which a phone left out."""
+    video = ffmpeg(
+        *("-i", phone, "-vf", "setpts=(N+2*gt(N\\,5))/240/TB", "-fps_mode", "passthrough"),
+        *("-enc_time_base", "1/24000", *H264, tmp_path / "slow.mov"),
+    )
+    report = encode_video(video, tmp_path / "out.mp4")
+    assert report.num_frames == 12
+    expected = (np.arange(12) + 2 * (np.arange(12) > 5)) / 240
+    np.testing.assert_allclose(times(video), expected, atol=5e-4)
+    np.testing.assert_allclose(times(report.output), expected, atol=5e-4)
 
 
 @pytest.mark.parametrize("encoder", ["libaom", "svt"])
@@ -362,6 +406,61 @@ def fake_ffmpeg(folder: Path, script: str) -> Path:
     path.write_text(f'#!/bin/sh\n{script}\nexec {imageio_ffmpeg.get_ffmpeg_exe()} "$@"\n')
     path.chmod(0o755)
     return path
+
+
+# What is asked of hardware encoders: by quality 20, that is quantiser index 81 of 255, each frame
+# from those before it.
+HARDWARE = {
+    "nvenc": "-tune hq -preset p1 -rc constqp -qp 81 -b_ref_mode 0 -bf 0",
+    "qsv": "-preset 7 -q:v 81 -bf 0 -low_delay_brc 1",
+    "amf": "-usage lowlatency -quality 100 -bf 0 -rc cqp -qp_i 81 -qp_p 81",
+    "vaapi": "-compression_level 7 -rc_mode CQP -global_quality 81 -bf 0",
+}
+PICTURES = {"nvenc": "format=yuv420p", "vaapi": "format=nv12,hwupload"}
+# Those that ffmpeg has for every encoder.
+OF_ALL_ENCODERS = {"-bf", "-q:v", "-global_quality", "-compression_level"}
+
+
+@pytest.mark.parametrize("name", HARDWARE)
+def test_what_hardware_encoders_are_asked(
+    phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """As on a machine that has the hardware, up to where it would be used."""
+    asked = tmp_path / "asked"
+    log = f'printf "%s\\n" "$@" > {asked}'
+    script = f'case "$*" in *lavfi*) exit 0;; *) {log}; exit 1;; esac'
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, script)))
+    with pytest.raises(EncodeError, match="the encoder failed after 0 frames"):
+        encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder=name))
+    words = asked.read_text().splitlines()
+    device = ["-vaapi_device", "/dev/dri/renderD128"] if name == "vaapi" else []
+    assert words[words.index("-y") + 1 : words.index("-i")] == [
+        *device,
+        *("-ignore_editlist", "1"),
+    ]
+    assert words[words.index("-i") : words.index("-progress")] == [
+        *("-i", f"file:{phone}", "-map", "0:0", "-vf", PICTURES.get(name, "format=nv12")),
+        *("-fps_mode", "passthrough", "-enc_time_base", "demux", "-c:v", f"av1_{name}"),
+        *("-g", "9999", *HARDWARE[name].split()),
+    ]
+
+
+@pytest.mark.parametrize("name", HARDWARE)
+def test_hardware_encoders_know_what_they_are_asked(name: str) -> None:
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", f"encoder=av1_{name}"]
+    about = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    if "is not recognized" in about:
+        pytest.skip(f"this ffmpeg is built without av1_{name}")
+    words = HARDWARE[name].split()
+    for option, value in zip(words[::2], words[1::2], strict=True):
+        # An option's line, and those of its values, which are indented further.
+        own = re.search(rf"^  {option} .*\n((?:     .*\n)*)", about, re.MULTILINE)
+        if own is None:
+            assert option in OF_ALL_ENCODERS
+        elif not value.isdecimal():
+            assert re.search(rf"^     {value} ", own[1], re.MULTILINE), (option, value)
+        elif bounds := re.search(r"\(from (-?\d+) to (\d+)\)", own[0]):
+            assert int(bounds[1]) <= int(value) <= int(bounds[2])
 
 
 FAIL_HALF_WAY = """case "$*" in *lavfi*) ;; *)
