@@ -5,7 +5,7 @@ python examples/benchmarks/dense_points.py --model sift_model --video OUT.mp4
 
 Without arguments the rendered clip is densified on its true poses, and its surfaces are the truth.
 Else it is the points of the model that lie near others in an image: not many, but from another
-front-end. The rows add, one after the other, what makes points more and surer.
+front-end. Each row adds to the one before an option that gives more or more accurate points.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+import render
+from clips import EXAMPLES, load_render_scene
 from numpy.typing import NDArray
-from tracks import load_render_scene
+from results import Value, add_results, read_rows, save
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
@@ -27,41 +29,37 @@ from colmap_av1.evaluate.metrics.clouds import depth_differences, point_cloud
 from colmap_av1.model.colmap_model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
 
-EXAMPLES = Path(__file__).resolve().parents[1]
-
 
 @dataclass(frozen=True)
-class Way:
-    """What makes the points."""
+class Tracking:
+    """Options that points come from."""
 
     name: str
     tracks: TrackOptions
     max_depth_error: float | None = None
 
 
-WAYS = (
-    Way("tracks of 4 frames, 1 to a unit", TrackOptions(min_length=4, cell=4)),
-    Way("tracks of 3 frames, too", TrackOptions(cell=4)),
-    Way("tracks that meet go on", TrackOptions()),
-    Way(
-        "distances that are sure: the defaults", TrackOptions(), TriangulateOptions.max_depth_error
-    ),
-    Way("--seeding 2", TrackOptions(seeding=2), TriangulateOptions.max_depth_error),
+TRACKINGS = (
+    Tracking("4 frames and more, one in a 4x4 unit", TrackOptions(min_length=4, cell=4)),
+    Tracking("3 frames and more", TrackOptions(cell=4)),
+    Tracking("continued where two meet", TrackOptions()),
+    Tracking("accurate depth: the defaults", TrackOptions(), TriangulateOptions.max_depth_error),
+    Tracking("`--seeding 2`", TrackOptions(seeding=2), TriangulateOptions.max_depth_error),
 )
 
 
 def main() -> int:
-    """Densify in every way and print a table."""
+    """Densify with all options and print a table."""
     parser = argparse.ArgumentParser(description="Measure the points of dense models.")
     parser.add_argument("--model", type=Path, help="COLMAP model of the video's frames")
     parser.add_argument("--video", type=Path, help="AV1 video")
+    parser.add_argument("--name", help="name of the clip; without, that of the video")
+    add_results(parser, "dense_points")
     arguments = parser.parse_args()
     if (arguments.model is None) != (arguments.video is None):
         parser.error("give --model and --video, or neither")
-    print(
-        "| points from | points | observations each | error px | depth off by, median "
-        "| > 5 % | > 10 % | checked | CPU s |\n|---|" + "---:|" * 8
-    )
+    rows = []
+    clip = arguments.name or (arguments.video.stem if arguments.video else "scene")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         script = scene = None
@@ -70,19 +68,23 @@ def main() -> int:
             script = load_render_scene()
             scene = script.build_scene()
             model, video = true_model(scene, folder / "truth"), EXAMPLES / "scene.mp4"
-        for number, way in enumerate(WAYS):
+        for number, tracking in enumerate(TRACKINGS):
             output = folder / str(number)
             options = DensifyOptions(
-                match=MatchOptions(tracks=way.tracks),
-                triangulate=TriangulateOptions(max_depth_error=way.max_depth_error),
+                match=MatchOptions(tracks=tracking.tracks),
+                triangulate=TriangulateOptions(max_depth_error=tracking.max_depth_error),
             )
             measured = run_measured(make, model, video, output, options, log=folder / "log.txt")
             dense, reference = read_model(output), read_model(model)
             if script is None:
-                off, times = depth_differences(dense, reference), reference.num_points3D()
+                off, given = depth_differences(dense, reference), reference.num_points3D()
             else:
-                off, times = surface_errors(dense, script, scene), None
-            print_row(way, dense, off, times, measured.cpu_seconds)
+                off, given = surface_errors(dense, script, scene), None
+            about = {"sequence": clip, "tracks": tracking.name}
+            rows.append({**about, **figures(dense, off, given), "cpu_s": measured.cpu_seconds})
+    save(arguments.results, rows, ("sequence", "tracks"))
+    mine = [row for row in read_rows(arguments.results) if row["sequence"] == clip]
+    print(render.dense_points(mine), end="")
     return 0
 
 
@@ -91,25 +93,19 @@ def make(model: Path, video: Path, output: Path, options: DensifyOptions) -> Non
     densify(model, video, output, options=options)
 
 
-def print_row(
-    way: Way, dense: Any, off: NDArray[np.float64], given: int | None, cpu_seconds: float
-) -> None:
-    """One row of the table; `given` is the number of the given model's points."""
+def figures(dense: Any, off: NDArray[np.float64], given: int | None) -> dict[str, Value]:
+    """Figures of a model, the relative errors of its depths, the given model's number of points."""
     checked = off[np.isfinite(off)]
-    num_points = dense.num_points3D()
-    more = f", {num_points / given:.1f}x" if given else ""
-    cells = [
-        way.name,
-        f"{num_points:,}{more}",
-        f"{dense.compute_mean_track_length():.1f}",
-        f"{np.mean([p.error for p in dense.points3D.values()]):.3f}",
-        f"{np.median(checked):.2%}",
-        f"{np.mean(checked > 0.05):.1%}",
-        f"{np.mean(checked > 0.1):.1%}",
-        f"{len(checked):,}",
-        f"{cpu_seconds:.1f}",
-    ]
-    print(f"| {' | '.join(cells)} |", flush=True)
+    return {
+        "points": dense.num_points3D(),
+        "points_of_model": given,
+        "observations_per_point": dense.compute_mean_track_length(),
+        "error_px": float(np.mean([p.error for p in dense.points3D.values()])),
+        "depth_error": float(np.median(checked)),
+        "above_5_percent": float(np.mean(checked > 0.05)),
+        "above_10_percent": float(np.mean(checked > 0.1)),
+        "checked": len(checked),
+    }
 
 
 def surface_errors(dense: Any, script: Any, scene: Any) -> NDArray[np.float64]:

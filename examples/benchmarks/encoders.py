@@ -23,8 +23,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import clips as ruler
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import tracks as ruler
 from rich.console import Console
 
 from colmap_av1 import (

@@ -1,13 +1,13 @@
-"""Time the ways from a video to a database and to a dense model beside SIFT's.
+"""Measure each way from a video to a database and to a dense model, beside SIFT.
 
 python examples/benchmarks/end_to_end.py --cache benchmark_end_to_end
 
 In turn, for each sequence and round: `reconstruct` makes the folder that trainers open from the
 AV1 stream; pycolmap extracts SIFT, matches sequentially and maps the same frames; `match` fills a
 database with the default preset and the same mapper maps that; `densify` puts the tracks on the
-poses of SIFT's model. Every step has a process of its own; medians over the rounds, and what they
-are of SIFT's. Poses are judged against the truth, where none is known against SIFT's exhaustive
-model.
+poses of SIFT's model. Every step has a process of its own; medians over the rounds, and their
+ratios to SIFT's. Poses are compared with the ground truth, where none is known with SIFT's
+exhaustive model.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
-from rich.console import Console
-from tracks import (
+import render
+from clips import (
     CASES,
     Case,
     Material,
     Truth,
+    footage_of,
     known_truth,
-    markdown,
-    real_sequence,
+    mapper_options,
+    material_of,
     reference_model,
-    rendered_clip,
     with_reference,
 )
+from results import Value, add_results, read_rows, save
+from rich.console import Console
 
 from colmap_av1 import (
-    CameraOptions,
     ColmapAv1Error,
     DensifyOptions,
     ImageOptions,
-    MapOptions,
     MatchOptions,
     ReconstructOptions,
     densify,
@@ -54,24 +54,18 @@ from colmap_av1.evaluate import (
     model_figures,
     model_poses,
     pose_errors,
-    prepare_footage,
     run_frontend,
     run_measured,
 )
 from colmap_av1.model.colmap_model import read_model
 
-# The ways, and the one that each is compared with.
-SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
-SIFT_MODEL = "SIFT sequential: model"
-WAYS = {
-    SIFT_DATABASE: None,
-    SIFT_MAPPER: None,
-    SIFT_MODEL: None,
-    "match: database": SIFT_DATABASE,
-    "match: mapper": SIFT_MAPPER,
-    "reconstruct: dense model": SIFT_MODEL,
-    "densify on SIFT's model": SIFT_MODEL,
-}
+# The ways, in the order of the table.
+WAYS = (
+    render.SIFT_DATABASE,
+    render.SIFT_MAPPER,
+    render.SIFT_MODEL,
+    *render.COMPARED_WITH,
+)
 
 
 @dataclass(frozen=True)
@@ -117,22 +111,21 @@ def main() -> int:
         default=["street", "shelfbox", "log_building", "kitchen"],
     )
     parser.add_argument("--rounds", type=int, default=3)
+    add_results(parser, "end_to_end")
     arguments = parser.parse_args()
     console = Console(stderr=True)
-    rows = []
     for case in CASES:
         if case.name not in arguments.sequences:
             continue
         folder = arguments.cache.resolve() / case.name
-        folder.mkdir(parents=True, exist_ok=True)
         try:
             measured = measure_case(case, folder, arguments.rounds, console)
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {error}", markup=False)
             continue
-        rows += table_rows(case.name, measured)
-    header = ["sequence, way", "images", "points", "error px", "ATE", "seconds", "CPU seconds"]
-    print(markdown([*header, "peak memory"], rows), end="")
+        save(arguments.results, medians(case.name, measured), ("sequence", "way"))
+    rows = read_rows(arguments.results)
+    print(render.end_to_end([r for r in rows if r["sequence"] in arguments.sequences]), end="")
     return 0
 
 
@@ -140,21 +133,9 @@ def measure_case(
     case: Case, folder: Path, rounds: int, console: Console
 ) -> dict[str, list[Figures]]:
     """Figures of each way in each round."""
-    material = rendered_clip() if case.name == "scene" else real_sequence(case, folder, console)
-    camera = CameraOptions()
-    if material.camera is not None:
-        params = ",".join(map(str, material.camera.params))
-        camera = CameraOptions(camera_model=material.camera.model.name, camera_params=params)
-    footage = prepare_footage(
-        material.video,
-        folder / "footage",
-        num_frames=material.num_frames,
-        image_step=case.image_step,
-        camera=camera,
-    )
-    settings = MapOptions(
-        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
-    )
+    material = material_of(case, folder, console)
+    footage = footage_of(case, material, folder)
+    settings = mapper_options(case, material)
     truth = known_truth(material)
     if truth.poses is None:
         model = reference_model(footage, folder, settings, console)
@@ -180,11 +161,11 @@ def measure_case(
         our_model = measure_mapper(
             where / "match" / "database.db", footage.image_path, where / "match-model", settings
         )
-        add(SIFT_DATABASE, sift)
+        add(render.SIFT_DATABASE, sift)
         add("match: database", ours)
         add("match: mapper", step_of(our_model), our_model.model)
-        add(SIFT_MAPPER, step_of(mapped), mapped.model)
-        add(SIFT_MODEL, sift + step_of(mapped), mapped.model)
+        add(render.SIFT_MAPPER, step_of(mapped), mapped.model)
+        add(render.SIFT_MODEL, sift + step_of(mapped), mapped.model)
         if mapped.model is not None:
             onto = run_measured(run_densify, mapped.model, footage, case, where / "onto", log=log)
             add("densify on SIFT's model", step_of(onto), where / "onto")
@@ -202,7 +183,7 @@ def step_of_frontend(run: FrontendRun) -> Step:
 
 
 def run_reconstruct(footage: Footage, case: Case, output: Path) -> None:
-    """The whole way from the stream, as the command line goes it."""
+    """From the stream to the dense model, as the command line does it."""
     options = MatchOptions(camera=footage.camera, images=ImageOptions(every=case.image_step))
     reconstruct(footage.video, output, options=ReconstructOptions(match=options))
 
@@ -214,7 +195,7 @@ def run_densify(model: Path, footage: Footage, case: Case, output: Path) -> None
 
 
 def figures(step: Step, model: Path | None, material: Material, truth: Truth) -> Figures:
-    """What a way took, and what its model is worth."""
+    """What a way took, and the figures of its model."""
     taken = (step.seconds, step.cpu_seconds, step.peak_memory)
     if model is None:
         return Figures(*taken)
@@ -232,29 +213,29 @@ def figures(step: Step, model: Path | None, material: Material, truth: Truth) ->
     )
 
 
-def table_rows(name: str, measured: dict[str, list[Figures]]) -> list[list[str]]:
-    """Medians over the rounds, and their ratio to SIFT's."""
+def medians(name: str, measured: dict[str, list[Figures]]) -> list[dict[str, Value]]:
+    """Medians over the rounds, a row for each way."""
 
-    def median(way: str, field: str) -> float | None:
-        values = [getattr(figures, field) for figures in measured[way]]
-        return None if not values or None in values else statistics.median(values)
+    def median(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return statistics.median(known) if known and len(known) == len(values) else None
 
-    def cell(way: str, field: str, spell: str) -> str:
-        value, other = median(way, field), WAYS[way]
-        if value is None:
-            return "-"
-        base = median(other, field) if other is not None else None
-        return f"{value:{spell}} ({value / base:.2f}x)" if base else f"{value:{spell}}"
-
-    columns = (
-        *(("num_images", ".0f"), ("num_points", ",.0f"), ("error", ".3f")),
-        *(("ate", ".4f"), ("seconds", ".1f"), ("cpu_seconds", ".1f")),
-    )
+    columns = {
+        "images": "num_images",
+        "points": "num_points",
+        "error_px": "error",
+        "ate": "ate",
+        "seconds": "seconds",
+        "cpu_s": "cpu_seconds",
+    }
     rows = []
-    for way, values in measured.items():
-        if values:
-            row = [f"{name}, {way}", *(cell(way, *column) for column in columns)]
-            rows.append([*row, f"{median(way, 'peak_memory') / 1e6:.0f} MB"])
+    for way, runs in measured.items():
+        if runs:
+            row: dict[str, Value] = {"sequence": name, "way": way}
+            for column, field in columns.items():
+                row[column] = median([getattr(run, field) for run in runs])
+            row["peak_memory_mb"] = statistics.median(run.peak_memory for run in runs) / 1e6
+            rows.append(row)
     return rows
 
 

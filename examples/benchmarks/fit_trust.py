@@ -20,16 +20,15 @@ from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+from clips import EXAMPLES, load_render_scene
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from tracks import load_render_scene
 
 from colmap_av1 import FrameMotion, RefineOptions, Tracks, build_tracks, read_motion
 from colmap_av1.evaluate import model_poses
 from colmap_av1.tracks.refine import match_tracks
 from colmap_av1.video.decoding import decode_frames
 
-EXAMPLES = Path(__file__).resolve().parents[1]
 SAMPLES = 40_000  # of each clip
 # Larger errors, in pixels, are wrong matches, whatever their size.
 LARGEST_ERROR = {"steps": 3.0, "matches": 4.0}

@@ -3,7 +3,7 @@
 python examples/benchmarks/read_memory.py --cache benchmark_clips
 
 Encodes 100 frames of 3840x2160, repeats their packets to the wanted number of frames, and reads
-the result frame by frame in a process of its own, whose peak resident set it prints.
+the result frame by frame in another process, whose peak resident set it reports.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import tempfile
 from pathlib import Path
 
 import imageio_ffmpeg
+import render
+from results import add_results, read_rows, save
 
 from colmap_av1 import ReadOptions, read_motion
 
@@ -35,6 +37,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--read", type=Path, help=argparse.SUPPRESS)
+    add_results(parser, "read_memory")
     arguments = parser.parse_args()
     if arguments.read is not None:
         return read(arguments.read, arguments.threads)
@@ -43,7 +46,14 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         video = make_video(folder, arguments.frames)
         words = ["--threads", str(arguments.threads), "--read", str(video)]
-        return subprocess.run([sys.executable, __file__, *words], check=False).returncode
+        command = [sys.executable, __file__, *words]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    peak, before = map(float, done.stdout.split())
+    row = {"frames": arguments.frames, "threads": arguments.threads}
+    row |= {"peak_MB": round(peak), "before_reading_MB": round(before)}
+    save(arguments.results, [row], ("frames", "threads"))
+    print(render.plain(read_rows(arguments.results)), end="")
+    return 0
 
 
 def make_video(folder: Path, frames: int) -> Path:
@@ -66,16 +76,11 @@ def make_video(folder: Path, frames: int) -> Path:
 
 
 def read(video: Path, threads: int) -> int:
-    """Read a video frame by frame and print what that took."""
-    imported = peak_mb()
-    frames = units = 0
-    for motion in read_motion(video, ReadOptions(num_threads=threads)):
-        frames += 1
-        units = max(units, motion.mi_size.size)
-    print(
-        f"{video.name}: {frames} coded frames of up to {units} units, {threads} threads: "
-        f"peak {peak_mb():.0f} MB, of which {imported:.0f} MB before reading"
-    )
+    """Read a video frame by frame; prints the peak memory in MB at the end and before reading."""
+    before = peak_mb()
+    for _ in read_motion(video, ReadOptions(num_threads=threads)):
+        pass
+    print(peak_mb(), before)
     return 0
 
 

@@ -25,14 +25,14 @@ from functools import partial
 from pathlib import Path
 
 import av
+import render
+from clips import EXAMPLES, SEQUENCES, ffmpeg, ffmpeg_input
+from results import Value, add_results, read_rows, save
 from rich.console import Console
 from rich.progress import Progress
 
 from colmap_av1 import ColmapAv1Error, ReadOptions, _core, read_motion
 from colmap_av1.video.container import open_stream
-
-EXAMPLES = Path(__file__).resolve().parents[1]
-SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 
 LIBAOM = "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -b:v 0"
 SVT_AV1 = "-c:v libsvtav1 -preset 8"
@@ -110,6 +110,7 @@ def main() -> int:
     parser.add_argument(
         "--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads to time"
     )
+    add_results(parser, "read_motion")
     arguments = parser.parse_args()
     if arguments.repeats < 1 or min(arguments.threads) < 1:
         parser.error("--repeats and --threads start at 1")
@@ -139,9 +140,12 @@ def main() -> int:
                 print(f"error: {clip.name}: {error}", file=sys.stderr)
                 return 1
             progress.advance(task)
-    print_table(timings, threads)
-    print()
-    print(machine(arguments.repeats))
+    save(arguments.results, [r for t in timings for r in figures(t)], ("clip", "threads"))
+    measured = {timing.clip for timing in timings}
+    rows = [row for row in read_rows(arguments.results) if row["clip"] in measured]
+    for n in threads:
+        print(render.read_motion(rows, str(n)))
+    print(conditions(arguments.repeats))
     for line in skipped:
         print(line)
     return 0
@@ -159,34 +163,21 @@ def make_clip(clip: Clip, folder: Path) -> Path:
     path = folder / f"{clip.name}.mp4"
     if path.exists():
         return path
-    source = source_words(SEQUENCES / clip.sequence)
-    try:
-        import imageio_ffmpeg  # noqa: PLC0415  only those who make clips need it
-    except ImportError as error:
-        raise RuntimeError(f"{error}: pip install '.[dev]'") from error
+    sequence = SEQUENCES / clip.sequence
+    source = sequence / "clip.mp4"
+    if not source.is_file():
+        source = sequence / "frames"
+    if not source.exists():
+        raise FileNotFoundError(f"no sequence at {sequence}")
     unfinished = path.with_suffix(".part.mp4")
-    command = [
-        *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y", *source),
-        *(*clip.encoding.split(), "-pix_fmt", "yuv420p", "-an", str(unfinished)),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
+    encoding = [*clip.encoding.split(), "-pix_fmt", "yuv420p", "-an"]
+    try:
+        ffmpeg(*ffmpeg_input(source, 25), *encoding, str(unfinished))
+    except subprocess.CalledProcessError as error:
         unfinished.unlink(missing_ok=True)
-        raise RuntimeError(f"ffmpeg failed: {done.stderr.strip() or done.returncode}")
+        raise RuntimeError(f"ffmpeg failed: {error.returncode}") from error
     unfinished.replace(path)
     return path
-
-
-def source_words(sequence: Path) -> list[str]:
-    """How ffmpeg opens a sequence: a clip, or images with consecutive numbers as names."""
-    if (sequence / "clip.mp4").is_file():
-        return ["-i", str(sequence / "clip.mp4")]
-    images = sorted((sequence / "frames").glob("*")) if sequence.is_dir() else []
-    if not images:
-        raise FileNotFoundError(f"no sequence at {sequence}")
-    first = images[0]
-    pattern = str(first.with_name(f"%0{len(first.stem)}d{first.suffix}"))
-    return ["-framerate", "25", "-start_number", str(int(first.stem)), "-i", pattern]
 
 
 def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing:
@@ -271,47 +262,33 @@ def count(items: Iterator[object]) -> int:
     return sum(1 for _ in items)
 
 
-def print_table(timings: list[Timing], threads: list[int]) -> None:
-    """Print milliseconds a shown frame, how many times faster the reader is, what threads gain."""
-    first = []
-    for n in threads:
-        first += [f"reader, {n}T", f"dav1d, {n}T", "ratio"]
-        if n > threads[0]:
-            first.append(f"gain of {n}T")
-    header = ["clip", "frames", "Mbit", *first, "demux", "parse"]
-    print("| " + " | ".join(header) + " |")
-    print("|---|" + "---:|" * (len(header) - 1))
-    for timing in timings:
-        row = [timing.clip, str(timing.frames), f"{timing.megabits:.1f}"]
-        per_frame = 1e3 / timing.frames
-        for n in threads:
-            row += [
-                f"{timing.reader[n] * per_frame:.3f}",
-                f"{timing.dav1d[n] * per_frame:.3f}",
-                f"{timing.dav1d[n] / timing.reader[n]:.2f}",
-            ]
-            if n > threads[0]:
-                row.append(f"{timing.gain[n]:.2f}")
-        row += [f"{timing.demux * per_frame:.3f}", f"{timing.parse * per_frame:.3f}"]
-        print("| " + " | ".join(row) + " |")
+def figures(timing: Timing) -> list[dict[str, Value]]:
+    """A row for each number of threads, in milliseconds a shown frame."""
+    per_frame = 1e3 / timing.frames
+    return [
+        {
+            "clip": timing.clip,
+            "threads": n,
+            "megabits": timing.megabits,
+            "read_motion_ms": timing.reader[n] * per_frame,
+            "dav1d_ms": timing.dav1d[n] * per_frame,
+            "gain": timing.gain[n] if n > min(timing.gain) else None,
+            "parse_ms": timing.parse * per_frame if n == 1 else None,
+            "demux_ms": timing.demux * per_frame if n == 1 else None,
+        }
+        for n in timing.reader
+    ]
 
 
-def machine(repeats: int) -> str:
-    """What the figures mean, and where they were taken."""
-    cpu = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                cpu = line.partition(":")[2].strip()
-                break
+def conditions(repeats: int) -> str:
+    """What the figures mean, and what they were taken with."""
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (
-        f"Milliseconds per shown frame, medians of {repeats} runs in turns; T: threads. CPU time "
-        "with one thread, real time with more. Of the "
-        "reader's time at one thread, demux is reading the packets once (the reader does it "
-        "twice), parse the parser alone. Gain: times that the reader is faster with more threads.\n"
-        f"{os.cpu_count()} cores, {cpu}{load}; Python {platform.python_version()}, "
-        f"PyAV {av.__version__} with FFmpeg {av.ffmpeg_version_info} and its libdav1d."
+        f"Milliseconds per shown frame, medians of {repeats} runs in turns: CPU time with one "
+        "thread, real time with more. Of the reader's time with one thread, parse is the parser "
+        "alone. Gain: times that the reader is faster with more threads.\n"
+        f"Python {platform.python_version()}, PyAV {av.__version__} with FFmpeg "
+        f"{av.ffmpeg_version_info} and its libdav1d{load}."
     )
 
 

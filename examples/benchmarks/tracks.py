@@ -3,36 +3,48 @@
 python examples/benchmarks/tracks.py --cache benchmark_tracks
 
 Each sequence is encoded once as AV1 and its frames are written as images; every front-end gets
-these. What is measured stays in the cache: a run that was stopped goes on where it was, and only
-what has changed is measured again. The rendered clip is always there, the sequences lie in
-../shared.
+these. What is measured stays in the cache: a run that was stopped is resumed, and only what has
+changed is measured again. The rendered clip is always there, the sequences lie in ../shared.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
-import importlib.util
-import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import pycolmap
-from numpy.typing import NDArray
+import render
+from clips import (
+    CASES,
+    REFERENCE,
+    SEQUENCES,
+    Case,
+    Material,
+    Truth,
+    ffmpeg,
+    footage_of,
+    is_there,
+    known_truth,
+    mapper_options,
+    material_of,
+    median,
+    quantile,
+    reference_model,
+    with_reference,
+)
+from results import Value, add_results, read_rows, save
 from rich.console import Console
 
 from colmap_av1 import (
     CameraOptions,
     ColmapAv1Error,
     DensifyOptions,
-    MapOptions,
     MatchOptions,
     RefineOptions,
     Tracks,
@@ -54,8 +66,6 @@ from colmap_av1.evaluate import (
     model_figures,
     model_poses,
     pose_errors,
-    prepare_footage,
-    read_sequence,
     run_frontend,
     track_statistics,
 )
@@ -63,74 +73,21 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 
-EXAMPLES = Path(__file__).resolve().parents[1]
-SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
-REFERENCE = "sift-exhaustive"
-# Given the pictures the video was made of, not those decoded from it.
+# Given the pictures the video was made from, not those decoded from it.
 FROM_SOURCE = {
     "sift-sequential-source": "sift-sequential",
     "sift-exhaustive-source": "sift-exhaustive",
 }
-# Where few and sure tracks give the poses, all are triangulated on them.
+# Where few and accurate tracks give the poses, all are triangulated on them.
 ALL_TRACKS = {
     "av1-sparse": DensifyOptions(),
     "av1-refined-sparse": DensifyOptions(match=MatchOptions(refine=RefineOptions(refine="lk"))),
 }
-ENCODING = (
-    "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
-    "-pix_fmt yuv420p -an"
-)
-
-Poses = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A sequence and how it is used; `image_step` as `every` in ImageOptions."""
-
-    name: str
-    image_step: int = 1
-    forward_motion: bool = False
-
-
-CASES = (
-    Case("scene"),
-    Case("street", forward_motion=True),
-    Case("shelfbox"),
-    Case("kitchen", image_step=2),
-    Case("log_building"),
-    Case("ditch"),
-)
-
-
-@dataclass(frozen=True)
-class Material:
-    """What a case is measured on.
-
-    `transfer` is the rendered clip's exact truth; `source` are ffmpeg's words for the pictures the
-    video was made of, where these are not rendered.
-    """
-
-    video: Path
-    num_frames: int
-    camera: Any | None
-    poses: Poses | None
-    transfer: Callable[..., Any] | None = None
-    source: tuple[str, ...] | None = None
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What is measured against: of the epipolar error and of the poses; and what that is."""
-
-    geometry: tuple[Poses, Any] | None
-    poses: Poses | None
-    about: str
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one front-end; what could not be measured is None."""
+    """What one front-end gave; what could not be measured is None."""
 
     frontend: str
     run: FrontendRun
@@ -173,9 +130,10 @@ def main() -> int:
     parser.add_argument(
         "--camera_model",
         help="COLMAP's camera model where the intrinsics are unknown; without, SIMPLE_RADIAL, "
-        "and RADIAL where match tells the focal length",
+        "and RADIAL where match estimates the focal length",
     )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
+    add_results(parser, "tracks")
     arguments = parser.parse_args()
     console = Console(stderr=True)
     failed = False
@@ -184,51 +142,38 @@ def main() -> int:
         for case in CASES:
             if case.name not in arguments.sequences:
                 continue
-            if case.name != "scene" and not (SEQUENCES / case.name).is_dir():
+            if not is_there(case.name):
                 console.print(f"{case.name}: not measured, {SEQUENCES / case.name} is absent")
                 continue
             try:
-                rows, about = measure_case(case, cache / case.name, arguments, console)
+                rows = measure_case(case, cache / case.name, arguments, console)
             except ColmapAv1Error as error:
                 console.print(f"error: {case.name}: {error}", markup=False)
                 failed = True
                 continue
-            print(f"### {case.name}\n\n{about}\n")
-            print(tracks_table(rows))
-            if not arguments.no_mapping:
-                print(models_table(rows))
-            sys.stdout.flush()
+            save(arguments.results, rows, ("sequence", "frontend"))
             failed |= len(rows) < len(arguments.frontends)
+            if rows:
+                table = render.tracks(read_rows(arguments.results), case.name)
+                print(f"### {case.name}\n\n{table}", flush=True)
     return 1 if failed else 0
 
 
 def measure_case(
     case: Case, folder: Path, arguments: argparse.Namespace, console: Console
-) -> tuple[list[Row], str]:
-    """Rows of one sequence, and a line on what they are measured against."""
+) -> list[dict[str, Value]]:
+    """Figures of one sequence, a row for each front-end."""
     mapping = not arguments.no_mapping
-    folder.mkdir(parents=True, exist_ok=True)
-    material = rendered_clip() if case.name == "scene" else real_sequence(case, folder, console)
-    intrinsics = CameraOptions(camera_model=arguments.camera_model)
-    if material.camera is not None:
-        camera = material.camera
-        params = ",".join(map(str, camera.params))
-        intrinsics = CameraOptions(camera_model=camera.model.name, camera_params=params)
-    footage = prepare_footage(
-        material.video,
-        folder / "footage",
-        num_frames=material.num_frames,
-        image_step=case.image_step,
-        camera=intrinsics,
-    )
-    settings = MapOptions(
-        refine_intrinsics=material.camera is None, forward_motion=case.forward_motion
-    )
+    material = material_of(case, folder, console)
+    unknown = CameraOptions(camera_model=arguments.camera_model)
+    camera = unknown if material.camera is None else material.intrinsics
+    footage = footage_of(case, material, folder, camera)
+    settings = mapper_options(case, material)
     truth = known_truth(material)
     if mapping and truth.geometry is None:
         model = reference_model(footage, folder, settings, console)
         truth = with_reference(truth, model, material.num_frames)
-    rows = []
+    rows: list[dict[str, Value]] = []
     for name in arguments.frontends:
         console.print(f"{case.name}: {name}", markup=False)
         if name in FROM_SOURCE and material.source is None:
@@ -251,69 +196,21 @@ def measure_case(
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {name}: {error}", markup=False)
             continue
-        row = measure_row(run, mapper, footage, material, truth)
-        rows.append(replace(row, dense=dense))
-    scale = "intrinsics known and kept" if material.camera is not None else "intrinsics unknown"
-    about = f"{len(footage.frames)} images of {material.num_frames} frames; {scale}; {truth.about}."
-    return rows, about
-
-
-def load_render_scene() -> Any:
-    """The script that rendered the example clip, as a module."""
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def rendered_clip() -> Material:
-    """The example clip with its exact truth."""
-    render_scene = load_render_scene()
-    scene = render_scene.build_scene()
-    camera = pycolmap.Camera(
-        model="PINHOLE",
-        width=scene.width,
-        height=scene.height,
-        params=[scene.fx, scene.fy, scene.cx, scene.cy],
-    )
-    return Material(
-        video=EXAMPLES / "scene.mp4",
-        num_frames=len(scene.cam_from_world),
-        camera=camera,
-        poses=scene.cam_from_world,
-        transfer=functools.partial(render_scene.transfer, scene),
-    )
-
-
-def real_sequence(case: Case, folder: Path, console: Console) -> Material:
-    """A sequence of ../shared, encoded as AV1."""
-    sequence = read_sequence(SEQUENCES / case.name)
-    source = sequence.source
-    words: tuple[str, ...] = ("-i", str(source))
-    if source.is_dir():
-        first = min(source.iterdir())
-        pattern = source / f"%0{len(first.stem)}d{first.suffix}"
-        words = ("-framerate", str(sequence.fps), "-i", str(pattern))
-    video = folder / "video" / "video.mp4"
-
-    def encode() -> dict[str, Any]:
-        console.print(f"{case.name}: encoding", markup=False)
-        ffmpeg(*words, *ENCODING.split(), str(video))
-        return {"bytes": video.stat().st_size}
-
-    pictures = sorted(source.iterdir()) if source.is_dir() else [source]
-    given = (words, ENCODING, [file_digest(p) for p in pictures])
-    run_stage_in(video.parent, given, encode, products=[video], made_by=())
-    return Material(
-        video, sequence.num_frames, sequence.camera, sequence.cam_from_world, source=words
-    )
+        row = replace(measure_row(run, mapper, footage, material, truth), dense=dense)
+        about: dict[str, Value] = {
+            "sequence": case.name,
+            "frontend": name,
+            "num_frames": material.num_frames,
+            "num_images": len(footage.frames),
+            "intrinsics": "unknown" if material.camera is None else "known and kept",
+            "measured_against": truth.about,
+        }
+        rows.append({**about, **track_figures(row), **model_figures_of(row, name)})
+    return rows
 
 
 def source_footage(footage: Footage, material: Material, folder: Path) -> Footage:
-    """The same footage with the pictures the video was made of."""
+    """The same footage with the pictures the video was made from."""
     assert material.source is not None
     words = material.source
     images = folder / "source" / "images"
@@ -326,40 +223,6 @@ def source_footage(footage: Footage, material: Material, folder: Path) -> Footag
     given = (words, file_digest(footage.video))
     run_stage_in(images.parent, given, make, products=[images], made_by=())
     return replace(footage, image_path=images)
-
-
-def ffmpeg(*words: str) -> None:
-    """Run ffmpeg."""
-    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words], check=True)
-
-
-def known_truth(material: Material) -> Truth:
-    """What is truly known of the cameras."""
-    if material.poses is None:
-        return Truth(None, None, "no poses known")
-    if material.camera is None:
-        return Truth(None, material.poses, "true poses, no epipolar error")
-    return Truth((material.poses, material.camera), material.poses, "true poses")
-
-
-def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
-    """The same, with the reference's model for what is not known."""
-    poses = model_poses(model, num_frames)
-    geometry = (poses, next(iter(model.cameras.values())))
-    if truth.poses is None:
-        return Truth(geometry, poses, f"errors against {REFERENCE}'s model")
-    return Truth(geometry, truth.poses, f"true poses; epipolar error against {REFERENCE}'s model")
-
-
-def reference_model(footage: Footage, folder: Path, settings: MapOptions, console: Console) -> Any:
-    """The model that stands for the truth where that is not known."""
-    console.print(f"{folder.name}: {REFERENCE} as the reference", markup=False)
-    run = run_frontend(REFERENCE, footage, folder / REFERENCE)
-    where = folder / f"{REFERENCE}-model"
-    mapper = measure_mapper(run.database, footage.image_path, where, settings)
-    if mapper.model is None:
-        raise ColmapAv1Error(f"{REFERENCE} makes no model, so there is no reference: see {where}")
-    return read_model(mapper.model)
 
 
 def measure_row(
@@ -407,114 +270,49 @@ def exact_by_span(
     return by_span
 
 
-def median(values: NDArray[np.float64]) -> float:
-    """The median; NaN where there is nothing."""
-    return quantile(values, 0.5)
+def track_figures(row: Row) -> dict[str, Value]:
+    """The figures of tracks, as `results/tracks.csv` names them."""
+    about = row.statistics
+    figures: dict[str, Value] = {"tracks": about.num_tracks}
+    for length, count in zip(render.LENGTHS, about.tracks_by_length.values(), strict=True):
+        figures[f"tracks_{length}"] = count
+    figures["keypoints_per_image"] = about.observations_per_image[0]
+    figures["covered"], figures["least_covered"] = about.coverage
+    for span, error in (row.epipolar or {}).items():
+        figures[f"epipolar_px_{span}"] = error
+    for span, (middle, most) in (row.exact or {}).items():
+        figures[f"exact_px_{span}"] = middle
+        figures[f"exact_px_of_90_{span}"] = most
+    return figures
 
 
-def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile; NaN where there is nothing."""
-    return float(np.quantile(values, share)) if len(values) else float("nan")
-
-
-def tracks_table(rows: Sequence[Row]) -> str:
-    """Markdown table of the tracks."""
-    spans = " / ".join(map(str, SPANS))
-    header = ["tracks", "tracks", *(f"of {c}" for c in length_classes(rows)), "keypoints an image"]
-    header += ["covered (least)", f"epipolar px at {spans} frames"]
-    exact = any(row.exact for row in rows)
-    if exact:
-        header += [f"exact px at {spans} frames: median", "90 %"]
-    body = []
-    for row in rows:
-        s = row.statistics
-        cells = [row.frontend, f"{s.num_tracks:,}"]
-        cells += [f"{n:,}" for n in s.tracks_by_length.values()]
-        cells.append(f"{s.observations_per_image[0]:,.0f}")
-        cells.append(f"{s.coverage[0]:.0%} ({s.coverage[1]:.0%})")
-        cells.append(by_span(row.epipolar))
-        if exact and row.exact:
-            cells.append(by_span({span: e[0] for span, e in row.exact.items()}))
-            cells.append(by_span({span: e[1] for span, e in row.exact.items()}))
-        body.append(cells)
-    return markdown(header, body)
-
-
-def models_table(rows: Sequence[Row]) -> str:
-    """Markdown table of the models and of what they take, beside the reference's."""
-    header = ["models", "images", "ATE (share of extent)", "rotation", "error px mean / median"]
-    header += ["points", "all tracks: points", "their error px"]
-    header += ["front-end CPU s (wall)", "memory", "mapper CPU s (wall)", "all tracks CPU s (wall)"]
-    reference = next((row for row in rows if row.frontend == REFERENCE), None)
-    base_points = reference.model.num_points if reference and reference.model else None
-    base_cpu = reference.run.cpu_seconds if reference else None
-    body = []
-    for row in rows:
-        memory = row.run.peak_memory
-        cost = [
-            f"{took(row.run.cpu_seconds, row.run.seconds)}{share(row.run.cpu_seconds, base_cpu)}",
-            f"{memory / 2**20:.0f} MB" if memory is not None else "-",
-            took(row.mapper.cpu_seconds, row.mapper.seconds) if row.mapper else "-",
-        ]
-        if row.model is None:
-            body.append([row.frontend, "no model", *["-"] * 6, *cost, "-"])
-            continue
-        model, errors, dense = row.model, row.pose_errors, row.dense
-        cells = [row.frontend, f"{model.num_registered} of {row.statistics.num_images}"]
-        if errors is None or (row is reference and not row.poses_are_true):
-            cells += ["-", "-"]
-        else:
-            cells.append(f"{errors.ate:.4f} ({errors.ate / errors.extent:.2%})")
-            cells.append(f"{errors.rotation:.3f}°")
-        cells.append(f"{model.mean_error:.3f} / {model.median_error:.3f}")
-        cells.append(f"{model.num_points:,}{times(model.num_points, base_points)}")
-        if dense is None:
-            body.append([*cells, "-", "-", *cost, "-"])
-            continue
-        made, figures = dense
-        cells.append(f"{figures.num_points:,}{times(figures.num_points, base_points)}")
-        cells.append(f"{figures.mean_error:.3f} / {figures.median_error:.3f}")
-        cost.append(took(made.cpu_seconds, made.seconds))
-        body.append([*cells, *cost])
-    return markdown(header, body)
-
-
-def took(cpu_seconds: float, seconds: float | dict[str, float]) -> str:
-    """CPU time and, behind it, wall time."""
-    wall = sum(seconds.values()) if isinstance(seconds, dict) else seconds
-    return f"{cpu_seconds:.1f} ({wall:.1f})"
-
-
-def share(value: float, base: float | None) -> str:
-    """What part of the reference's this is."""
-    return f", {value / base:.1%}" if base else ""
-
-
-def times(value: int, base: int | None) -> str:
-    """How many times the reference's this is."""
-    return f", {value / base:.1f}x" if base else ""
-
-
-def length_classes(rows: Sequence[Row]) -> list[str]:
-    """Names of the classes of track length."""
-    lows = list(rows[0].statistics.tracks_by_length) if rows else []
-    tops = [str(high - 1) for high in lows[1:]]
-    return [f"{low}-{top}" for low, top in zip(lows, tops, strict=False)] + [f"{lows[-1]}+"] * bool(
-        lows
-    )
-
-
-def by_span(values: dict[int, float] | None) -> str:
-    """Pixels by span in one cell."""
-    if values is None:
-        return "-"
-    return " / ".join("-" if np.isnan(v) else f"{v:.2f}" for v in values.values())
-
-
-def markdown(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; all but the first column to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *body]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+def model_figures_of(row: Row, name: str) -> dict[str, Value]:
+    """The figures of the model and of what it took, as `results/tracks.csv` names them."""
+    memory = row.run.peak_memory
+    figures: dict[str, Value] = {
+        "frontend_cpu_s": row.run.cpu_seconds,
+        "frontend_s": sum(row.run.seconds.values()),
+        "peak_memory_mb": memory / 2**20 if memory is not None else None,
+    }
+    if row.mapper is not None:
+        figures["mapper_cpu_s"], figures["mapper_s"] = row.mapper.cpu_seconds, row.mapper.seconds
+        figures["registered"] = row.model.num_registered if row.model is not None else 0
+    if row.model is not None:
+        figures["points"] = row.model.num_points
+        figures["error_px_mean"] = row.model.mean_error
+        figures["error_px_median"] = row.model.median_error
+    # The reference has no error against itself.
+    if row.pose_errors is not None and (name != REFERENCE or row.poses_are_true):
+        figures["ate"] = row.pose_errors.ate
+        figures["ate_of_extent"] = row.pose_errors.ate / row.pose_errors.extent
+        figures["rotation_deg"] = row.pose_errors.rotation
+    if row.dense is not None:
+        made, dense = row.dense
+        figures["all_tracks_points"] = dense.num_points
+        figures["all_tracks_error_px_mean"] = dense.mean_error
+        figures["all_tracks_error_px_median"] = dense.median_error
+        figures["all_tracks_cpu_s"], figures["all_tracks_s"] = made.cpu_seconds, made.seconds
+    return figures
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import argparse
 import shutil
 import sqlite3
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,10 +22,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+import render
+from clips import ENCODING, EXAMPLES, SEQUENCES, camera_options, ffmpeg, ffmpeg_input, is_there
 from numpy.typing import NDArray
+from results import Value, add_results, read_rows, save
 
 from colmap_av1 import CameraOptions, ColmapAv1Error, MatchOptions, match
 from colmap_av1.database.reading import image_ids_from_pair_id
@@ -35,13 +36,7 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import DensityOptions, VerifyOptions
 
-EXAMPLES = Path(__file__).resolve().parents[1]
-SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 NAMES = ("scene", "street", "log_building", "ditch", "shelfbox")
-ENCODING = (
-    "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
-    "-pix_fmt yuv420p -an"
-)
 
 
 @dataclass(frozen=True)
@@ -68,28 +63,28 @@ def main() -> int:
     parser.add_argument(
         "--sequences", nargs="+", choices=NAMES, default=NAMES, metavar="NAME", help=" ".join(NAMES)
     )
+    add_results(parser, "verification")
     arguments = parser.parse_args()
     if arguments.repeats < 2:
         parser.error("--repeats starts at 2: COLMAP is compared with itself")
     failed = False
-    print(
-        "| clip | pairs | matches | ours, CPU s | COLMAP, CPU s | times | same config | "
-        "inlier Jaccard mean | >= 0.98 | COLMAP with itself: config | mean | >= 0.98 |"
-    )
-    print("|---|" + "---:|" * 11)
     with ExitStack() as stack:
         cache = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cache.mkdir(parents=True, exist_ok=True)
         for name in arguments.sequences:
-            if name != "scene" and not (SEQUENCES / name).is_dir():
+            if not is_there(name):
                 print(f"{name}: not measured, {SEQUENCES / name} is absent", file=sys.stderr)
                 continue
             try:
                 database = fill_database(name, arguments.preset, cache)
-                print(measure(name, database, arguments.repeats, cache), flush=True)
+                about: dict[str, Value] = {"clip": name, "preset": arguments.preset}
+                row = {**about, **measure(database, arguments.repeats, cache)}
+                save(arguments.results, [row], ("clip", "preset"))
             except ColmapAv1Error as error:
                 print(f"error: {name}: {error}", file=sys.stderr)
                 failed = True
+    rows = read_rows(arguments.results)
+    print(render.verification([row for row in rows if row["clip"] in arguments.sequences]), end="")
     return 1 if failed else 0
 
 
@@ -102,44 +97,41 @@ def fill_database(name: str, preset: str, cache: Path) -> Path:
     if name != "scene":
         sequence = read_sequence(SEQUENCES / name)
         if sequence.camera is not None:
-            camera = CameraOptions(
-                camera_model=sequence.camera.model_name,
-                camera_params=",".join(map(str, sequence.camera.params)),
-            )
+            camera = camera_options(sequence.camera)
         video = cache / f"{name}.mp4"
         if not video.exists():
-            encode(sequence.source, sequence.fps, video)
+            unfinished = video.with_suffix(".part.mp4")
+            source = ffmpeg_input(sequence.source, sequence.fps)
+            ffmpeg(*source, *ENCODING.split(), str(unfinished))
+            unfinished.replace(video)
     options = MatchOptions(camera=camera, density=DensityOptions(preset=preset))
     match(database, video, options=options)
     return database
 
 
-def encode(source: Path, fps: float, video: Path) -> None:
-    """Encode a clip or a folder of numbered images as AV1."""
-    words = ["-i", str(source)]
-    if source.is_dir():
-        first = min(source.iterdir())
-        pattern = source / f"%0{len(first.stem)}d{first.suffix}"
-        words = ["-framerate", str(fps), "-start_number", first.stem, "-i", str(pattern)]
-    unfinished = video.with_suffix(".part.mp4")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *words, *ENCODING.split()]
-    subprocess.run([*command, str(unfinished)], check=True)
-    unfinished.replace(video)
-
-
-def measure(name: str, database: Path, repeats: int, cache: Path) -> str:
-    """A row of the table."""
+def measure(database: Path, repeats: int, cache: Path) -> dict[str, Value]:
+    """Figures of a database."""
     log = cache / "log.txt"
     ours, theirs = [], []
     for turn in range(repeats):
         ours.append(run_measured(verify_here, database, log=log).result)
         theirs.append(run_measured(verify_with_colmap, database, turn % 2, log=log).result)
-    cpu = [statistics.median(run.cpu_seconds for run in runs) for runs in (ours, theirs)]
     with sqlite3.connect(database) as connection:
         pairs, matches = connection.execute("SELECT COUNT(*), SUM(rows) FROM matches").fetchone()
-    figures = [*agreement(ours[0], theirs[0]), *agreement(theirs[1], theirs[0])]
-    cells = [name, pairs, f"{matches:,}", *(f"{s:.2f}" for s in cpu), f"{cpu[1] / cpu[0]:.1f}"]
-    return "| " + " | ".join(map(str, [*cells, *(f"{figure:.4f}" for figure in figures)])) + " |"
+    same, inliers, inliers_of_98 = agreement(ours[0], theirs[0])
+    colmap_same, colmap_inliers, colmap_inliers_of_98 = agreement(theirs[1], theirs[0])
+    return {
+        "pairs": pairs,
+        "matches": matches,
+        "cpu_s": statistics.median(run.cpu_seconds for run in ours),
+        "colmap_cpu_s": statistics.median(run.cpu_seconds for run in theirs),
+        "same_config": same,
+        "inliers": inliers,
+        "inliers_of_98": inliers_of_98,
+        "colmap_same_config": colmap_same,
+        "colmap_inliers": colmap_inliers,
+        "colmap_inliers_of_98": colmap_inliers_of_98,
+    }
 
 
 def verify_here(database: Path) -> Verified:

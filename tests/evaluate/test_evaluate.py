@@ -1,5 +1,6 @@
 """Front-ends and mapper of the comparison, and what they take."""
 
+import csv
 import os
 import signal
 import subprocess
@@ -240,11 +241,13 @@ def test_unknown_frontend(clip, tmp_path):
 @pytest.mark.slow
 def test_benchmark_prints_its_tables(tmp_path):
     script = EXAMPLES / "benchmarks" / "tracks.py"
+    results = tmp_path / "tracks.csv"
     words = ["--cache", tmp_path, "--sequences", "scene", "--frontends", "av1-sparse"]
+    words += ["--results", results, "--no_mapping"]
     done = subprocess.run(
-        [sys.executable, script, *words, "--no_mapping"], check=True, capture_output=True, text=True
+        [sys.executable, script, *words], check=True, capture_output=True, text=True
     )
-    header, _, row = done.stdout.strip().splitlines()[-3:]
+    header, _, row = [line for line in done.stdout.splitlines() if line.startswith("|")]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert len(cells) == header.count("|") - 1
     assert cells[0] == "av1-sparse"
@@ -252,3 +255,7 @@ def test_benchmark_prints_its_tables(tmp_path):
     assert sum(int(cell.replace(",", "")) for cell in cells[2:7]) == tracks > 1000
     exact = [float(value) for value in cells[-2].split("/")]
     assert all(0 < value < 0.5 for value in exact)
+    (kept,) = csv.DictReader(results.read_text().splitlines())
+    assert (int(kept["tracks"]), kept["frontend"]) == (tracks, "av1-sparse")
+    assert kept["commit"]
+    assert kept["machine"]

@@ -1,0 +1,230 @@
+"""The clips that benchmarks measure on: their videos, known cameras and reference models."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+from rich.console import Console
+
+from colmap_av1 import CameraOptions, ColmapAv1Error, MapOptions
+from colmap_av1.evaluate import (
+    Footage,
+    measure_mapper,
+    model_poses,
+    prepare_footage,
+    read_sequence,
+    run_frontend,
+)
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
+
+EXAMPLES = Path(__file__).resolve().parents[1]
+SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
+REFERENCE = "sift-exhaustive"
+# What `colmap-av1 encode --encoder libaom` uses.
+ENCODING = (
+    "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
+    "-pix_fmt yuv420p -an"
+)
+
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sequence and how it is used; `image_step` as `every` in ImageOptions."""
+
+    name: str
+    image_step: int = 1
+    forward_motion: bool = False
+
+
+CASES = (
+    Case("scene"),
+    Case("street", forward_motion=True),
+    Case("shelfbox"),
+    Case("kitchen", image_step=2),
+    Case("log_building"),
+    Case("ditch"),
+)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a case is measured on.
+
+    `transfer` is the rendered clip's exact ground truth; `source` is ffmpeg's input of the pictures
+    the video was made from, where these are not rendered.
+    """
+
+    video: Path
+    num_frames: int
+    camera: Any | None
+    poses: Poses | None
+    transfer: Callable[..., Any] | None = None
+    source: tuple[str, ...] | None = None
+
+    @property
+    def intrinsics(self) -> CameraOptions:
+        """The camera where it is known; no camera options where it is not."""
+        return CameraOptions() if self.camera is None else camera_options(self.camera)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The ground truth of epipolar errors and of poses, and a description of both."""
+
+    geometry: tuple[Poses, Any] | None
+    poses: Poses | None
+    about: str
+
+
+def camera_options(camera: Any) -> CameraOptions:
+    """The options for a known camera of pycolmap."""
+    params = ",".join(map(str, camera.params))
+    return CameraOptions(camera_model=camera.model.name, camera_params=params)
+
+
+def is_there(name: str) -> bool:
+    """Whether a clip can be measured here; sequences may be absent, the rendered clip is not."""
+    return name == "scene" or (SEQUENCES / name).is_dir()
+
+
+def load_render_scene() -> Any:
+    """The script that rendered the example clip, as a module."""
+    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["render_scene"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def rendered_clip() -> Material:
+    """The example clip with its exact ground truth."""
+    render_scene = load_render_scene()
+    scene = render_scene.build_scene()
+    camera = pycolmap.Camera(
+        model="PINHOLE",
+        width=scene.width,
+        height=scene.height,
+        params=[scene.fx, scene.fy, scene.cx, scene.cy],
+    )
+    return Material(
+        video=EXAMPLES / "scene.mp4",
+        num_frames=len(scene.cam_from_world),
+        camera=camera,
+        poses=scene.cam_from_world,
+        transfer=functools.partial(render_scene.transfer, scene),
+    )
+
+
+def real_sequence(case: Case, folder: Path, console: Console) -> Material:
+    """A sequence of ../shared, encoded as AV1."""
+    sequence = read_sequence(SEQUENCES / case.name)
+    source = sequence.source
+    words = ffmpeg_input(source, sequence.fps)
+    video = folder / "video" / "video.mp4"
+
+    def encode() -> dict[str, Any]:
+        console.print(f"{case.name}: encoding", markup=False)
+        ffmpeg(*words, *ENCODING.split(), str(video))
+        return {"bytes": video.stat().st_size}
+
+    pictures = sorted(source.iterdir()) if source.is_dir() else [source]
+    given = (words, ENCODING, [file_digest(p) for p in pictures])
+    run_stage_in(video.parent, given, encode, products=[video], made_by=())
+    return Material(
+        video, sequence.num_frames, sequence.camera, sequence.cam_from_world, source=words
+    )
+
+
+def material_of(case: Case, folder: Path, console: Console) -> Material:
+    """The rendered clip, or a sequence that `folder` keeps encoded."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return rendered_clip() if case.name == "scene" else real_sequence(case, folder, console)
+
+
+def footage_of(
+    case: Case, material: Material, folder: Path, camera: CameraOptions | None = None
+) -> Footage:
+    """The images that all front-ends get; `camera` where it is not that of the material."""
+    return prepare_footage(
+        material.video,
+        folder / "footage",
+        num_frames=material.num_frames,
+        image_step=case.image_step,
+        camera=material.intrinsics if camera is None else camera,
+    )
+
+
+def mapper_options(case: Case, material: Material) -> MapOptions:
+    """How the mapper treats the case: known intrinsics are kept."""
+    return MapOptions(refine_intrinsics=material.camera is None, forward_motion=case.forward_motion)
+
+
+def ffmpeg_input(source: Path, fps: float) -> tuple[str, ...]:
+    """How ffmpeg opens a clip, or a folder of images with consecutive numbers as names."""
+    if not source.is_dir():
+        return ("-i", str(source))
+    first = min(source.iterdir())
+    pattern = source / f"%0{len(first.stem)}d{first.suffix}"
+    return ("-framerate", str(fps), "-start_number", str(int(first.stem)), "-i", str(pattern))
+
+
+def ffmpeg(*words: str) -> None:
+    """Run ffmpeg."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y", *words]
+    subprocess.run(command, check=True)
+
+
+def known_truth(material: Material) -> Truth:
+    """What is truly known of the cameras."""
+    if material.poses is None:
+        return Truth(None, None, "no poses known")
+    if material.camera is None:
+        return Truth(None, material.poses, "true poses, no epipolar error")
+    return Truth((material.poses, material.camera), material.poses, "true poses")
+
+
+def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
+    """The same, with the reference's model for what is not known."""
+    poses = model_poses(model, num_frames)
+    geometry = (poses, next(iter(model.cameras.values())))
+    if truth.poses is None:
+        return Truth(geometry, poses, f"errors against {REFERENCE}'s model")
+    return Truth(geometry, truth.poses, f"true poses; epipolar error against {REFERENCE}'s model")
+
+
+def reference_model(footage: Footage, folder: Path, settings: MapOptions, console: Console) -> Any:
+    """The model that stands for the ground truth where that is not known."""
+    console.print(f"{folder.name}: {REFERENCE} as the reference", markup=False)
+    run = run_frontend(REFERENCE, footage, folder / REFERENCE)
+    where = folder / f"{REFERENCE}-model"
+    mapper = measure_mapper(run.database, footage.image_path, where, settings)
+    if mapper.model is None:
+        raise ColmapAv1Error(f"{REFERENCE} makes no model, so there is no reference: see {where}")
+    return read_model(mapper.model)
+
+
+def median(values: NDArray[np.float64]) -> float:
+    """The median; NaN where there is nothing."""
+    return quantile(values, 0.5)
+
+
+def quantile(values: NDArray[np.float64], share: float) -> float:
+    """A quantile; NaN where there is nothing."""
+    return float(np.quantile(values, share)) if len(values) else float("nan")

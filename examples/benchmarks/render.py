@@ -1,0 +1,357 @@
+"""Put the tables of `results/*.csv` into the documents that ask for them.
+
+python examples/benchmarks/render.py
+python examples/benchmarks/render.py --check
+
+A document asks by the lines `<!-- table NAME WORDS -->` and `<!-- end of table -->`; what stands
+between them is replaced. `--check` changes nothing and fails where a document is not up to date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).resolve().parent
+DOCUMENTS = (BENCHMARKS.parents[1] / "README.md", BENCHMARKS / "README.md")
+MARKED = re.compile(r"(<!-- table ([^\n]+) -->\n).*?(<!-- end of table -->\n)", re.DOTALL)
+SPANS = (1, 2, 4, 8, 16)
+LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
+REFERENCE = "sift-exhaustive"
+
+Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its heading, and its cell made of a row."""
+
+    heading: str
+    cell: Callable[[Row], str]
+
+
+def main() -> int:
+    """Bring the documents up to date, or say which are not."""
+    parser = argparse.ArgumentParser(description="Put tables of results into the documents.")
+    parser.add_argument("--check", action="store_true", help="change nothing, fail where needed")
+    check = parser.parse_args().check
+    stale = [path for path in DOCUMENTS if rendered(path.read_text()) != path.read_text()]
+    for path in stale:
+        if check:
+            print(f"{path}: not up to date: python examples/benchmarks/render.py", file=sys.stderr)
+        else:
+            path.write_text(rendered(path.read_text()))
+    return 1 if check and stale else 0
+
+
+def rendered(document: str) -> str:
+    """A document with its tables made anew."""
+
+    def fill(found: re.Match[str]) -> str:
+        name, *words = found[2].split()
+        with (BENCHMARKS / "results" / f"{name.partition('.')[0]}.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        return f"{found[1]}\n{TABLES[name](rows, *words)}\n{found[3]}"
+
+    return MARKED.sub(fill, document)
+
+
+def number(row: Row, name: str, spelling: str, unit: str = "") -> str:
+    """A cell of a figure; "-" where it was not measured."""
+    return f"{float(row[name]):{spelling}}{unit}" if row.get(name) else "-"
+
+
+def figure(heading: str, name: str, spelling: str, unit: str = "") -> Column:
+    """A column of one figure."""
+    return Column(heading, lambda row: number(row, name, spelling, unit))
+
+
+def words(heading: str, *names: str) -> Column:
+    """A column of one or several words."""
+    return Column(heading, lambda row: ", ".join(row[name] for name in names if row[name]))
+
+
+def as_written(name: str) -> Column:
+    """A column under its name in the file; large whole numbers get separators."""
+
+    def cell(row: Row) -> str:
+        value = row[name]
+        return f"{int(value):,}" if value.isdigit() else value or "-"
+
+    return Column(name.replace("_", " "), cell)
+
+
+def share_of(row: Row, name: str, base: Row | None, spelling: str) -> str:
+    """A figure's ratio to that of another row, behind a comma; nothing where there is none."""
+    if not row.get(name) or base is None or not base.get(name):
+        return ""
+    return f", {float(row[name]) / float(base[name]):{spelling}}"
+
+
+def markdown(columns: Sequence[Column], rows: Iterable[Row], left: int = 1) -> str:
+    """A Markdown table, all but the first columns aligned to the right."""
+    lines = [[column.heading for column in columns]]
+    lines.append(["---"] * left + ["---:"] * (len(columns) - left))
+    lines += [[column.cell(row) for column in columns] for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def measured_at(rows: Sequence[Row], name: str = "") -> str:
+    """Where the rows were measured, a line; with the rows' names where that differs."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        places.setdefault((row["commit"], row["machine"]), []).append(row.get(name, ""))
+    if len(places) == 1:
+        ((commit, machine),) = places
+        return f"Commit {commit}; {machine}.\n"
+    spelled = (f"{', '.join(dict.fromkeys(n))}: commit {c}; {m}" for (c, m), n in places.items())
+    return ". ".join(spelled) + ".\n"
+
+
+def tracks(rows: list[Row], sequence: str) -> str:
+    """Tracks of the front-ends on a sequence, and the models mapped from them."""
+    rows = [row for row in rows if row["sequence"] == sequence]
+    first = rows[0]
+    about = (
+        f"{first['num_images']} images of {first['num_frames']} frames; intrinsics "
+        f"{first['intrinsics']}; {first['measured_against']}."
+    )
+    tables = [about, "", markdown(track_columns(rows), rows)]
+    if any(row.get("registered") for row in rows):
+        tables.append(markdown(model_columns(rows), rows))
+    return "\n".join([*tables, measured_at(rows, "frontend")])
+
+
+def by_span(row: Row, name: str) -> str:
+    """Pixels by frames between two observations, in one cell."""
+    cells = [number(row, f"{name}_{span}", ".2f") for span in SPANS]
+    return "-" if set(cells) == {"-"} else " / ".join(cells)
+
+
+def track_columns(rows: Sequence[Row]) -> list[Column]:
+    """The columns that describe tracks."""
+    spans = " / ".join(map(str, SPANS))
+    columns = [
+        words("tracks", "frontend"),
+        figure("tracks", "tracks", ",.0f"),
+        *(figure(f"of {length}", f"tracks_{length}", ",.0f") for length in LENGTHS),
+        figure("keypoints an image", "keypoints_per_image", ",.0f"),
+        Column(
+            "covered (least)",
+            lambda row: f"{number(row, 'covered', '.0%')} ({number(row, 'least_covered', '.0%')})",
+        ),
+        Column(f"epipolar px at {spans} frames", lambda row: by_span(row, "epipolar_px")),
+    ]
+    if any(row.get("exact_px_1") for row in rows):
+        heading = f"exact px at {spans} frames: median"
+        columns.append(Column(heading, lambda row: by_span(row, "exact_px")))
+        columns.append(Column("90 %", lambda row: by_span(row, "exact_px_of_90")))
+    return columns
+
+
+def model_columns(rows: Sequence[Row]) -> list[Column]:
+    """The columns that describe models and what they take, beside the reference's."""
+    base = next((row for row in rows if row["frontend"] == REFERENCE), None)
+
+    def took(row: Row, name: str) -> str:
+        seconds = number(row, f"{name}_cpu_s", ".1f")
+        return seconds if seconds == "-" else f"{seconds} ({number(row, f'{name}_s', '.1f')})"
+
+    def ate(row: Row) -> str:
+        if not row.get("ate"):
+            return "-"
+        return f"{number(row, 'ate', '.4f')} ({number(row, 'ate_of_extent', '.2%')})"
+
+    def error(row: Row, name: str) -> str:
+        mean = number(row, f"{name}_mean", ".3f")
+        return mean if mean == "-" else f"{mean} / {number(row, f'{name}_median', '.3f')}"
+
+    def points(row: Row, name: str) -> str:
+        base_points = None if base is None else {name: base["points"]}
+        times = share_of(row, name, base_points, ".1f")
+        return number(row, name, ",.0f") + (f"{times}x" if times else "")
+
+    def images(row: Row) -> str:
+        known = row.get("registered", "") not in ("", "0")
+        return f"{row['registered']} of {row['num_images']}" if known else "no model"
+
+    return [
+        words("models", "frontend"),
+        Column("images", images),
+        Column("ATE (share of extent)", ate),
+        figure("rotation", "rotation_deg", ".3f", "°"),
+        Column("error px mean / median", lambda row: error(row, "error_px")),
+        Column("points", lambda row: points(row, "points")),
+        Column("all tracks: points", lambda row: points(row, "all_tracks_points")),
+        Column("their error px", lambda row: error(row, "all_tracks_error_px")),
+        Column(
+            "front-end CPU s (wall)",
+            lambda row: took(row, "frontend") + share_of(row, "frontend_cpu_s", base, ".1%"),
+        ),
+        figure("memory", "peak_memory_mb", ".0f", " MB"),
+        Column("mapper CPU s (wall)", lambda row: took(row, "mapper")),
+        Column("all tracks CPU s (wall)", lambda row: took(row, "all_tracks")),
+    ]
+
+
+def dense_points(rows: list[Row]) -> str:
+    """Points of dense models and the errors of their depths."""
+
+    def points(row: Row) -> str:
+        base = {"points": row["points_of_model"]}
+        times = share_of(row, "points", base, ".1f")
+        return number(row, "points", ",.0f") + (f"{times}x" if times else "")
+
+    columns = [
+        words("sequence, tracks", "sequence", "tracks"),
+        Column("points", points),
+        figure("observations each", "observations_per_point", ".1f"),
+        figure("error px", "error_px", ".3f"),
+        figure("depth off by, median", "depth_error", ".2%"),
+        figure("> 5 %", "above_5_percent", ".1%"),
+        figure("> 10 %", "above_10_percent", ".1%"),
+        figure("checked", "checked", ",.0f"),
+        figure("CPU s", "cpu_s", ".1f"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
+
+
+# The steps of `end_to_end.py`, and the one that each is compared with.
+SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
+SIFT_MODEL = "SIFT sequential: model"
+COMPARED_WITH = {
+    "match: database": SIFT_DATABASE,
+    "match: mapper": SIFT_MAPPER,
+    "reconstruct: dense model": SIFT_MODEL,
+    "densify on SIFT's model": SIFT_MODEL,
+}
+
+
+def end_to_end(rows: list[Row]) -> str:
+    """All steps from a video to a model, as factors of SIFT's."""
+    by_way = {(row["sequence"], row["way"]): row for row in rows}
+
+    def beside(heading: str, name: str, spelling: str) -> Column:
+        def cell(row: Row) -> str:
+            base = by_way.get((row["sequence"], COMPARED_WITH.get(row["way"], "")))
+            times = share_of(row, name, base, ".2f").lstrip(", ")
+            return number(row, name, spelling) + (f" ({times}x)" if times else "")
+
+        return Column(heading, cell)
+
+    columns = [
+        words("sequence, way", "sequence", "way"),
+        beside("images", "images", ".0f"),
+        beside("points", "points", ",.0f"),
+        beside("error px", "error_px", ".3f"),
+        beside("ATE", "ate", ".4f"),
+        beside("seconds", "seconds", ".1f"),
+        beside("CPU seconds", "cpu_s", ".1f"),
+        figure("peak memory", "peak_memory_mb", ".0f", " MB"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
+
+
+def end_to_end_summary(rows: list[Row]) -> str:
+    """SIFT's model and that of `reconstruct` on each sequence."""
+    ways = {SIFT_MODEL: "SIFT, COLMAP's mapper", "reconstruct: dense model": "`reconstruct`"}
+    rows = [row for row in rows if row["way"] in ways]
+    columns = [
+        Column("clip", lambda row: f"`{row['sequence']}`" if row["way"] == SIFT_MODEL else ""),
+        Column("model", lambda row: ways[row["way"]]),
+        figure("images", "images", ".0f"),
+        figure("points", "points", ",.0f"),
+        figure("reprojection error", "error_px", ".3f", " px"),
+        figure("camera centres", "ate", ".4f"),
+        figure("seconds", "seconds", ".0f"),
+        figure("CPU seconds", "cpu_s", ".0f"),
+    ]
+    return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'sequence')}"
+
+
+def read_motion(rows: list[Row], threads: str) -> str:
+    """Times of reading motion and of decoding: CPU time of one thread, real time of more."""
+    rows = [row for row in rows if row["threads"] == threads]
+    gain = [figure("gain", "gain", ".2f")] if threads != "1" else []
+    parse = [figure("parse", "parse_ms", ".3f")] if threads == "1" else []
+
+    def ratio(row: Row) -> str:
+        return f"{float(row['dav1d_ms']) / float(row['read_motion_ms']):.2f}"
+
+    columns = [
+        words("clip", "clip"),
+        figure("Mbit", "megabits", ".1f"),
+        figure("read_motion", "read_motion_ms", ".3f"),
+        figure("dav1d", "dav1d_ms", ".3f"),
+        Column("ratio", ratio),
+        *gain,
+        *parse,
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
+def dav1d_profile(rows: list[Row]) -> str:
+    """Shares of dav1d's time in per cent, and what a reader that only parses could gain."""
+    parts = ("symbols", "coefficients", "modes", "prediction", "pictures")
+    columns = [
+        words("clip", "clip"),
+        *(figure(part, part, ".1f") for part in parts),
+        Column("at most", lambda row: f"{100 / (100 - float(row['pictures'])):.2f}"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
+def verification(rows: list[Row]) -> str:
+    """Verification of pairs beside COLMAP's."""
+
+    def ratio(row: Row) -> str:
+        return f"{float(row['colmap_cpu_s']) / float(row['cpu_s']):.1f}x"
+
+    columns = [
+        words("clip", "clip"),
+        figure("pairs", "pairs", ".0f"),
+        figure("matches", "matches", ",.0f"),
+        figure("ours, CPU s", "cpu_s", ".2f"),
+        figure("COLMAP, CPU s", "colmap_cpu_s", ".2f"),
+        Column("ratio", ratio),
+        figure("same config", "same_config", ".1%"),
+        figure("inliers", "inliers", ".1%"),
+        figure(">= 0.98", "inliers_of_98", ".1%"),
+        figure("COLMAP with itself: config", "colmap_same_config", ".1%"),
+        figure("inliers", "colmap_inliers", ".1%"),
+        figure(">= 0.98", "colmap_inliers_of_98", ".1%"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
+def plain(rows: list[Row]) -> str:
+    """A table whose columns are those of the file, in its words."""
+    names = [name for name in rows[0] if name not in ("commit", "machine")]
+    columns = [as_written(name) for name in names]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, names[0])}"
+
+
+TABLES: dict[str, Callable[..., str]] = {
+    "tracks": tracks,
+    "dense_points": dense_points,
+    "end_to_end": end_to_end,
+    "end_to_end.summary": end_to_end_summary,
+    "read_motion": read_motion,
+    "dav1d_profile": dav1d_profile,
+    "verification": verification,
+    "read_memory": plain,
+    "long_video": plain,
+    "image_pairs": plain,
+    "appended": plain,
+    "camera_model": plain,
+    "comparison": plain,
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""The files of results: a script measures, puts its rows into `results/NAME.csv`, prints its table.
+
+`render.py` puts the tables of all files into the documents.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+Value = str | float | int | None
+
+
+def add_results(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add the option for the CSV file that a script writes."""
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=RESULTS / f"{name}.csv",
+        metavar="CSV",
+        help="file that gets the figures; rows of what is not measured again stay",
+    )
+
+
+def spelled(row: Mapping[str, Value]) -> dict[str, str]:
+    """A row as a CSV file holds it: six significant digits, nothing for what was not measured."""
+    return {name: _spell(value) for name, value in row.items()}
+
+
+def save(path: Path, rows: Sequence[Mapping[str, Value]], key: Sequence[str]) -> None:
+    """Put rows into a CSV file, each in place of the one with the same values of `key`.
+
+    Every row gets the commit of the checkout and the machine as its last columns.
+    """
+    kept = {tuple(row[name] for name in key): row for row in read_rows(path)}
+    where = {"commit": commit(), "machine": machine()}
+    for row in rows:
+        new = spelled({**row, **where})
+        kept[tuple(new[name] for name in key)] = new
+    columns = dict.fromkeys(name for row in kept.values() for name in row if name not in where)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*columns, *where], restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(kept.values())
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file; none where there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def commit() -> str:
+    """The commit of this checkout, marked where it has been changed since."""
+    words = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def machine() -> str:
+    """Number of cores, and the processor."""
+    name = platform.processor() or platform.machine()
+    cpus = Path("/proc/cpuinfo")
+    if cpus.is_file():
+        models = [s for s in cpus.read_text().splitlines() if s.startswith("model name")]
+        name = models[0].partition(":")[2].strip() if models else name
+    return f"{os.cpu_count()} cores, {name}"
+
+
+def _spell(value: Value) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
