@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,11 +67,46 @@ def test_options_exist(path: Path) -> None:
 
 def test_options_are_found() -> None:
     """What the other test looks at is there."""
-    assert len(uses(PROJECT / "README.md")) > 20
+    assert ("match", "--num_images") in uses(PROJECT / "README.md")
+    assert len(uses(PROJECT / "README.md") + uses(PROJECT / "examples" / "README.md")) > 20
     assert ("match", "--every") in uses(PROJECT / "examples" / "pipelines" / "README.md")
     assert ("match", "--camera_model") in uses(PROJECT / "examples/pipelines/nerfstudio.sh")
     assert ("export", "--output") in uses(PROJECT / "examples" / "pipelines" / "hloc.sh")
     assert all(uses(script) for script in SCRIPTS)
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for path in DOCUMENTS:
+        for target, anchor in re.findall(r"\]\(([\w./]*)(?:#([\w-]+))?\)", path.read_text()):
+            file = path.parent / target if target else path
+            assert file.exists(), f"{path}: {target}"
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", file.read_text(), flags=re.MULTILINE)
+                slugs = [re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings]
+                assert anchor in slugs, f"{path}: {target}#{anchor}"
+
+
+def test_tables_are_those_of_the_results() -> None:
+    """The documents hold what `render.py` makes of the CSV files."""
+    script = PROJECT / "examples" / "benchmarks" / "render.py"
+    command = [sys.executable, script, "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_results_take_the_place_of_those_of_the_same_clip(tmp_path: Path) -> None:
+    source = PROJECT / "examples" / "benchmarks" / "results.py"
+    spec = importlib.util.spec_from_file_location("benchmark_results", source)
+    assert spec is not None
+    assert spec.loader is not None
+    results = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(results)
+    file = tmp_path / "new" / "figures.csv"
+    results.save(file, [{"clip": "a", "px": 1 / 3}, {"clip": "b", "px": None}], ["clip"])
+    results.save(file, [{"clip": "b", "px": float("nan"), "pairs": 7}], ["clip"])
+    rows = results.read_rows(file)
+    assert [[*row.values()][:3] for row in rows] == [["a", "0.333333", ""], ["b", "", "7"]]
+    assert all(row["commit"] and row["machine"].endswith(results.machine()) for row in rows)
 
 
 def test_loose_options_of_documents_exist() -> None:

@@ -259,7 +259,7 @@ def end_to_end(rows: list[Row]) -> str:
 
 def end_to_end_summary(rows: list[Row]) -> str:
     """SIFT's model and that of `reconstruct` on each sequence."""
-    ways = {SIFT_MODEL: "SIFT, COLMAP's mapper", "reconstruct: dense model": "`reconstruct`"}
+    ways = {SIFT_MODEL: "SIFT", "reconstruct: dense model": "`reconstruct`"}
     rows = [row for row in rows if row["way"] in ways]
     columns = [
         Column("clip", lambda row: f"`{row['sequence']}`" if row["way"] == SIFT_MODEL else ""),
