@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, ModelError, cannot_write
-from colmap_av1.images.choosing import check_frame_list, choose_images
+from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import size_of_images
 from colmap_av1.model.colmap_model import (
     ModelImage,
@@ -21,18 +21,22 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
+from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model
 from colmap_av1.model.track_points import (
     LEAST_AGREEING,
     Colours,
+    MedianColours,
     chaining_for_points,
+    cloud_of,
+    mean_error,
     seen_in,
-    to_model_points,
     triangulate_tracks,
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
-from colmap_av1.options import DensifyOptions
-from colmap_av1.tracks.tracks import scale_tracks
+from colmap_av1.options import DensifyOptions, MatchOptions
+from colmap_av1.tracks.tracks import Tracks, scale_tracks
 from colmap_av1.tracks.video_tracks import (
+    VideoSource,
     decoded_pictures,
     open_source,
     times_of_frames,
@@ -56,6 +60,8 @@ class DensifyReport:
         agreeing: share of these that agree with the poses.
         num_points: 3D points.
         num_model_points: those of the given model.
+        coverage: share of the images' cells of 16x16 pixels that visible points project into.
+        model_coverage: that of the given model's points.
         mean_error: mean reprojection error of the points in pixels.
         seconds: wall time of each stage.
         warnings: what the user should know.
@@ -68,6 +74,8 @@ class DensifyReport:
     agreeing: float
     num_points: int
     num_model_points: int
+    coverage: float
+    model_coverage: float
     mean_error: float
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -122,14 +130,7 @@ def densify(
             matching = chaining_for_points(options.match, options.triangulate)
             tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
             with clock.measure("choice"):
-                chosen = choose_images(
-                    tracked.tracks,
-                    options.match.images,
-                    existing=list(posed),
-                    folder=folder,
-                    times=lambda: times_of_frames(source, tracked.tracks.num_frames),
-                    decode=lambda: decoded_pictures(source, options.match),
-                )
+                chosen = _choose(tracked.tracks, source, list(posed), folder, options.match)
         images = [posed[name] for name in chosen.names]
         seen, view = seen_in(scale_tracks(tracked.tracks, size), chosen.frames)
         with clock.measure("points"):
@@ -141,30 +142,56 @@ def densify(
                 progress=progress,
             )
         agreeing = _agreement(model, points)
+        views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+        with clock.measure("cloud"):
+            xy = seen.xy[points.observation].astype(np.float64)
+            cloud = cloud_of(points, view, xy, views, options.triangulate)
         with clock.measure("colours"):
-            colours = Colours(seen, view, points, len(images))
+            colours: Colours | MedianColours = MedianColours(cloud, size, len(images))
+            if options.triangulate.points == "survey":
+                colours = Colours(seen, view, points, len(images))
             pictures = decoded_pictures(source, options.match)
             _add_pictures(colours, pictures, chosen.frames, seen.num_frames, progress)
+    with clock.measure("coverage"):
+        covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
-        xy = seen.xy[points.observation].astype(np.float64)
-        dense = to_model_points(points, colours.mean(), view, xy)
-        _write(output, cameras, images, dense)
+        _write(output, cameras, images, replace(cloud, rgb=colours.rgb()))
     return DensifyReport(
         output=output,
         model=model,
         num_images=len(images),
         num_tracks=points.num_tracks,
         agreeing=agreeing,
-        num_points=len(points.xyz),
+        num_points=len(cloud.xyz),
         num_model_points=reconstruction.num_points3D(),
-        mean_error=float(points.error.mean()),
+        coverage=covered,
+        model_coverage=coverage_of_model(reconstruction),
+        mean_error=mean_error(cloud),
         seconds=clock.seconds,
         warnings=tracked.warnings,
     )
 
 
+def _choose(
+    tracks: Tracks,
+    source: VideoSource,
+    names: list[str],
+    folder: Path | None,
+    options: MatchOptions,
+) -> ChosenImages:
+    """The frames of the model's images."""
+    return choose_images(
+        tracks,
+        options.images,
+        existing=names,
+        folder=folder,
+        times=lambda: times_of_frames(source, tracks.num_frames),
+        decode=lambda: decoded_pictures(source, options),
+    )
+
+
 def _add_pictures(
-    colours: Colours,
+    colours: Colours | MedianColours,
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     frames: NDArray[np.int32],
     num_frames: int,

@@ -54,6 +54,7 @@ class ReconstructReport:
         num_pose_tracks: tracks that the poses come from.
         num_points: 3D points.
         num_observations: observations of all points.
+        coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean reprojection error of the points in pixels.
         far_views: median distance in pixels of what the pictures of images ten and more apart show
             in common from where the poses put it; None where no such images see the same.
@@ -78,6 +79,7 @@ class ReconstructReport:
     num_pose_tracks: int
     num_points: int
     num_observations: int
+    coverage: float
     mean_error: float
     far_views: float | None
     far_views_largest: float | None

@@ -14,6 +14,7 @@ from colmap_av1.options import (
     MapperOptions,
     MatchOptions,
     ReconstructOptions,
+    TriangulateOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 
@@ -24,6 +25,7 @@ NUM_IMAGES = 20
 OPTIONS = ReconstructOptions(
     match=MatchOptions(images=ImageOptions(every=EVERY)),
     mapping=MapperOptions(pose_tracks_per_image=300, pose_spacing=24.0),
+    triangulate=TriangulateOptions(points="survey"),
 )
 
 

@@ -12,7 +12,7 @@ from dense_scene import SCENE, Truth
 from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.model.colmap_model import ModelImage, no_points, write_model
-from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions
+from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
 from colmap_av1.video.decoding import decode_frames
 
 
@@ -30,7 +30,10 @@ def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -
 def test_densify_on_true_poses(truth: Truth, tmp_path: Path) -> None:
     """Points lie where the rendered clip's depth says, and in its colours."""
     model = true_model(tmp_path / "model", truth, range(0, 60, 4))
-    options = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
+    options = DensifyOptions(
+        match=MatchOptions(images=ImageOptions(first_number=0)),
+        triangulate=TriangulateOptions(points="survey"),
+    )
     report = densify(model, SCENE, tmp_path / "dense", options=options)
     assert report.num_images == 15
     assert report.agreeing > 0.9
@@ -70,7 +73,10 @@ def test_densify_on_true_poses(truth: Truth, tmp_path: Path) -> None:
 def test_points_lie_on_the_surfaces(truth: Truth, tmp_path: Path) -> None:
     """Those that three frames see, too; errors are shares of the distance from the camera."""
     model = true_model(tmp_path / "model", truth, range(60))
-    options = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
+    options = DensifyOptions(
+        match=MatchOptions(images=ImageOptions(first_number=0)),
+        triangulate=TriangulateOptions(points="survey"),
+    )
     densify(model, SCENE, tmp_path / "dense", options=options)
     dense = pycolmap.Reconstruction(tmp_path / "dense")
     points = list(dense.points3D.values())

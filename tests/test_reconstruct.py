@@ -4,6 +4,7 @@ import errno
 import importlib
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -493,6 +494,7 @@ def test_command_line(
 ) -> None:
     words = ["reconstruct", "--video", str(SCENE), "--output", str(made.output)]
     words += ["--every", str(EVERY), "--pose_tracks_per_image", "300", "--pose-spacing", "24"]
+    words += ["--points", "survey"]
     assert main(words) == 0
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
@@ -504,6 +506,12 @@ def test_command_line(
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
     assert main(words) == 0
-    assert "agree with the poses" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "agree with the poses" in told.out
+    covered = re.search(r"coverage\t(\S+)% of the images, the model had (\S+)%", told.out)
+    assert covered is not None
+    assert float(covered[1]) > 99 > float(covered[2]) > 80
+    assert main([*words, "--max_points", "7"]) == 2
+    assert "max_points is 7: give 100 or more" in capsys.readouterr().err
     assert main(words) == 2
     assert "error: " in capsys.readouterr().err

@@ -76,6 +76,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),
         ("points", f"{report.num_points}, {report.num_observations} observations"),
+        ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
         ("focal length", f"{report.focal_length:.2f} px"),
         *_link_rows(**report.links),
@@ -113,6 +114,10 @@ def densify_rows(report: DensifyReport) -> Rows:
         ("images", str(report.num_images)),
         ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
         ("points", f"{report.num_points}, the model had {report.num_model_points}"),
+        (
+            "coverage",
+            f"{report.coverage:.1%} of the images, the model had {report.model_coverage:.1%}",
+        ),
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *_seconds_rows(report.seconds),
     ]
@@ -126,7 +131,8 @@ def compare_rows(report: CompareReport) -> Rows:
         if column.model is not None:
             told = (
                 f"{column.model.num_registered} of {report.num_images} images, "
-                f"{column.model.num_points} points, {column.model.mean_error:.3f} px, "
+                f"{column.model.num_points} points, {column.model.coverage:.1%} of the images, "
+                f"{column.model.mean_error:.3f} px, "
                 f"{sum(column.cpu_seconds.values()):.1f} s of CPU time"
             )
         rows.append((column.name, told))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.coverage import coverage_of_model
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class ModelFigures:
         num_registered: images with a pose.
         num_points: 3D points.
         mean_track_length: images that see a point, on average.
+        coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean of the points' reprojection errors in pixels, as COLMAP states it.
         median_error: their median.
         focal_length: in pixels, on average over the cameras.
@@ -27,6 +29,7 @@ class ModelFigures:
     num_registered: int
     num_points: int
     mean_track_length: float
+    coverage: float
     mean_error: float
     median_error: float
     focal_length: float
@@ -41,12 +44,14 @@ def model_figures(model: Any) -> ModelFigures:
     if isinstance(model, Path):
         model = read_model(model)
     errors = np.array([p.error for p in model.points3D.values()], dtype=np.float64)
+    known = errors[errors >= 0]
     focal_lengths = [camera.mean_focal_length() for camera in model.cameras.values()]
     return ModelFigures(
         num_registered=model.num_reg_images(),
         num_points=len(errors),
         mean_track_length=model.compute_mean_track_length(),
-        mean_error=float(errors.mean()) if len(errors) else float("nan"),
-        median_error=float(np.median(errors)) if len(errors) else float("nan"),
+        coverage=coverage_of_model(model),
+        mean_error=float(known.mean()) if len(known) else float("nan"),
+        median_error=float(np.median(known)) if len(known) else float("nan"),
         focal_length=float(np.mean(focal_lengths)),
     )

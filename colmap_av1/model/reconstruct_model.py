@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import write_images
-from colmap_av1.model.colmap_model import write_model
+from colmap_av1.model.colmap_model import ModelPoints, write_model
+from colmap_av1.model.coverage import PosedCamera, coverage
 from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
 from colmap_av1.model.reconstruct_stages import Run
-from colmap_av1.model.track_points import Colours, seen_in, to_model_points
+from colmap_av1.model.track_points import (
+    Colours,
+    MedianColours,
+    cloud_of,
+    mean_error,
+    seen_in,
+)
+from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -24,13 +32,38 @@ from colmap_av1.video.unchanged import check_unchanged
 _Image = NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class _DenseCloud:
+    """Points of all tracks, those of them that are written, in black, and what these cover."""
+
+    points: TriangulatedPoints
+    cloud: ModelPoints
+    coverage: float
+
+
+def _dense_cloud(
+    run: Run, placed: PosedImages, camera: Any, seen: Tracks, view: NDArray[np.int64]
+) -> _DenseCloud:
+    options, clock = run.options.triangulate, run.clock
+    with clock.measure("points"):
+        points = triangulate_images(
+            *(run, placed, seen, view), pinhole=camera, options=options, progress=run.progress
+        )
+    views = [PosedCamera(camera, image.cam_from_world) for image in placed.images]
+    with clock.measure("cloud"):
+        xy = on_pinhole(placed.camera, camera, seen.xy[points.observation])
+        cloud = cloud_of(points, view, xy, views, options)
+    with clock.measure("coverage"):
+        return _DenseCloud(points, cloud, coverage(views, cloud.xyz))
+
+
 def _write_images(
-    run: Run, folder: Path, placed: PosedImages, colours: Colours
-) -> tuple[Colours, FarViews]:
+    run: Run, folder: Path, placed: PosedImages, colours: Colours | MedianColours
+) -> FarViews:
     """Write the images, undistorted; look at their colours and at views from far apart on the way.
 
     Returns:
-        The colours with all pictures added, and how far views from far apart disagree.
+        How far views from far apart disagree; the colours have all pictures added.
     """
     options, progress = run.options, run.progress
     camera = pinhole_camera(placed.camera)
@@ -41,10 +74,10 @@ def _write_images(
 
     def change(frame: int, picture: _Image) -> _Image:
         index = index_of_frame[frame]
-        colours.add(index, picture)
-        picture = undistort(picture) if undistort is not None else picture
-        far.add(index, picture)
-        return picture
+        shown = undistort(picture) if undistort is not None else picture
+        colours.add(index, picture if isinstance(colours, Colours) else shown)
+        far.add(index, shown)
+        return shown
 
     with run.clock.measure("images"):
         write_images(
@@ -58,41 +91,35 @@ def _write_images(
             progress=lambda done: progress("images", done, len(names)),
         )
     with run.clock.measure("far views"):
-        return colours, far.result()
+        return far.result()
 
 
 def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
     """Triangulate all tracks and write the images and the model that trainers open."""
-    options, clock, progress = run.options, run.clock, run.progress
-    source = run.source
+    options, clock, source = run.options, run.clock, run.source
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, chosen)
-        distorted, frames = placed.camera, placed.frames
-        camera = pinhole_camera(distorted)
+        camera = pinhole_camera(placed.camera)
         images = [replace(image, camera_id=1) for image in placed.images]
-        seen, view = seen_in(tracks, frames)
-        with clock.measure("points"):
-            points = triangulate_images(
-                *(run, placed, seen, view),
-                pinhole=camera,
-                options=options.triangulate,
-                progress=progress,
-            )
-        colours, far_views = _write_images(
-            run, partial / "images", placed, Colours(seen, view, points, len(images))
-        )
+        seen, view = seen_in(tracks, placed.frames)
+        dense = _dense_cloud(run, placed, camera, seen, view)
+        points, cloud = dense.points, dense.cloud
+        size = int(camera.width), int(camera.height)
+        colours: Colours | MedianColours = MedianColours(cloud, size, len(images))
+        if options.triangulate.points == "survey":
+            colours = Colours(seen, view, points, len(images))
+        far_views = _write_images(run, partial / "images", placed, colours)
         check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
-            xy = on_pinhole(distorted, camera, seen.xy[points.observation])
-            dense = to_model_points(points, colours.mean(), view, xy)
-            write_model(folder, {1: camera}, images, dense)
+            write_model(folder, {1: camera}, images, replace(cloud, rgb=colours.rgb()))
         return {
-            "num_points": len(points.xyz),
-            "num_observations": len(points.observation),
-            "mean_error": float(points.error.mean()),
+            "num_points": len(cloud.xyz),
+            "num_observations": len(cloud.image),
+            "coverage": dense.coverage,
+            "mean_error": mean_error(cloud),
             "focal_length": float(camera.params[0]),
             "far_views": far_views.median,
             "far_views_largest": far_views.largest,

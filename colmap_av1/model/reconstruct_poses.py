@@ -33,7 +33,7 @@ _ADJUSTED = DensityOptions(
 )
 _LOSS_SCALE = 0.25
 # Poses follow from rays, however uncertain the points are that these meet in.
-_FOR_POSES = TriangulateOptions(max_depth_error=None)
+_FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
 
 def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:

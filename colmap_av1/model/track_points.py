@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.model.colmap_model import ModelPoints
+from colmap_av1.model.coverage import PosedCamera
+from colmap_av1.model.splat_cloud import splat_cloud
+from colmap_av1.model.splat_points import splat_points
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames
@@ -22,6 +25,8 @@ LEAST_AGREEING = 0.5
 # Shown frames that a track is seen in at least which a point may come from: where rays meet at an
 # angle, points of three frames are as true as those of four and five.
 _TRACK_LENGTH = 3
+# Weights of red, green and blue in what looks bright (BT.601), in thousandths.
+_LUMA = np.array([299, 587, 114])
 # Width in pixels of the squares that hold one track each: tracks that come near each other show
 # two points as long as they do not come nearer than this.
 _CELL = 2
@@ -57,7 +62,10 @@ def triangulate_tracks(
     num_threads: int | None,
     progress: Progress,
 ) -> TriangulatedPoints:
-    """Triangulate all tracks; errors are in pixels of `pinhole`, else of each image's camera."""
+    """Points of all tracks, of the kind that the options say.
+
+    Errors are in pixels of `pinhole`, else of each image's camera.
+    """
     rays = np.full((len(view), 2), np.nan)
     camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
     for camera in {int(camera.camera_id): camera for camera in cameras}.values():
@@ -66,7 +74,7 @@ def triangulate_tracks(
     shown = [pinhole if pinhole is not None else camera for camera in cameras]
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = len(tracks.offsets) - 1
-    return triangulate(
+    return (splat_points if options.points == "splats" else triangulate)(
         Observations(tracks.offsets, view, rays, tracks.sigma),
         Views(np.stack(poses), focal),
         options,
@@ -100,10 +108,58 @@ class Colours:
         np.add.at(self._sum, self._point[own], picture[y, x, ::-1])
         np.add.at(self._count, self._point[own], 1.0)
 
-    def mean(self) -> _Image:
+    def rgb(self) -> _Image:
         """Colours uint8 [num_points, 3], red first."""
         mean = self._sum / np.maximum(self._count, 1.0)[:, None]
         return np.round(mean).astype(np.uint8)
+
+
+class MedianColours:
+    """Colours of points as the middle one of the pictures shows them, picture by picture.
+
+    A blurred, bright or hidden view among several does not change them.
+    """
+
+    def __init__(self, points: ModelPoints, size: tuple[int, int], num_images: int) -> None:
+        self._points, self._size = points, np.array(size)
+        self._order = np.argsort(points.image, kind="stable")
+        ordered = points.image[self._order]
+        self._bounds = np.searchsorted(ordered, np.arange(num_images + 1))
+        self._seen = np.zeros((len(points.image), 3), np.uint8)
+
+    def add(self, image: int, picture: _Image) -> None:
+        """Look at the picture (BGR, of any scale) of an image, of its model's camera."""
+        own = self._order[self._bounds[image] : self._bounds[image + 1]]
+        size = np.array(picture.shape[1::-1])
+        x, y = np.clip((self._points.xy[own] * size / self._size).astype(np.int64), 0, size - 1).T
+        self._seen[own] = picture[y, x, ::-1]
+
+    def rgb(self) -> _Image:
+        """Colours uint8 [num_points, 3], red first."""
+        offsets = self._points.offsets
+        owner = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+        order = np.lexsort((self._seen.astype(np.int64) @ _LUMA, owner))
+        return np.asarray(self._seen[order[(offsets[:-1] + offsets[1:]) // 2]])
+
+
+def cloud_of(
+    points: TriangulatedPoints,
+    view: NDArray[np.int64],
+    xy: NDArray[np.float64],
+    images: Sequence[PosedCamera],
+    options: TriangulateOptions,
+) -> ModelPoints:
+    """The points, of splats those that a trainer needs, in black; `xy` as in `to_model_points`."""
+    black = np.zeros((len(points.xyz), 3), np.uint8)
+    cloud = to_model_points(points, black, view, xy)
+    if options.points == "survey":
+        return cloud
+    return splat_cloud(cloud, images, options.max_points)
+
+
+def mean_error(cloud: ModelPoints) -> float:
+    """Mean reprojection error in pixels of the points that have one."""
+    return float(cloud.error[cloud.error >= 0].mean())
 
 
 def to_model_points(

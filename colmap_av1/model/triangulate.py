@@ -27,9 +27,9 @@ _CONVERGED = 0.999
 # Error in pixels at which an observation counts half.
 _SOFT_ERROR = 1.0
 # Error in pixels that an observation has however sure its motion is.
-_SIGMA_FLOOR = 0.3
+SIGMA_FLOOR = 0.3
 # Error of a ray, where a point is looked at for the wrong distance, to its mean reprojection error.
-_ERROR_TO_SIGMA = 2.0
+ERROR_TO_SIGMA = 2.0
 # Smallest eigenvalue of the normal equations, as a share of their trace, that is no plain
 # singularity.
 _SINGULAR = 1e-12
@@ -281,7 +281,7 @@ def _group(
         track=np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows)))),
         view=view,
         rays=np.ascontiguousarray(observations.rays[rows].T),
-        weight=1.0 / (_SIGMA_FLOOR**2 + observations.sigma[rows].astype(np.float64) ** 2),
+        weight=1.0 / (SIGMA_FLOOR**2 + observations.sigma[rows].astype(np.float64) ** 2),
         pose=pose[:, :, view],
         focal=np.ascontiguousarray(views.focal.T)[:, view],
         views=views,
@@ -405,6 +405,6 @@ def _is_sure(
     if options.max_depth_error is None:
         return wide
     # All observations of a track may be off alike, which its errors show only in part.
-    pixels = np.hypot(_SIGMA_FLOOR, _ERROR_TO_SIGMA * error)
+    pixels = np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * error)
     focal = group.focal[:, group.starts].mean(axis=0)
     return np.asarray(wide & (pixels <= options.max_depth_error * focal * angle))

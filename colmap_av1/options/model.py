@@ -40,6 +40,25 @@ class TriangulateOptions(Options):
         unit="a fraction",
     )
     min_observations: int = option(3, "fewest observations of a point", least=2, common=True)
+    points: Literal["splats", "survey"] = option(
+        "splats",
+        "splats: what training of Gaussian splats starts well from, with far points, evenly spread "
+        "in the images, holes filled; survey: only points of sure depth, by min_angle and "
+        "max_depth_error, and all of them",
+        common=True,
+    )
+    max_points: int | None = option(
+        None,
+        "largest number of points, of splats; the finest are left out first; None: as many as "
+        "images of this size tell apart",
+        least=100,
+        common=True,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_points is not None and self.points == "survey":
+            raise OptionError("max_points bounds splats: leave it out, or give --points splats")
 
 
 @dataclass(frozen=True)

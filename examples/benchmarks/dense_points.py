@@ -72,7 +72,9 @@ def main() -> int:
             output = folder / str(number)
             options = DensifyOptions(
                 match=MatchOptions(tracks=tracking.tracks),
-                triangulate=TriangulateOptions(max_depth_error=tracking.max_depth_error),
+                triangulate=TriangulateOptions(
+                    points="survey", max_depth_error=tracking.max_depth_error
+                ),
             )
             measured = run_measured(make, model, video, output, options, log=folder / "log.txt")
             dense, reference = read_model(output), read_model(model)

@@ -123,7 +123,7 @@ def test_colours_are_means_of_the_pictures_that_see_a_point() -> None:
     half[-1, -1] = [0, 40, 0]
     colours.add(0, blue)
     colours.add(2, half)  # the picture in the middle is not there
-    assert colours.mean().tolist() == [
+    assert colours.rgb().tolist() == [
         [50, 0, 100],
         [0, 20, 100],  # beyond the last pixel is the last pixel
         [0, 0, 0],

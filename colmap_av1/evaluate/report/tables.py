@@ -32,7 +32,7 @@ def models_table(report: CompareReport) -> Table:
     base = next((c.model for c in report.columns if c.name == BASELINE), None)
     header = ["front-end", "images", "points"]
     header += ["x SIFT exhaustive"] * (base is not None)
-    header += ["track length", "error px, mean / median"]
+    header += ["coverage", "track length", "error px, mean / median"]
     header += ["ATE", "relative pose error"] * bool(report.pose_reference)
     header += ["Chamfer", "Hausdorff (95 %)"] * bool(report.cloud_reference)
     rows = []
@@ -45,6 +45,7 @@ def models_table(report: CompareReport) -> Table:
         row.append(f"{model.num_points:,}")
         if base is not None:
             row.append(f"{model.num_points / base.num_points:.1f}" if base.num_points else _NONE)
+        row.append(f"{model.coverage:.1%}")
         row.append(f"{model.mean_track_length:.2f}")
         row.append(f"{_number(model.mean_error)} / {_number(model.median_error)}")
         if report.pose_reference:
@@ -56,7 +57,8 @@ def models_table(report: CompareReport) -> Table:
 
 
 def _about_models(report: CompareReport) -> str:
-    told = "Error: reprojection error of the points, as COLMAP states it."
+    told = "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
+    told += "Error: reprojection error of the points, as COLMAP states it."
     if report.pose_reference:
         whose = _whose(report.pose_reference, report.is_truth)
         told += (

@@ -1,0 +1,161 @@
+"""Coverage: how much of its images a cloud of points fills."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.model.colmap_model import posed_images
+
+_Floats = NDArray[np.float64]
+
+# Width in pixels of the cells that are filled or empty.
+CELL = 16
+# A point is seen through a gap in what is before it where all but one of the cells around have
+# points that are nearer by this factor.
+_NEARER = 1.25
+_AROUND = 8
+# Images that are looked at, evenly spread; bounds the time of long videos.
+_MOST_IMAGES = 64
+# Points looked at at a time; bounds memory.
+_CHUNK = 500_000
+# Points of the picture's edge that tell which rays a camera sees.
+_EDGE_POINTS = 33
+
+
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera where an image was taken.
+
+    Attributes:
+        camera: its pycolmap.Camera.
+        cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
+    """
+
+    camera: Any
+    cam_from_world: _Floats
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image in pixels."""
+        return int(self.camera.width), int(self.camera.height)
+
+    @property
+    def centre(self) -> _Floats:
+        """Float64 [3] place of the camera in the world."""
+        return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
+
+    def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
+        """The points that lie in the picture.
+
+        Args:
+            xyz: float64 [n, 3] in the world.
+
+        Returns:
+            int64 [m] their indices, ascending; float64 [m, 2] pixels, the first one's centre at
+            (0.5, 0.5); and float64 [m] depths along the camera's axis.
+        """
+        low, high = _seen_rays(self.camera)
+        found = []
+        for first in range(0, len(xyz), _CHUNK):
+            own = xyz[first : first + _CHUNK] @ self.cam_from_world[:, :3].T
+            own += self.cam_from_world[:, 3]
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                rays = own[:, :2] / own[:, 2:]
+            # Beyond what a camera sees its distortion may fold back into the picture.
+            seen = np.flatnonzero((own[:, 2] > 0) & ((rays >= low) & (rays <= high)).all(axis=1))
+            xy = np.asarray(self.camera.img_from_cam(own[seen])).reshape(-1, 2)
+            inside = ((xy >= 0) & (xy < self.size)).all(axis=1)
+            found.append((seen[inside] + first, xy[inside], own[seen[inside], 2]))
+        if not found:
+            return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
+        index, xy, depth = (np.concatenate(column) for column in zip(*found, strict=True))
+        return index, xy, depth
+
+
+def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
+    """Share of the images' cells of 16x16 pixels that a visible point projects into.
+
+    A point that is seen through a gap in the surface before it does not count. Of long videos 64
+    images, evenly spread, are looked at.
+
+    Args:
+        views: the images.
+        xyz: float64 [n, 3] the points.
+
+    Returns:
+        From 0 to 1; 0 without images.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(_MOST_IMAGES, len(views))).astype(int))
+    filled = total = 0
+    for view in (views[i] for i in chosen):
+        depth = visible_depth(view, xyz)
+        filled += int(np.isfinite(depth).sum())
+        total += depth.size
+    return filled / max(total, 1)
+
+
+def coverage_of_model(reconstruction: Any) -> float:
+    """`coverage` of a pycolmap.Reconstruction's points in its images."""
+    images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
+    cameras = reconstruction.cameras
+    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+    xyz = np.array([p.xyz for p in reconstruction.points3D.values()], np.float64)
+    return coverage(views, xyz.reshape(-1, 3))
+
+
+def visible_depth(view: PosedCamera, xyz: _Floats, cell: int = CELL) -> _Floats:
+    """Depth of the nearest visible point in each cell of an image.
+
+    Args:
+        view: the image.
+        xyz: float64 [n, 3] the points.
+        cell: width of a cell in pixels.
+
+    Returns:
+        float64 [rows, columns]; inf where there is none.
+    """
+    _, xy, depth = view.project(xyz)
+    grid = nearest_depth(view.size, xy, depth, cell)
+    grid[seen_through_gap(grid)] = np.inf
+    return grid
+
+
+def nearest_depth(size: tuple[int, int], xy: _Floats, depth: _Floats, cell: int) -> _Floats:
+    """Float64 [rows, columns] least depth of the points in each cell, inf without any."""
+    width, height = size
+    columns, rows = -(-width // cell), -(-height // cell)
+    grid = np.full(rows * columns, np.inf)
+    column, row = (xy // cell).astype(np.int64).T
+    np.minimum.at(grid, row * columns + column, depth)
+    return grid.reshape(rows, columns)
+
+
+def seen_through_gap(grid: _Floats) -> NDArray[np.bool_]:
+    """Cells whose points lie well behind those of nearly all cells around them."""
+    rows, columns = grid.shape
+    padded = np.pad(grid, 1, constant_values=np.inf)
+    limit = grid / _NEARER
+    nearer = np.zeros(grid.shape, np.int64)
+    for row in range(3):
+        for column in range(3):
+            nearer += padded[row : row + rows, column : column + columns] < limit
+    return np.asarray(np.isfinite(grid) & (nearer >= _AROUND - 1))
+
+
+def _seen_rays(camera: Any) -> tuple[_Floats, _Floats]:
+    """Least and largest (x / z, y / z) that a picture's edge shows, a little widened."""
+    width, height = float(camera.width), float(camera.height)
+    along = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    none, all_ = np.zeros_like(along), np.ones_like(along)
+    edge = [(along, none), (along, all_), (none, along), (all_, along)]
+    xy = np.concatenate([np.column_stack([x * width, y * height]) for x, y in edge])
+    rays = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    margin = 0.01 * (high - low)
+    return low - margin, high + margin
