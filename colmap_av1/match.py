@@ -92,8 +92,11 @@ class MatchReport:
     warnings: tuple[str, ...]
 
     @property
-    def next_commands(self) -> tuple[str, str]:
-        """Shell lines that map the database: with COLMAP, and with this package."""
+    def next_commands(self) -> tuple[str, str, str]:
+        """Shell lines: two that map the database, with COLMAP and with this package; one after.
+
+        The last one makes the cloud that training of Gaussian splats starts from.
+        """
         database = _no_option(self.database)
         output = _no_option(self.database.with_name(f"{self.database.stem}_model"))
         images = _no_option(self.image_path) if self.image_path is not None else "IMAGES"
@@ -113,7 +116,13 @@ class MatchReport:
         ]
         if self.forward_motion:
             ours.append("--forward_motion")
-        return f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}", shlex.join(ours)
+        densify = [
+            *("colmap-av1", "densify", "--model", f"{output}/0", "--video", _no_option(self.video)),
+            *(("--image_path", images) if self.image_path is not None else ()),
+            *("--output", _no_option(self.database.with_name(f"{self.database.stem}_splats"))),
+        ]
+        with_colmap = f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}"
+        return with_colmap, shlex.join(ours), shlex.join(densify)
 
 
 def match(

@@ -141,9 +141,13 @@ def test_gaussian_splatting(tmp_path: Path, tools: Path, video: Path) -> None:
         *("gaussian_splatting.sh", tools, video, tmp_path / "source", *FEW),
         CONVERT=str(tools / "convert.py"),
     )
+    dense = tmp_path / "source/distorted/sparse/0"
     model = pycolmap.Reconstruction(tmp_path / "source/sparse/0")
     assert [camera.model_name for camera in model.cameras.values()] == ["PINHOLE"]
-    check_model(model, tmp_path / "source/images")
+    check_model(model, tmp_path / "source/images", least_points=3000)
+    # Points that fill holes, too, go through COLMAP's undistortion.
+    assert model.num_points3D() == pycolmap.Reconstruction(dense).num_points3D()
+    assert largest_model(tmp_path / "source/distorted/mapped").num_points3D() < 3000
 
 
 # What ns-process-data does when told to skip COLMAP: copy the images under names of its own,
@@ -174,9 +178,9 @@ def test_nerfstudio(tmp_path: Path, tools: Path, video: Path) -> None:
     (tools / "process.py").write_text(textwrap.dedent(NERFSTUDIO))
     add_command(tools, "ns-process-data", f'exec "{sys.executable}" "{tools}/process.py" "$@"')
     run("nerfstudio.sh", tools, video, tmp_path / "data", *FEW)
-    check_model(
-        pycolmap.Reconstruction(tmp_path / "data/colmap/sparse/0"), tmp_path / "data/frames"
-    )
+    model = pycolmap.Reconstruction(tmp_path / "data/colmap/sparse/0")
+    check_model(model, tmp_path / "data/frames", least_points=3000)
+    assert largest_model(tmp_path / "data/colmap/mapped").num_points3D() < 3000
     transforms = json.loads((tmp_path / "data/transforms.json").read_text())
     assert transforms["camera_model"] == "OPENCV"
     files = [tmp_path / "data" / frame["file_path"] for frame in transforms["frames"]]

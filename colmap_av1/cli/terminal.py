@@ -62,12 +62,13 @@ def print_summary(rows: Rows) -> None:
 
 def print_next(report: MatchReport) -> None:
     """Print the commands that map what `match` wrote."""
-    with_colmap, with_ours = report.next_commands
+    with_colmap, with_ours, densify = report.next_commands
     if sys.stdout.isatty():
         # Printed bare, so that they can be copied from any terminal.
         print(f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}")
+        print(f"Then, to train Gaussian splats:\n  {densify}")
     else:
-        print(f"next\t{with_colmap}\nor\t{with_ours}")
+        print(f"next\t{with_colmap}\nor\t{with_ours}\nthen, for splats\t{densify}")
     if report.image_path is None:
         print(f"{PROGRAM}: IMAGES stands for a folder of the frames", file=sys.stderr)
 

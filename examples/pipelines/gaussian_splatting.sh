@@ -13,18 +13,20 @@ shift 2
 
 mkdir -p "$source/distorted/sparse"
 colmap-av1 match --database "$source/distorted/database.db" --video "$video" \
-  --image_path "$source/input" --camera_model OPENCV "$@"
+  --image_path "$source/input" --camera_model OPENCV \
+  --keep_stream "$source/distorted/stream.mp4" "$@"
 
 # As convert.py calls it.
 colmap mapper --database_path "$source/distorted/database.db" --image_path "$source/input" \
   --output_path "$source/distorted/sparse" --Mapper.ba_global_function_tolerance=0.000001
 
-# convert.py takes model 0; the mapper may leave smaller ones before the real one.
+# The points that training starts from are many more than the mapper's, on its poses. convert.py
+# takes model 0; the mapper may leave smaller ones before the real one.
 best=$(ls -S "$source/distorted/sparse"/*/images.bin | head -n 1) || exit 1
-best=$(dirname "$best")
-if [[ $best != "$source/distorted/sparse/0" ]]; then
-  mv "$source/distorted/sparse/0" "$source/distorted/sparse/smaller"
-  mv "$best" "$source/distorted/sparse/0"
-fi
+mv "$source/distorted/sparse" "$source/distorted/mapped"
+best=${best/#"$source/distorted/sparse"/"$source/distorted/mapped"}
+mkdir "$source/distorted/sparse"
+colmap-av1 densify --model "$(dirname "$best")" --video "$video" --image_path "$source/input" \
+  --keep_stream "$source/distorted/stream.mp4" --output "$source/distorted/sparse/0"
 
 python "${CONVERT:-convert.py}" -s "$source" --skip_matching

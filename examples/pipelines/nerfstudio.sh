@@ -13,18 +13,23 @@ shift 2
 
 mkdir -p "$data/colmap/sparse"
 colmap-av1 match --database "$data/colmap/database.db" --video "$video" \
-  --image_path "$data/frames" --camera_model OPENCV "$@"
+  --image_path "$data/frames" --camera_model OPENCV \
+  --keep_stream "$data/colmap/stream.mp4" "$@"
 colmap mapper --database_path "$data/colmap/database.db" --image_path "$data/frames" \
   --output_path "$data/colmap/sparse" --Mapper.ba_global_function_tolerance=1e-6
 
-# ns-process-data takes model 0; the mapper may leave smaller ones before the real one.
+# The mapper may leave smaller models before the real one.
 best=$(ls -S "$data/colmap/sparse"/*/images.bin | head -n 1) || exit 1
 best=$(dirname "$best")
-if [[ $best != "$data/colmap/sparse/0" ]]; then
-  mv "$data/colmap/sparse/0" "$data/colmap/sparse/smaller"
-  mv "$best" "$data/colmap/sparse/0"
-fi
-colmap bundle_adjuster --input_path "$data/colmap/sparse/0" \
-  --output_path "$data/colmap/sparse/0" --BundleAdjustment.refine_principal_point 1
+colmap bundle_adjuster --input_path "$best" --output_path "$best" \
+  --BundleAdjustment.refine_principal_point 1
+
+# The points that training starts from are many more than the mapper's, on its poses.
+# ns-process-data takes model 0.
+mv "$data/colmap/sparse" "$data/colmap/mapped"
+best=${best/#"$data/colmap/sparse"/"$data/colmap/mapped"}
+mkdir "$data/colmap/sparse"
+colmap-av1 densify --model "$best" --video "$video" --image_path "$data/frames" \
+  --keep_stream "$data/colmap/stream.mp4" --output "$data/colmap/sparse/0"
 
 ns-process-data images --data "$data/frames" --output-dir "$data" --skip-colmap

@@ -55,6 +55,10 @@ def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:
         *("colmap-av1", "map", "--database", "a.db", "--image_path", "my frames"),
         *("--output", "a_model"),
     ]
+    assert shlex.split(table["then, for splats"]) == [
+        *("colmap-av1", "densify", "--model", "a_model/0", "--video", str(clip)),
+        *("--image_path", "my frames", "--output", "a_splats"),
+    ]
 
 
 def test_refinement_is_an_option(
