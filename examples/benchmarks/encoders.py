@@ -4,14 +4,12 @@ python examples/benchmarks/encoders.py --cache benchmark_encoders
 
 Each clip is converted with each setting; the tracks of the stream are counted and, where cameras
 are known, measured against them; `reconstruct` makes a model of the stream's motion and the clip's
-own pictures. Hardware encoders are measured where they work. Rows go to encoders.csv beside this
-script, in place of those of the same clip and setting.
+own pictures. Hardware encoders are measured where they work.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import re
 import shutil
@@ -19,12 +17,13 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import clips as ruler
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from results import add_results, save
 from rich.console import Console
 
 from colmap_av1 import (
@@ -62,7 +61,6 @@ CLIPS = {
     "shelfbox": 1,
     "kitchen": 2,
 }
-TABLE = Path(__file__).with_suffix(".csv")
 # Matches of SIFT between images that lie far apart, held against the poses; not part of this
 # project.
 FAR_VIEWS = ruler.SEQUENCES.parent / "tools" / "loop_consistency.py"
@@ -110,6 +108,7 @@ def main() -> int:
     parser.add_argument("--clips", nargs="+", choices=CLIPS, default=list(CLIPS), metavar="NAME")
     names = [name_of(setting) for setting in SETTINGS]
     parser.add_argument("--settings", nargs="+", choices=names, default=names, metavar="NAME")
+    add_results(parser, "encoders")
     arguments = parser.parse_args()
     console = Console(stderr=True)
     wanted = [setting for setting in SETTINGS if name_of(setting) in arguments.settings]
@@ -127,7 +126,7 @@ def main() -> int:
                 except ColmapAv1Error as error:
                     console.print(f"error: {clip}: {error}", markup=False)
                     continue
-                keep_row(row)
+                save(arguments.results, [asdict(row)], ("clip", "encoder", "speed", "quality"))
                 print(row, flush=True)
     return 0
 
@@ -262,40 +261,6 @@ def far_views(output: Path) -> dict[str, float]:
     said = subprocess.run([*command, str(FAR)], capture_output=True, text=True, check=False).stdout
     found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
     return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
-
-
-def keep_row(row: Row) -> None:
-    """Put a row into the table, in place of that of the same clip and setting."""
-    names = [field.name for field in fields(Row)]
-    rows = []
-    if TABLE.is_file():
-        with TABLE.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-    new = {name: spelled(value) for name, value in asdict(row).items()}
-    key = names[:4]
-    rows = [r for r in rows if any(r[name] != new[name] for name in key)]
-    order = list(CLIPS)
-    rows.append(new)
-    rows.sort(
-        key=lambda r: (
-            order.index(r["clip"]),
-            r["encoder"],
-            r["quality"],
-            len(r["speed"]),
-            r["speed"],
-        )
-    )
-    with TABLE.open("w", newline="") as file:
-        table = csv.DictWriter(file, names, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-
-
-def spelled(value: object) -> str:
-    """A cell of the table."""
-    if value is None:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -329,6 +329,32 @@ def verification(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def encoders(rows: list[Row]) -> str:
+    """What conversions cost, and the models made of them."""
+
+    def pair(heading: str, first: str, second: str, spelling: str) -> Column:
+        def cell(row: Row) -> str:
+            return f"{number(row, first, spelling)} / {number(row, second, spelling)}"
+
+        return Column(heading, cell)
+
+    columns = [
+        words("clip", "clip"),
+        Column("encoder, speed", lambda row: f"{row['encoder']} {row['speed']}"),
+        words("quality", "quality"),
+        figure("CPU s", "cpu_per_megapixel", ".2f"),
+        figure("kB a frame", "kb_per_frame", ".1f"),
+        figure("tracks", "tracks_of_4", ",.0f"),
+        pair("epipolar px at 1 / 8 frames", "epipolar_1", "epipolar_8", ".2f"),
+        Column("registered", lambda row: f"{row['registered']} of {row['images']}"),
+        figure("points", "points", ",.0f"),
+        figure("error px", "error", ".3f"),
+        figure("ATE", "ate", ".4f"),
+        pair("far views px, median / 90 %", "far_views", "far_views_90", ".2f"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
 def plain(rows: list[Row]) -> str:
     """A table whose columns are those of the file, in its words."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
@@ -344,6 +370,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "read_motion": read_motion,
     "dav1d_profile": dav1d_profile,
     "verification": verification,
+    "encoders": encoders,
     "read_memory": plain,
     "long_video": plain,
     "image_pairs": plain,
