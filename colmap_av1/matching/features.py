@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -11,8 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 # Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from
-# far apart share.
-_FIRST_OCTAVE = 0
+# far apart share; with it there are several times as many.
+_FIRST_OCTAVE = {"light": 0, "full": -1}
 # COLMAP's own limits for matches of SIFT: angle of the nearest descriptor, in radians, and its
 # ratio to that of the second nearest.
 _MAX_ANGLE = 0.7
@@ -38,11 +38,11 @@ class Features:
 class FeatureExtractor:
     """Extracts SIFT features by pycolmap, on one thread."""
 
-    def __init__(self, max_num_features: int) -> None:
+    def __init__(self, max_num_features: int, effort: Literal["light", "full"] = "light") -> None:
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.num_threads = 1
-        options.sift.first_octave = _FIRST_OCTAVE
+        options.sift.first_octave = _FIRST_OCTAVE[effort]
         options.sift.max_num_features = max_num_features
         # COLMAP says on standard error that it makes one.
         level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _WARNINGS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +52,12 @@ def extract_features(
     pictures: Pictures,
     size: tuple[int, int],
     options: LinkOptions,
+    *,
+    effort: Literal["light", "full"],
     progress: Progress,
 ) -> dict[int, Features]:
     """Features of the pictures of images, in pixels of the images."""
-    extractor = FeatureExtractor(options.max_link_features)
+    extractor = FeatureExtractor(options.max_link_features, effort)
     found: dict[int, Features] = {}
     for image, picture in pictures(wanted):
         features = extractor.extract(picture)
@@ -125,12 +127,12 @@ def supported_links(
     )
 
 
-def judge_gaps(
+def broken_gaps(
     gaps: NDArray[np.int64], links: Links, matched: MatchedImages, cameras: Sequence[Any]
-) -> tuple[list[int], list[int]]:
-    """Gaps whose motion is not believed, and those of them that no link crosses."""
+) -> list[int]:
+    """Gaps whose motion the pictures contradict, or do not confirm: it is not believed."""
     of_pair = {pair: k for k, pair in enumerate(map(tuple, matched.pairs.tolist()))}
-    broken, unlinked = [], []
+    broken = []
     for gap in gaps.tolist():
         num_matches = num_agreeing = 0
         crossing = np.flatnonzero((links.pairs[:, 0] <= gap) & (links.pairs[:, 1] > gap))
@@ -147,6 +149,4 @@ def judge_gaps(
             num_agreeing += int(np.count_nonzero(agrees))
         if num_agreeing < _MIN_AGREEING * num_matches or num_matches == 0:
             broken.append(gap)
-        if len(crossing) == 0:
-            unlinked.append(gap)
-    return broken, unlinked
+    return broken

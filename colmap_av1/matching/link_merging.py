@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.matching.features import Features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.link_matches import Links
+from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.tracks.tracks import Tracks
@@ -110,6 +111,18 @@ def _both(
         leading = link
     inliers = joined(geometry.inlier_matches, link.inlier_matches)
     return joined(matches, link_matches), replace(leading, inlier_matches=inliers)
+
+
+def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
+    """Number of the group of images that pairs connect, for each image: int32 [num_images]."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - slow to import
+
+    used = [len(geometry.inlier_matches) >= MIN_INLIERS for geometry in matched.geometries]
+    i, j = matched.pairs[np.array(used, dtype=np.bool_)].T
+    count = len(matched.keypoints)
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def links_as_tracks(

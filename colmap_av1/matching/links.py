@@ -8,8 +8,8 @@ the motion across it is believed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,17 @@ from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
 from colmap_av1.matching.link_matches import (
     Image,
     Pictures,
+    broken_gaps,
     extract_features,
-    judge_gaps,
     match_pairs,
     supported_links,
 )
-from colmap_av1.matching.link_merging import links_as_tracks, merge_links, no_tracks
+from colmap_av1.matching.link_merging import (
+    connected_images,
+    links_as_tracks,
+    merge_links,
+    no_tracks,
+)
 from colmap_av1.matching.retrieval import similar_images
 from colmap_av1.matching.weak_gaps import weak_gaps
 from colmap_av1.options import LinkOptions, MatchOptions
@@ -43,6 +48,9 @@ _LONG = 8
 _LEAST_IMAGES = 120
 # Key images lie at least so many images apart: this bounds what links cost in any video.
 _LEAST_STEP = 3
+# Inliers across a gap from which on mappers take it: they register an image by 30 points of its,
+# of which matches of two images give a part.
+_SURE_INLIERS = 100
 # Gaps that a warning names.
 _NUM_NAMED = 4
 
@@ -59,6 +67,7 @@ class LinkReport:
         weak_gaps: (frame, frame) on either side of gaps that motion does not carry over.
         broken_gaps: those whose motion contradicts the pictures, or is not confirmed by them: its
             matches are left out.
+        doubtful_gaps: those that few matches of any kind cross: a mapper may part the images there.
         open_gaps: those across which neither motion nor pictures connect the images.
     """
 
@@ -68,6 +77,7 @@ class LinkReport:
     num_revisits: int = 0
     weak_gaps: tuple[tuple[int, int], ...] = ()
     broken_gaps: tuple[tuple[int, int], ...] = ()
+    doubtful_gaps: tuple[tuple[int, int], ...] = ()
     open_gaps: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -140,17 +150,23 @@ def link_video(
             if image in left:
                 yield image, picture
 
-    plan = _plan(matched, weak_gaps(inter_share, frames), options.links)
-    if plan.wanted:
+    def link(plan: _Plan) -> LinkedImages:
         with clock.measure("links"):
-            linked = _link_images(
+            return _link_images(
                 *(plan, matched, cameras, size, pictures),
                 num_frames=len(inter_share),
                 options=options,
                 progress=progress,
             )
-    else:
-        linked = LinkedImages(matched, no_tracks(len(inter_share), size), LinkReport())
+
+    plan = _plan(matched, weak_gaps(inter_share, frames), options.links)
+    linked = LinkedImages(matched, no_tracks(len(inter_share), size), LinkReport())
+    if plan.wanted:
+        linked = link(plan)
+    if linked.report.doubtful_gaps:
+        # As after a cut: what lies on either side may go on anywhere.
+        key = plan.key or _spread_images(matched)
+        linked = link(replace(plan, key=key, effort="full"))
     if len(linked.matched.pairs) == 0:
         raise nothing_to_match(source.pictures.path, options)
     return linked
@@ -170,7 +186,9 @@ def _link_images(
     """Link the images of a plan, see `link_video`."""
     frames = np.array([k.frame for k in matched.keypoints], dtype=np.int32)
     gaps, key = plan.gaps, plan.key
-    features = extract_features(plan.wanted, pictures, size, options.links, progress)
+    features = extract_features(
+        plan.wanted, pictures, size, options.links, effort=plan.effort, progress=progress
+    )
     gap_pairs = {(i, j) for images in plan.around for i in images for j in images if i < j}
     revisit_pairs = _revisit_pairs(matched, key, features, options) - gap_pairs
     tried = np.array(sorted(gap_pairs | revisit_pairs), dtype=np.int32).reshape(-1, 2)
@@ -184,8 +202,10 @@ def _link_images(
         progress=progress,
     )
     links, num_revisits = supported_links(links, revisit_pairs, key)
-    broken, unlinked = judge_gaps(gaps, links, matched, cameras)
+    broken = broken_gaps(gaps, links, matched, cameras)
     merged = merge_links(matched, links, features, broken)
+    group = connected_images(merged)
+    unlinked = [gap for gap in gaps.tolist() if group[gap] != group[gap + 1]]
 
     def between(which: Sequence[int]) -> tuple[tuple[int, int], ...]:
         return tuple((int(frames[g]), int(frames[g + 1])) for g in which)
@@ -197,6 +217,7 @@ def _link_images(
         num_revisits=num_revisits,
         weak_gaps=between(gaps.tolist()),
         broken_gaps=between(broken),
+        doubtful_gaps=between([gap for gap in gaps.tolist() if _is_doubtful(gap, merged)]),
         open_gaps=between(unlinked),
     )
     tracks = links_as_tracks(links, features, frames, num_frames, size)
@@ -211,11 +232,13 @@ class _Plan:
         gaps: int64 [n] weak gaps, by the image before each.
         around: the images whose pictures are matched across each.
         key: images that places seen again are looked for in.
+        effort: of the search for features.
     """
 
     gaps: NDArray[np.int64]
     around: list[list[int]]
     key: list[int]
+    effort: Literal["light", "full"] = "light"
 
     @property
     def wanted(self) -> list[int]:
@@ -227,6 +250,13 @@ def _plan(matched: MatchedImages, weak: NDArray[np.bool_], options: LinkOptions)
     gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
     around = [_images_around(int(gap), len(matched.keypoints)) for gap in gaps]
     return _Plan(gaps, around, _key_images(matched, options))
+
+
+def _is_doubtful(gap: int, matched: MatchedImages) -> bool:
+    """Whether no pair of images across a gap has the inliers that a mapper is sure of."""
+    crossing = (matched.pairs[:, 0] <= gap) & (matched.pairs[:, 1] > gap)
+    inliers = [len(matched.geometries[k].inlier_matches) for k in np.flatnonzero(crossing)]
+    return max(inliers, default=0) < _SURE_INLIERS
 
 
 def _images_around(gap: int, num_images: int) -> list[int]:
@@ -251,7 +281,13 @@ def _key_images(matched: MatchedImages, options: LinkOptions) -> list[int]:
     is_long = num_images >= max(_LONG * reach, _LEAST_IMAGES)
     if options.links == "none" or (options.links == "auto" and not is_long):
         return []
-    step = max(_LEAST_STEP, round(_KEY_SHARE * reach))
+    return _spread_images(matched)
+
+
+def _spread_images(matched: MatchedImages) -> list[int]:
+    """Images that lie so far apart that tracks reach over several of them."""
+    num_images = len(matched.keypoints)
+    step = max(_LEAST_STEP, round(_KEY_SHARE * _reach(matched)))
     return list(range(step // 2, num_images, step))
 
 
