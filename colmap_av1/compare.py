@@ -1,4 +1,4 @@
-"""The published comparison: front-ends on one video, their clouds, poses and costs, a report."""
+"""Comparison of front-ends on one video: their clouds, poses and costs, in a report."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def compare(
     Every front-end gets the same images, and the same camera where its model or parameters are
     given, and fills a database; each of these is mapped by COLMAP's incremental mapper with the
     same settings, and the models are measured. Where no model is given, that is SIMPLE_RADIAL, and
-    RADIAL where this package's tracks tell the focal length.
+    RADIAL where this package estimates the focal length from the tracks.
     The folder gets `report.html`, `report.md` and `results.json`, and keeps what every stage
     made: another run does only what is missing or damaged, or depends on what has changed. A
     front-end that fails leaves a line in its column; the others stand.
@@ -165,7 +165,7 @@ def _writing(output: Path) -> Iterator[None]:
             raise  # of what is read
         raise OptionError(
             f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
-            "run the same command again once that is mended"
+            "run the same command again once that is fixed"
         ) from error
 
 
@@ -186,7 +186,7 @@ def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
             if not (colon and features and matches):
                 raise OptionError(f"front-end '{word}': give NAME=FEATURES.h5:MATCHES.h5")
             if name in known or not name or Path(name).name != name:
-                raise OptionError(f"front-end '{word}': give it a name of its own")
+                raise OptionError(f"front-end '{word}': give it another name")
             frontend = imported_frontend(Path(features), Path(matches))
         elif name in known:
             frontend = known[name]
@@ -241,7 +241,7 @@ def _run_column(
     except ColmapAv1Error as error:
         return [replace(column, error=str(error))]
     if column.model_path is None:
-        return [replace(column, error="no image is registered: the mapper finds no start")]
+        return [replace(column, error="no image is registered: the mapper finds no initial pair")]
     if not (own and options.all_tracks):
         return [column]
     dense = replace(column, name=f"{name}{ALL_TRACKS}", num_models=1)
@@ -264,7 +264,7 @@ def _run_column(
 def _trained(
     column: Column, footage: Footage, output: Path, options: CompareOptions, progress: Progress
 ) -> Column:
-    """The column with what is trained on its model."""
+    """The column with the training on its model."""
     if column.model_path is None or not (options.split or options.trainer):
         return column
     folder = output / "splats" / column.name.replace(" ", "")

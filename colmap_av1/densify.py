@@ -90,7 +90,7 @@ def densify(
     options: DensifyOptions | None = None,
     progress: Progress | None = None,
 ) -> DensifyReport:
-    """Triangulate the tracks of a video on the poses of a model that is there.
+    """Triangulate the tracks of a video on the poses of an existing model.
 
     Poses, cameras and image names stay as they are; the points are new.
 

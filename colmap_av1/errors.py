@@ -1,4 +1,4 @@
-"""What a user can do wrong: one class each, one base class.
+"""Errors of input: one class each, one base class.
 
 Every message is one line that says what to do. The command line prints it and
 exits with status 2; anything that is not a `ColmapAv1Error` is a defect of this
@@ -61,4 +61,4 @@ class EvaluationError(ColmapAv1Error):
 def cannot_write(path: Path, error: Exception) -> str:
     """The message where the system refuses to write a file or folder."""
     reason = getattr(error, "strerror", None) or error
-    return f"{path}: cannot be written: {reason}: mend that, or give another path"
+    return f"{path}: cannot be written: {reason}: fix that, or give another path"

@@ -1,4 +1,4 @@
-"""The whole way from a video to the rows of a COLMAP database."""
+"""From a video to the rows of a COLMAP database."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def _with_chosen_tracks(
 
 
 def _figures(tracks: Tracks, matched: MatchedImages) -> dict[str, Any]:
-    """What `MatchReport` counts of tracks and of matches."""
+    """The counts of tracks and matches in `MatchReport`."""
     lengths = np.diff(tracks.offsets)
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower") if len(lengths) else ()
     kinds = [geometry.config.name for geometry in matched.geometries]

@@ -1,4 +1,4 @@
-"""From a video to a dense model: poses from few sure tracks, points from all of them."""
+"""From a video to a dense model: poses from few accurate tracks, points from all."""
 
 from __future__ import annotations
 
@@ -101,15 +101,15 @@ def reconstruct(
 ) -> ReconstructReport:
     """Make a dense model of a video, in a folder that trainers of Gaussian splats open.
 
-    The poses come from COLMAP's mapper on a spread choice of long, sure tracks; then every
+    The poses come from COLMAP's mapper on a spread selection of long, accurate tracks; then every
     track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one
     PINHOLE camera, undistorted and of the video's size, and beside them `database.db` and
     `report.json`. A run that was stopped is resumed after its last finished stage; a changed
     option redoes what depends on it, and what is damaged or gone is made again.
 
     Args:
-        video: a video; one that is not AV1 is converted first, to a stream that a run which
-            goes on uses again; it lies in the folder, or where `options.match.keep_stream` says.
+        video: a video; one that is not AV1 is converted first, to a stream that a
+            resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
@@ -181,7 +181,7 @@ def _notes(facts: dict[str, Any]) -> list[str]:
     if facts["num_flat_pairs"] > _MANY_FLAT * facts["num_verified_pairs"]:
         notes.append(
             f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "
-            "turns or the scene is flat: the depth of the points may mean nothing; film while "
+            "turns or the scene is flat: the depth of the points may be unreliable; film while "
             "moving sideways"
         )
     if facts["far_views_largest"] is not None and facts["far_views_largest"] > _FAR_APART:

@@ -331,8 +331,8 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         "av1,surf": "front-end 'surf': give one of av1,",
         "av1,av1": "front-end 'av1' is given twice",
         "mine=features.h5": "give NAME=FEATURES.h5:MATCHES.h5",
-        "av1=a.h5:b.h5": "give it a name of its own",
-        "../x=a.h5:b.h5": "give it a name of its own",
+        "av1=a.h5:b.h5": "give it another name",
+        "../x=a.h5:b.h5": "give it another name",
     }
     for frontends, told in refused.items():
         assert main([*given, "--frontends", frontends]) == 2

@@ -386,7 +386,9 @@ def test_model_of_two_images_is_none(
     stages = importlib.import_module("colmap_av1.model.reconstruct_poses")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
-    with pytest.raises(ModelError, match=r"incremental mapper finds no start: .* try --mapper"):
+    with pytest.raises(
+        ModelError, match=r"incremental mapper finds no initial pair: .* try --mapper"
+    ):
         reconstruct(SCENE, tmp_path / "out", options=other)
 
 
@@ -476,7 +478,7 @@ def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:
     frames = np.stack(frames)
     video = encode(frames, tmp_path / "flat.mp4")
     report = reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
-    assert any("the camera only turns or the scene is flat" in w for w in report.warnings)
+    assert any("the camera only rotates or the scene is flat" in w for w in report.warnings)
 
 
 def test_camera_that_stands_still(encode: Encode, tmp_path: Path) -> None:

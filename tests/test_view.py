@@ -146,7 +146,7 @@ def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
     ("pair", "message"),
     [
         (["x.png", "frame_000000.png"], "lists no image 'x.png'"),
-        (["frame_000000.png", "frame_000001.png"], "is missing or no image"),
+        (["frame_000000.png", "frame_000001.png"], "is missing or not an image"),
     ],
 )
 def test_pairs_that_cannot_be_drawn(

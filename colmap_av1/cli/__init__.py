@@ -1,4 +1,4 @@
-"""The command line: words to options, reports to rows."""
+"""The command line: parses options, prints reports."""
 
 from colmap_av1.cli.program import main
 

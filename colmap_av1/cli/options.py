@@ -1,4 +1,4 @@
-"""Options dataclasses as options of the command line."""
+"""Options dataclasses as command-line options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parser of a command's words: short and full help, and errors that say what was meant."""
+"""The parser of a command: short and full help, and errors that name the nearest option."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{PROGRAM}: error: {message} (see {self.prog} --help)\n")
 
     def refuse_unknown(self, words: Sequence[str]) -> None:
-        """Exit where a word is an option that there is not, and say which one is nearest to it."""
+        """Exit on an unknown option, and name the one nearest to it."""
         known = self._option_string_actions
         for word in words:
             name = word.partition("=")[0]

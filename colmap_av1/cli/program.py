@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nobody reads the output to its end.
 
     Raises:
-        SystemExit: the process is told to end.
+        SystemExit: a signal ends the process.
     """
     allow_any_file_name()
     try:
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.filename is None:
             raise
         what = f"{os.fsdecode(error.filename)}: {error.strerror}"
-        print_error(f"{what}: mend that, or give another path")
+        print_error(f"{what}: fix that, or give another path")
         return BAD_INPUT
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)

@@ -127,20 +127,20 @@ def compare_rows(report: CompareReport) -> Rows:
     """What `compare` found, a row for each front-end."""
     rows = []
     for column in report.columns:
-        told = "no model"
+        words = "no model"
         if column.model is not None:
-            told = (
+            words = (
                 f"{column.model.num_registered} of {report.num_images} images, "
                 f"{column.model.num_points} points, {column.model.coverage:.1%} of the images, "
                 f"{column.model.mean_error:.3f} px, "
                 f"{sum(column.cpu_seconds.values()):.1f} s of CPU time"
             )
-        rows.append((column.name, told))
+        rows.append((column.name, words))
     return [*rows, ("report", str(report.output / "report.html"))]
 
 
 def info_rows(report: StreamReport) -> Rows:
-    """What a stream is made of."""
+    """The structure of a stream."""
     rate = f"{report.frame_rate:.2f} per second" if report.frame_rate else "unknown"
     distances = sorted(report.reference_distances.items(), key=lambda item: -item[1])
     listed = [item for item in distances if item[1] >= _LEAST_LISTED_SHARE]

@@ -79,7 +79,7 @@ def print_warning(message: object) -> None:
 
 
 def print_error(message: object) -> None:
-    """Print what is wrong on a line of standard error."""
+    """Print an error on a line of standard error."""
     _print_line(f"{PROGRAM}: error: {message}")
 
 
@@ -89,7 +89,7 @@ def _print_line(text: str) -> None:
 
 
 def allow_any_file_name() -> None:
-    """Let standard output take names of files that are no text, as the bytes they are."""
+    """Let standard output take file names that are not valid text, as their bytes."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="surrogateescape")
 

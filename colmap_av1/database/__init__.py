@@ -1,1 +1,1 @@
-"""COLMAP's database and what other programs keep in its place."""
+"""COLMAP's database, and the files that other programs use instead."""

@@ -1,4 +1,4 @@
-"""What COLMAP's mappers will make of a database, found without altering it."""
+"""A check of what COLMAP's mappers will make of a database, without altering it."""
 
 from __future__ import annotations
 

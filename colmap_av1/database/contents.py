@@ -1,4 +1,4 @@
-"""What stands in a COLMAP database, image by image and pair by pair, for `check`."""
+"""The contents of a COLMAP database, image by image and pair by pair, for `check`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LARGEST = 0.9
 
 @dataclass(frozen=True)
 class Parallax:
-    """How far apart the views are.
+    """The parallax of the images.
 
     Attributes:
         names: names of the images of the widest pair.

@@ -84,7 +84,7 @@ def _target(path: Path) -> Path:
     A new one would take the place of a device, such as /dev/null, and a pipe has no end.
     """
     if path.exists() and not path.is_file():
-        raise DatabaseError(f"{path} is no plain file: give the path of a database file")
+        raise DatabaseError(f"{path} is not a regular file: give the path of a database file")
     try:
         return path.resolve()
     except (OSError, RuntimeError) as error:
@@ -94,7 +94,7 @@ def _target(path: Path) -> Path:
 def open_database(
     path: Path, named: Path | None = None
 ) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Open a file that exists, to read or write it, and close it at the end.
+    """Open an existing file, to read or write it, and close it at the end.
 
     Args:
         path: file to open.
@@ -104,7 +104,7 @@ def open_database(
 
 
 def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Open a file that exists to read it, without leaving a trace in it or beside it."""
+    """Open an existing file to read it, without leaving a trace in it or beside it."""
     # Without a log beside it the file is all there is, and SQLite needs no lock of its own.
     target = _target(path)
     logs = [target.with_name(target.name + end) for end in ("-journal", "-wal")]
@@ -113,7 +113,7 @@ def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Conn
 
 
 def copy_database(path: Path, copy: Path) -> None:
-    """Copy a database with all that was committed to it, without a trace in it or beside it.
+    """Copy a database with everything committed to it, without a trace in it or beside it.
 
     Args:
         path: the database.
@@ -128,7 +128,7 @@ def copy_database(path: Path, copy: Path) -> None:
 
 @contextlib.contextmanager
 def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
-    """Open a file with the given words of SQLite's URI; its errors become ours."""
+    """Open a file with the given parameters of SQLite's URI; its errors become ours."""
     try:
         with contextlib.closing(
             sqlite3.connect(

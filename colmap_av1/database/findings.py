@@ -1,4 +1,4 @@
-"""What a mapper's user should know of a database."""
+"""Findings in a database that matter for mapping it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a mapper's user should know of a database.
+    """One finding in a database that matters for mapping it.
 
     Attributes:
         severity: "error": mappers stop or find nothing; "warning": a part is lost, or some
@@ -40,7 +40,7 @@ class Finding:
 
 
 def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
-    """Images without a camera, names twice, focal lengths unknown."""
+    """Images without a camera, duplicate names, unknown focal lengths."""
     if len(images.ids) == 0:
         yield Finding("error", "lists no images")
         return
@@ -118,7 +118,7 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{_some(uneven, 'image')} with another number of descriptors than of keypoints: "
-            "guided matching and vocabulary trees stop, mappers do not mind",
+            "guided matching and vocabulary trees stop, mappers ignore it",
         )
     total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)
     if total - matched > _NOTED_SHARE * total:
@@ -168,14 +168,15 @@ def pair_findings(pairs: Pairs, images: Images) -> Iterator[Finding]:
     empty = np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))
     if empty:
         yield Finding(
-            "note", f"{empty} pairs were matched in vain: matchers skip them, writers replace them"
+            "note",
+            f"{empty} pairs were matched without result: matchers skip them, writers replace them",
         )
 
 
 def motion_findings(
     pairs: Pairs, parallax: Parallax | None, group: int, num_images: int
 ) -> Iterator[Finding]:
-    """Connection, parallax and forward motion: whether a mapper finds a start."""
+    """Connection, parallax and forward motion: whether a mapper finds an initial pair."""
     used = pairs.used
     if parallax is None:
         return
@@ -195,7 +196,7 @@ def motion_findings(
     if np.mean(flat) > 0.5:
         yield Finding(
             "warning",
-            f"{np.mean(flat):.0%} of the pairs see a plane or a camera that only turns: there is "
+            f"{np.mean(flat):.0%} of the pairs see a plane or a camera that only rotates: there is "
             "little depth to find",
         )
     if parallax.angle is None:
@@ -204,7 +205,7 @@ def motion_findings(
         yield Finding(
             "warning",
             f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no start, "
-            "take the global one",
+            "use the global one",
         )
     elif parallax.angle < INITIAL_MIN_ANGLE:
         yield Finding(

@@ -1,4 +1,4 @@
-"""Features and matches in the files of hloc, out and in.
+"""Export and import of features and matches in hloc's files.
 
 The layout is that of hloc (Sarlin et al., "From Coarse to Fine: Robust Hierarchical
 Localization at Large Scale", CVPR 2019; https://github.com/cvg/Hierarchical-Localization):

@@ -1,4 +1,4 @@
-"""What a COLMAP database holds: images, cameras, and the rows of keypoints and matches."""
+"""Reading a COLMAP database: images, cameras, rows of keypoints and matches."""
 
 from __future__ import annotations
 

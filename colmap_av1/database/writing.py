@@ -1,4 +1,4 @@
-"""Images, keypoints, matches and two-view geometries into a COLMAP database, in one transaction."""
+"""Writing images, keypoints, matches and two-view geometries to a database, all or nothing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_matched_images(
     matched: MatchedImages,
     on_existing: OnExisting = "error",
 ) -> None:
-    """Write all that is known of matched images, see `write_matches`."""
+    """Write matched images with their keypoints, matches and geometries, see `write_matches`."""
     write_matches(
         database,
         names,

@@ -1,4 +1,4 @@
-"""Rigs and frames, which COLMAP has from 3.12 on, of images in a database."""
+"""Rigs and frames of images in a database, which COLMAP has since 3.12."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keypoints into a COLMAP database, after those that its images have."""
+"""Writing keypoints to a COLMAP database, after those that its images have."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def append_keypoints(
     image_ids: Sequence[int],
     keypoints: Sequence[ImageKeypoints],
 ) -> list[int]:
-    """Put keypoints after those that the images have; returns where each image's begin."""
+    """Append keypoints to those that the images have; returns where each image's begin."""
     firsts = [0] * len(image_ids)
     all_present = any(len(k.xy) for k in keypoints)
     for index in np.argsort(np.asarray(image_ids, dtype=np.int64)):

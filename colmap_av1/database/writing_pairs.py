@@ -1,4 +1,4 @@
-"""Matches and two-view geometries of image pairs into a COLMAP database."""
+"""Writing matches and two-view geometries of image pairs to a COLMAP database."""
 
 from __future__ import annotations
 

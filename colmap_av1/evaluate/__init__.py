@@ -1,4 +1,4 @@
-"""What tracks, models and front-ends are worth: one module for each family of metrics."""
+"""Comparison of tracks, models and front-ends: one module for each family of metrics."""
 
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage, prepare_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend, FrontendRun

@@ -1,4 +1,4 @@
-"""Programs that get processes of their own, as torch and pycolmap share none; their packages."""
+"""Programs in separate processes, as torch and pycolmap must not share one; their packages."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def run_program(program: Path, task: Any) -> Any:
 
 
 def check_packages(what: str, packages: tuple[str, ...], extra: str) -> None:
-    """Refuse at the start what packages of an extra are needed for at the end.
+    """Check at the start that the packages of an extra, needed later, are installed.
 
     Args:
         what: what needs them.

@@ -1,4 +1,4 @@
-"""The camera of images: its model, its parameters, what it starts from."""
+"""The camera of images: its model, its parameters, its initial focal length."""
 
 from __future__ import annotations
 
@@ -71,17 +71,17 @@ def is_undistorted(camera: Any) -> bool:
 
 
 def is_nearly_pinhole(model: str | None) -> bool:
-    """Whether a pinhole camera is a first guess of the named model; that of none given is one."""
+    """Whether a pinhole camera can initialise the named model; so it is without a name."""
     return model is None or model in _RECTILINEAR
 
 
 def has_two_focal_lengths(camera: Any) -> bool:
-    """Whether the model of a pycolmap.Camera has a focal length along either axis of its own."""
+    """Whether the model of a pycolmap.Camera has separate focal lengths for x and y."""
     return len(camera.focal_length_idxs()) == 2
 
 
 def check_pixel_aspect(camera: Any, pixel_aspect: float, what_to_do: str) -> list[str]:
-    """Warnings of a camera with one focal length where pixels are not square.
+    """Warn of a camera with one focal length where pixels are not square.
 
     Args:
         camera: a pycolmap.Camera.
@@ -97,5 +97,5 @@ def check_pixel_aspect(camera: Any, pixel_aspect: float, what_to_do: str) -> lis
 
 
 def is_square(pixel_aspect: float) -> bool:
-    """Whether pixels are square, but for what rounding does to their width."""
+    """Whether pixels are square, up to rounding of their width."""
     return abs(pixel_aspect - 1) < _SQUARE_TOLERANCE

@@ -146,7 +146,7 @@ def choose_frames(
 
 
 def parallax(tracks: Tracks) -> NDArray[np.float64]:
-    """How far pictures part from the ones before by more than the camera's rotation.
+    """Parallax between consecutive pictures: motion beyond the camera's rotation.
 
     To each pair of neighbouring frames the motion field of a rotation (Longuet-Higgins and
     Prazdny 1980, for a focal length of 1.2 times the longer side) is fitted, robustly; what
@@ -182,7 +182,7 @@ def skip_blurred(
     tracks: Tracks,
     sharpness: Callable[[Sequence[int]], NDArray[np.float64]],
 ) -> NDArray[np.int32]:
-    """Move images from blurred frames to sharp ones nearby that serve as well.
+    """Replace blurred frames by sharp ones nearby that overlap as well.
 
     An image moves within a quarter of the distance to its neighbours, to the sharpest frame
     that shares nearly as many tracks with them. The first and the last image stay.
@@ -244,7 +244,7 @@ def read_frame_list(
 
 
 def check_frame_list(options: ImageOptions) -> None:
-    """Refuse a list of frames that says too little, whatever the video.
+    """Refuse a list of frames that is incomplete, whatever the video.
 
     Raises:
         ImageError: see `read_frame_list`.
@@ -262,7 +262,7 @@ def _read_entries(
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise ImageError(
-            f"{path}: is no list of frames that can be read: {reason}: give a text file with a "
+            f"{path}: cannot be read as a list of frames: {reason}: give a text file with a "
             "frame's index on each line"
         ) from error
     entries: list[tuple[int, int, str]] = []
@@ -360,7 +360,7 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
 def _sharpness(
     frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
 ) -> NDArray[np.float64]:
-    """Variance of the Laplacian of some frames, at a size at which noise counts little."""
+    """Variance of the Laplacian of some frames, at a size at which noise matters little."""
     wanted = set(frames)
     measured: list[float] = []
     for index, picture in pictures:
@@ -384,7 +384,7 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
 
 
 def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of the ascending place that is nearest to each wanted one, the earlier of two."""
+    """Index of the nearest of ascending positions to each wanted one; the earlier of two."""
     above = np.clip(np.searchsorted(places, wanted), 1, max(len(places) - 1, 1))
     if len(places) == 1:
         return np.zeros(len(wanted), dtype=np.int64)
@@ -403,7 +403,7 @@ def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
 def _rotation_field(
     xy: NDArray[np.float64], motion: NDArray[np.float64], focal: float
 ) -> NDArray[np.float64]:
-    """Motion [n, 2] at places [n, 2] from the picture's centre by the rotation that fits best."""
+    """Motion [n, 2] at positions [n, 2] from the picture's centre by the best-fitting rotation."""
     x, y = xy[:, 0] / focal, xy[:, 1] / focal
     columns = np.empty((len(xy), 2, 3))
     columns[:, 0] = focal * np.stack([x * y, -(1 + x * x), y], axis=1)

@@ -1,4 +1,4 @@
-"""Image files: those that exist, and those that are written."""
+"""Image files: existing ones, and those that are written."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _QUEUE_PER_THREAD = 2
 def size_of_images(
     sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int], pixel_aspect: float = 1.0
 ) -> tuple[int, int]:
-    """The one size of images that exist: that of the video's pictures, or these scaled.
+    """The common size of existing images: that of the video's pictures, or these scaled.
 
     Args:
         sizes: (width, height) of each image, by name; empty where none exist.
@@ -91,7 +91,7 @@ def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> 
 
 
 def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
-    """Images that a folder holds already, where they are not of a run of this package before.
+    """Images that a folder already holds, unless an earlier run of this package wrote them.
 
     Args:
         folder: the folder; it need not exist.
@@ -216,7 +216,7 @@ def write_images(
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ImageError(
-                f"{parent}: cannot be made: {error.strerror}: mend that, or give another path"
+                f"{parent}: cannot be made: {error.strerror}: fix that, or give another path"
             ) from error
         remove_leftovers(parent)
     try:
@@ -287,7 +287,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imread(str(path), how) if path.is_file() else None
     if image is None:
-        raise ImageError(f"{path}: is missing or no image: give the folder of the images")
+        raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""Names of images: patterns of new ones, numbers and order of those that exist."""
+"""Names of images: patterns of new ones, numbers and order of existing ones."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class PreparedImages:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How the pictures of a video and the images that exist go together.
+    """How the pictures of a video and existing images correspond.
 
     Attributes:
         existing: (width, height) of the images that exist, by name.
@@ -189,7 +189,7 @@ def _fit(
     options: MatchOptions,
     listed: Mapping[str, tuple[int, int]],
 ) -> _Fit:
-    """Find the images that exist, and how they show the video; refuses those that cannot."""
+    """Find existing images, and how they show the video; refuses those that do not fit."""
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
@@ -256,7 +256,7 @@ def _way_back(
     existing: dict[str, tuple[int, int]],
     folder: Path | None,
 ) -> Display | None:
-    """What turns shown pictures to how images that exist show them; None where they are shown so.
+    """The turn from shown pictures to existing images; None where these are shown the same.
 
     Their shape says it. Where either would do, the first image says it by what it shows, if its
     file is there; else images count as turned, as players and ffmpeg do.

@@ -134,7 +134,7 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
 def _check_rivals(
     path: Path, frame: int, likeness: NDArray[np.float32], frames: NDArray[np.float32]
 ) -> None:
-    """Refuse an image that another frame fits, too, unless the camera stands still meanwhile."""
+    """Refuse an image that another frame fits as well, unless the camera stands still."""
     rivals = ~_is_clearly_less(likeness, likeness[frame])
     # Frames without motion between them are one picture, and have one set of places.
     differs = 1 - frames @ frames[frame] > _SAME
@@ -151,7 +151,7 @@ def _check_rivals(
 
 
 def _is_clearly_less(likeness: Any, than: Any) -> NDArray[np.bool_]:
-    """Whether one likeness leaves no doubt that another one is greater."""
+    """Whether one similarity is clearly less than another."""
     return np.asarray((1 - likeness) > _MARGIN * (1 - than) + _SAME / 2)
 
 

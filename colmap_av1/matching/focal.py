@@ -1,4 +1,4 @@
-"""The focal length, estimated from tracks: that with the least epipolar errors of image pairs."""
+"""The focal length, estimated from tracks by least epipolar errors of image pairs."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _widest_pairs(
     matches: Sequence[NDArray[np.uint32]],
     shape: _Floats,
 ) -> list[int]:
-    """The pair of each part of the video whose matches move most differently, in order."""
+    """The pair with the most parallax in each part of the video, in order."""
     widest: dict[int, tuple[float, int]] = {}
     for pair, ((i, j), rows) in enumerate(zip(pairs.tolist(), matches, strict=True)):
         if len(rows) < _MIN_MATCHES:

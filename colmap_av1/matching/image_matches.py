@@ -97,7 +97,7 @@ def nothing_to_match(video: Path, options: MatchOptions) -> VideoError:
     """The error where no two images have enough matches."""
     return VideoError(
         f"{video}: no two images share {options.pairs.min_matches} tracks, so there is nothing to "
-        "match: let more frames be images, or see 'colmap-av1 info --video' for what the stream "
+        "match: use more frames as images, or see 'colmap-av1 info --video' for what the stream "
         "lacks; --reencode 1 converts it first"
     )
 
@@ -110,7 +110,7 @@ def shared_focal_length(
     *,
     clock: Clock,
 ) -> float | None:
-    """Estimate, from the tracks, the focal length of a camera about which nothing is given.
+    """Estimate, from the tracks, the focal length of a camera with unknown intrinsics.
 
     Args:
         paired: the images, all of one camera.

@@ -90,7 +90,7 @@ class LinkReport:
         return (
             f"nothing connects frames {shown}{f' and {more} more pairs' if more > 0 else ''}: the "
             "camera jerks, or the pictures are blurred or cut there, and show nothing in common; "
-            "what lies on either side becomes models of its own",
+            "the images on either side become separate models",
         )
 
 
@@ -134,7 +134,7 @@ def link_video(
         display: how pictures are shown in the images; None: as players show them.
         options: those of links, verification and reading are used.
         clock: gets the stage "links".
-        progress: told about the stage "links".
+        progress: called for the stage "links".
 
     Raises:
         VideoError: neither motion nor pictures connect any two images.

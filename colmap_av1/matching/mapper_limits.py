@@ -1,4 +1,4 @@
-"""What COLMAP's mappers ask of an image pair, by default, to use it or to start with it."""
+"""The default limits of COLMAP's mappers for using an image pair or starting with it."""
 
 # Inliers of a pair that any mapper uses (min_num_matches).
 MIN_INLIERS = 15

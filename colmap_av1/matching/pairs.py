@@ -99,7 +99,7 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
 def schedule_pairs(
     keypoints: Sequence[ImageKeypoints], options: PairOptions | None = None
 ) -> NDArray[np.int32]:
-    """Choose the image pairs to write: dense at short spans, geometric at long ones.
+    """Choose the image pairs to write: every distance for near images, growing ones for far.
 
     Long spans carry the parallax an incremental mapper starts from; the last one is the
     longest at which two images still share enough tracks. The triangulator follows written

@@ -1,4 +1,4 @@
-"""The two-view geometry of an image pair, and the configurations that COLMAP sorts them into."""
+"""The two-view geometry of an image pair, and COLMAP's configurations of it."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class MatchedPoints:
     spread_b: _Floats
 
     def first(self, count: int) -> tuple[_Floats, _Floats]:
-        """The first matches of the spread order, float64 [2, m] in either image."""
+        """The first matches of the spread order, float64 [2, m] in each image."""
         return self.spread_a[:, :count], self.spread_b[:, :count]
 
 
@@ -93,7 +93,7 @@ def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> MatchedPo
 
 @dataclass(frozen=True)
 class Search:
-    """How the models of one pair are looked for.
+    """How the models of one pair are estimated.
 
     Attributes:
         options: thresholds and effort.
@@ -108,7 +108,7 @@ class Search:
         return max(MIN_MATCHES, round(share * self.options.max_samples))
 
     def ransac(self, min_iterations: int) -> dict[str, Any]:
-        """PoseLib's words for it."""
+        """The options as PoseLib takes them."""
         return {
             "max_epipolar_error": self.options.max_error,
             "max_reproj_error": self.options.max_error,
@@ -169,7 +169,7 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
 
 
 def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Model:
-    """The homography of a pair, as well as the decision between it and its rival needs it.
+    """The homography of a pair, as exact as the decision between it and its rival needs.
 
     A search until no better one is found is the costliest part of all and seldom decides: a
     quick fit shows whether the inliers come near the rival's.
@@ -215,7 +215,7 @@ def _again_on_inliers(
     points: MatchedPoints,
     search: Search,
 ) -> Model:
-    """Refine a model that leaves out many matches once more, without those."""
+    """Refine a model with many outliers once more, on its inliers."""
     if found.matrix is None or found.count >= _TRUSTED_SHARE * points.a.shape[1]:
         return found
     agree = epipolar_inliers(
@@ -237,7 +237,7 @@ def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
 
 
 def poselib_camera(focal_length: float) -> dict[str, Any]:
-    """A camera whose principal point is the origin, in PoseLib's words."""
+    """A camera as PoseLib takes it, with the principal point at the origin."""
     # PoseLib does not use the size.
     params = [focal_length, 0.0, 0.0]
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
@@ -268,7 +268,7 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
 
 
 def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
-    """Points [2, n] as homogeneous ones about 0 of size 1, and what makes them so, [3, 3]."""
+    """Points [2, n] normalised, as homogeneous ones, and the normalising matrix [3, 3]."""
     centre = x.sum(axis=1) / x.shape[1]
     moved = x - centre[:, None]
     scale = 1 / (math.sqrt(np.vdot(moved, moved) / x.size) + _ROUNDING)
@@ -314,7 +314,7 @@ def _no_model(points: MatchedPoints) -> Model:
 def _test(
     inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: MatchedPoints, search: Search
 ) -> Model:
-    """The matrix at unit norm with its inliers; no model where an estimator found none."""
+    """The matrix at unit norm with its inliers; None where an estimator found no model."""
     matrix = np.asarray(matrix, dtype=np.float64)
     norm = float(np.linalg.norm(matrix))
     if not (math.isfinite(norm) and norm > 0):

@@ -67,7 +67,7 @@ class ModelPoints:
 
 
 def no_points() -> ModelPoints:
-    """What a model of poses alone has."""
+    """The points of a model of poses alone: none."""
     return ModelPoints(
         *(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0)),
         *(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 2))),

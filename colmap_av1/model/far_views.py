@@ -26,7 +26,7 @@ _MAX_ANGLE = 20.0
 _MAX_DISTANCE = 0.25
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500
-# Matches of a pair that tell anything.
+# Least matches of a pair that mean anything.
 _MIN_INLIERS = 20
 _SEED = 0
 

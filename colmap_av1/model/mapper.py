@@ -1,4 +1,4 @@
-"""COLMAP's mappers and adjustment, in processes of their own: to be stopped, logs kept apart."""
+"""COLMAP's mappers and bundle adjustment in separate processes, to stop them and keep logs."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def adjust_model(
     num_threads: int,
     log: Path,
 ) -> None:
-    """Adjust poses, points and, if asked to, intrinsics of a model together; it is overwritten.
+    """Bundle-adjust poses, points and, if asked to, intrinsics of a model; it is overwritten.
 
     Args:
         model: folder of a COLMAP model.
@@ -202,7 +202,7 @@ def _run_apart(
     failed: str,
     hint: str,
 ) -> None:
-    """Do what the settings say in a process; `hear` gets the words and values it prints."""
+    """Run the settings in a process; `hear` gets the names and values that it prints."""
     # The package is found where this one was.
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *sys.path])
     done, reason = False, ""
@@ -235,7 +235,7 @@ def _run_apart(
 
 
 def run_child(settings: dict[str, Any]) -> None:
-    """Map or adjust in this process; what happens is said on standard output."""
+    """Map or adjust in this process; progress goes to standard output."""
     # The interrupt of a terminal reaches the parent, too, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = os.fdopen(os.dup(1), "w", buffering=1)

@@ -1,4 +1,4 @@
-"""The stages of `reconstruct` that find the poses: COLMAP's mapper, then an adjustment."""
+"""The stages of `reconstruct` that estimate poses: COLMAP's mapper, then bundle adjustment."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
 
 def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
-    """Let COLMAP's mapper find the poses."""
+    """Estimate the poses by COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
     mapping = options.mapping
     forward = bool(matched.facts["forward_motion"])
@@ -92,15 +92,15 @@ def _refines_intrinsics(options: ReconstructOptions) -> bool:
 
 
 def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
-    """Why a mapper found no two images to start with, and what to try."""
-    no_start = f"COLMAP's {mapper} mapper finds no start"
+    """Why a mapper found no initial pair, and what to try."""
+    no_start = f"COLMAP's {mapper} mapper finds no initial pair"
     other = "incremental" if mapper == "global" else "global"
     most_agree = facts["num_verified_pairs"] >= facts["num_pairs"] / 2
     if most_agree and facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
         return (
             f"{no_start}: too little parallax, in {facts['num_flat_pairs']} of "
-            f"{facts['num_verified_pairs']} pairs the camera only turns or the scene is flat: film "
-            "while moving sideways, or give a longer part of the video"
+            f"{facts['num_verified_pairs']} pairs the camera only rotates or the scene is flat: "
+            "film while moving sideways, or give a longer part of the video"
         )
     if not most_agree or facts["keypoints_per_image"] < _FEW_TRACKS:
         return (
@@ -123,7 +123,7 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
 def adjustment_stage(
     run: Run, tracks: Tracks, links: Tracks, chosen: ChosenImages, posed: Kept
 ) -> Kept:
-    """Adjust the poses on more tracks than the mapper can take: long ones, spread over the images.
+    """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
     Links take part whole: without them places seen again would drift apart once more.
 

@@ -208,7 +208,7 @@ def match_stage(
 
 
 def _pair_facts(matched: MatchedImages) -> dict[str, Any]:
-    """What explains why a mapper finds no start."""
+    """Facts of the pairs that explain why a mapper finds no initial pair."""
     configs = [geometry.config for geometry in matched.geometries]
     return {
         "forward_motion": matched.forward_motion,

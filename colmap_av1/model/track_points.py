@@ -1,4 +1,4 @@
-"""All tracks triangulated on poses that are known, with colours."""
+"""All tracks triangulated on known poses, with colours."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _ITERATIONS = 4
 _CONVERGED = 0.999
 # Error in pixels at which an observation counts half.
 _SOFT_ERROR = 1.0
-# Error in pixels that an observation has however sure its motion is.
+# Error in pixels that an observation has however accurate its motion is.
 SIGMA_FLOOR = 0.3
 # Error of a ray, where a point is looked at for the wrong distance, to its mean reprojection error.
 ERROR_TO_SIGMA = 2.0
@@ -112,7 +112,7 @@ def triangulate(
     "Triangulation", 1997), judged by all observations; Gauss-Newton steps on the reprojection
     error follow, weighted by the expected error of each observation and by how well it agrees.
     Observations beyond `max_reprojection_error`, or behind the camera, are dropped. What is dropped
-    may be a point of its own, where a track slid from one surface to another: it is tried once
+    may be a separate point, where a track slid from one surface to another: it is tried once
     more. Rays that meet at an angle a and are off by e give a distance to e / a of it; where that
     is too much there is no point.
 
@@ -400,7 +400,7 @@ def _widest_angle(group: _Group, xyz: _Floats, kept: NDArray[np.bool_]) -> _Floa
 def _is_sure(
     group: _Group, angle: _Floats, error: _Floats, options: TriangulateOptions
 ) -> NDArray[np.bool_]:
-    """Whether points of these angles and mean errors are where they seem to be."""
+    """Whether points with these triangulation angles and mean errors have an accurate depth."""
     wide = angle >= math.radians(options.min_angle)
     if options.max_depth_error is None:
         return wide

@@ -1,4 +1,4 @@
-"""The pinhole camera that shows what a distorted one does, and its pictures."""
+"""The undistorted pinhole camera of a distorted one, and its pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BISECTIONS = 40
 
 
 def pinhole_camera(camera: Any) -> Any:
-    """The undistorted camera of the same size: as wide a view as leaves no pixel empty.
+    """The undistorted camera of the same size, with the widest view without empty pixels.
 
     Args:
         camera: pycolmap.Camera of any perspective model.
@@ -78,7 +78,7 @@ def on_pinhole(camera: Any, pinhole: Any, xy: NDArray[np.float32]) -> NDArray[np
 
 
 def undistortion(camera: Any, pinhole: Any) -> Callable[[_Image], _Image] | None:
-    """A function that undistorts pictures; None where there is nothing to do."""
+    """A function that undistorts pictures; None without distortion."""
     if is_undistorted(camera):
         return None
     fx, fy, cx, cy = pinhole.params

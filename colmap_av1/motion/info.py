@@ -1,4 +1,4 @@
-"""What a stream is made of, and whether its motion is worth matching."""
+"""The structure of a stream, and whether its motion is good for matching."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class StreamReport:
 
     @property
     def good(self) -> bool:
-        """Whether the stream is any good for matching."""
+        """Whether the stream is good for matching."""
         return not self.reasons
 
 
@@ -86,7 +86,7 @@ def inspect(
     options: ReadOptions | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> StreamReport:
-    """Read a whole stream and judge how well its motion serves for matching.
+    """Read a whole stream and judge how good its motion is for matching.
 
     Args:
         video: the video file.
@@ -143,7 +143,7 @@ def inspect(
 
 @dataclass
 class Structure:
-    """Counts that tell how a stream is coded, as far as matching cares.
+    """Counts that describe how a stream is coded, as far as it matters for matching.
 
     Attributes:
         num_coded: frames with block data.

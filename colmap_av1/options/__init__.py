@@ -1,4 +1,4 @@
-"""Options of every stage: frozen dataclasses that refuse values that cannot work."""
+"""Options of every stage: frozen dataclasses that check their values."""
 
 from colmap_av1.options.camera import CameraOptions
 from colmap_av1.options.commands import (

@@ -18,7 +18,7 @@ PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
 
 @dataclass(frozen=True)
 class LearnedOptions(Options):
-    """How learned features are found and matched for a comparison."""
+    """How learned features are extracted and matched for a comparison."""
 
     title: ClassVar[str] = "learned features"
 
@@ -44,7 +44,7 @@ class LearnedOptions(Options):
 
 @dataclass(frozen=True)
 class CompareOptions(Options):
-    """Options of `compare`; of `match`, all but the selection of tracks and what to keep apply."""
+    """Options of `compare`; those of `match` apply but for track selection and existing rows."""
 
     title: ClassVar[str] = "comparison"
 
@@ -56,13 +56,13 @@ class CompareOptions(Options):
     triangulate: TriangulateOptions = part(TriangulateOptions())
     frontends: tuple[str, ...] = option(
         ("av1", "av1-refined", "sift-exhaustive", "sift-sequential"),
-        "what is compared, in this order: av1, av1-sparse, av1-dense, the same as av1-refined..., "
-        "sift-exhaustive, sift-sequential, disk-lightglue, aliked-lightglue, and matches of other "
-        "programs in hloc's layout as NAME=FEATURES.h5:MATCHES.h5",
+        "front-ends to compare, in this order: av1, av1-sparse, av1-dense, av1-refined, "
+        "av1-refined-sparse, av1-refined-dense, sift-exhaustive, sift-sequential, disk-lightglue, "
+        "aliked-lightglue, and matches of other programs in hloc's layout as NAME=FEATURES.h5:MATCHES.h5",
         common=True,
     )
     all_tracks: bool = option(
-        True, "add to each of this package's models one of all its tracks on the same poses"
+        True, "for each of this package's models, add one with all tracks on the same poses"
     )
     trainer: str | None = option(
         None,
@@ -87,7 +87,7 @@ class CompareOptions(Options):
 
 
 def _check_trainer(trainer: str) -> None:
-    """Refuse a command that cannot be filled in."""
+    """Refuse a command whose placeholders are unknown."""
     if trainer == GSPLAT:
         return
     known = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)

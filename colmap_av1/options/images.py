@@ -54,7 +54,7 @@ class ImageOptions(Options):
     first_number: int | None = option(
         None,
         "number of the video's first frame in the names of existing images; None: only names that "
-        "leave no doubt about the frame are accepted",
+        "determine the frame are accepted",
     )
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class ImageOptions(Options):
 
 
 def check_image_pattern(pattern: str) -> str:
-    """Refuse a pattern that cannot name images, such as 'frame_%06d.png' can.
+    """Refuse a pattern that cannot name images; 'frame_%06d.png' can.
 
     Returns:
         The pattern's number field.
@@ -93,7 +93,7 @@ def check_image_pattern(pattern: str) -> str:
 
 
 def check_extension(name: str) -> None:
-    """Refuse a name that says no format of images.
+    """Refuse a name without the extension of an image format.
 
     Raises:
         OptionError: so it does.

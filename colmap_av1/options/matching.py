@@ -94,7 +94,7 @@ class VerifyOptions(Options):
     )
     max_samples: int = option(
         128,
-        "matches, spread over the image, on which the robust estimators search a model; it is "
+        "matches, spread over the image, on which the robust estimators search; a model is "
         "refined on more of them and tested on all",
         least=MIN_MATCHES,
     )

@@ -13,7 +13,7 @@ Mapper = Literal["incremental", "global"]
 
 @dataclass(frozen=True)
 class TriangulateOptions(Options):
-    """What makes a track a point."""
+    """Which tracks become points."""
 
     title: ClassVar[str] = "points"
 
@@ -105,7 +105,7 @@ class MapOptions(Options):
 
 @dataclass(frozen=True)
 class MapperOptions(Options):
-    """How the poses are found."""
+    """How poses are estimated."""
 
     title: ClassVar[str] = "poses"
 
@@ -118,10 +118,12 @@ class MapperOptions(Options):
     refine_intrinsics: bool | None = option(
         None, "refine focal length and distortion; None: unless camera_params are given"
     )
-    pose_tracks_per_image: int = option(600, "tracks of an image that poses are found on", least=50)
+    pose_tracks_per_image: int = option(
+        600, "tracks of each image that poses are estimated from", least=50
+    )
     pose_spacing: float = option(
         16.0,
-        "width in pixels of the cells of an image that one of these tracks each is selected for",
+        "width in pixels of the cells of an image; one of these tracks is selected for each",
         least=0,
         unit="pixels",
     )
@@ -138,7 +140,7 @@ class MapperOptions(Options):
 
 @dataclass(frozen=True)
 class ExportOptions(Options):
-    """What is written of a database for other programs."""
+    """What is exported from a database for other programs."""
 
     title: ClassVar[str] = "files"
 

@@ -1,4 +1,4 @@
-"""Options of chaining motion into tracks, of refining these and of selecting among them."""
+"""Options of chaining motion into tracks, refining these and selecting among them."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class DensityOptions(Options):
     )
     wide_tracks: int | None = option(
         None,
-        "tracks that an image keeps beyond that for wide baselines: those that moved nearly as far "
-        "as any, with errors up to a thirtieth of the distance; 0: none",
+        "further tracks of each image for wide baselines: those that moved nearly as far as any, "
+        "with errors up to a thirtieth of that distance; 0: none",
         least=0,
     )

@@ -1,4 +1,4 @@
-"""Tracks of what does not belong to the scene but lies over the picture: logos, dashboards."""
+"""Tracks of overlays, which are not part of the scene: logos, dashboards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
 
 # Pixels that nothing over the picture moves by: the finest step of a motion vector.
 _STILL = 0.125
-# Pixels that the picture moves by along a track, before standing still tells anything. Far points
+# Pixels that the picture moves by along a track, before standing still means anything. Far points
 # stand still for a while before a camera that moves sideways.
 _MOVED = 4.0
 # Steps to a frame that their median is taken of, on average, where there are more.
@@ -17,7 +17,7 @@ _NUM_STEPS = 1000
 
 
 def remove_overlays(tracks: Tracks) -> Tracks:
-    """Leave out the tracks that stand still while the picture moves.
+    """Remove the tracks that stand still while the picture moves.
 
     A picture moves by the median step of its tracks, of a thousand or more where there are so many,
     from frame to frame. Where the camera rests nothing is left out.
@@ -43,7 +43,7 @@ def remove_overlays(tracks: Tracks) -> Tracks:
 
 
 def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
-    """Median step in pixels that leads to each frame: float64 [num_frames], 0 where none does."""
+    """Median motion of tracks into each frame in pixels: float64 [num_frames], 0 without any."""
     starts = np.zeros(len(tracks.frame), dtype=np.bool_)
     starts[tracks.offsets[:-1]] = True
     # Every n-th: steps of a track follow each other, so all tracks have their part.

@@ -1,4 +1,4 @@
-"""Sub-pixel correction of tracks on decoded pictures; needs pixels, unlike all before it."""
+"""Sub-pixel correction of tracks on decoded pictures, the first stage that needs pixels."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def match_tracks(
     options: RefineOptions,
     progress: Callable[[int], None] | None = None,
 ) -> RefinedTracks:
-    """Do the work of `refine_tracks`, and tell how every observation was found.
+    """Do the work of `refine_tracks`, and return how every observation was found.
 
     Args and errors are those of `refine_tracks`.
     """
@@ -116,7 +116,7 @@ def match_tracks(
 
 @dataclass
 class RefinedTracks:
-    """What is known of every track after some of the frames.
+    """The state of every track after some of the frames.
 
     Attributes:
         xy: float32 [num_observations, 2] corrected positions in pixels.
@@ -235,7 +235,7 @@ class RefinedTracks:
         found: _Matches,
         source: NDArray[np.int64],
     ) -> NDArray[np.bool_]:
-        """Take over the matches that are good enough; tells which are.
+        """Take over the matches that are good enough; returns which are.
 
         Args:
             observations: int64 [n].
@@ -305,7 +305,7 @@ class _Templates:
         return np.asarray(framed, dtype=np.uint8)
 
     def drop(self, track: NDArray[np.int64]) -> None:
-        """Let go of the tracks' templates."""
+        """Release the tracks' templates."""
         track = track[self.slot[track] >= 0]
         self.free[self.num_free : self.num_free + len(track)] = self.slot[track]
         self.num_free += len(track)
@@ -345,7 +345,7 @@ class _Templates:
 def _texture(
     image: NDArray[np.uint8], window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What the window around every pixel holds for matching.
+    """The texture of the window around every pixel.
 
     Returns:
         float32 [height, width] standard deviation in pixels of a match in the worst direction

@@ -1,4 +1,4 @@
-"""Which tracks are used: few and sure ones for poses, more for maps, all for dense clouds."""
+"""Selection of tracks: few accurate ones for poses, more for maps, all for dense clouds."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.presets import limits_of
 from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
 
-# Error in pixels that an observation has however sure its motion is; keeps one sure
+# Error in pixels that an observation has however accurate its motion is; keeps one sure
 # observation from outweighing many good ones.
 _SIGMA_FLOOR = 0.3
-# What an observation tells of the cameras is its motion beside its error: one that moved far may
-# be less sure, up to this share of the way.
+# What an observation says of the cameras is its motion relative to its error: one that moved far
+# may be less accurate, up to this share of the distance.
 _MAX_ERROR_SHARE = 1 / 30
 # An observation is wide that moved at least this share of what those that moved farthest did.
 _WIDE = 0.8
 
 
 def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
-    """Choose tracks that are long, sure and spread over every image.
+    """Choose tracks that are long, accurate and spread over every image.
 
-    Observations less sure than `max_sigma`, against the first one of their track, are left out
-    but for those of wide views: of each image, so many as `wide_tracks` that moved nearly as far
-    from there as any of its do, the surest beside their way, and all that are as sure; where the
-    error is a thirtieth of the way or less. Then tracks are taken best
+    Observations with an error above `max_sigma`, relative to the first one of their track, are left
+    out but for those with a wide baseline: of each image, `wide_tracks` that moved nearly as far
+    from there as any of its do, those with the least error for their distance, and all that are as
+    accurate; where the error is a thirtieth of the distance or less. Then tracks are taken best
     first, the weight of an observation being its inverse expected variance. One is used where at
     least half of its observations lie in images that are not full, and there in cells, `spacing`
     wide, that no better track lies in; it loses the observations in full images.
@@ -77,7 +77,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
 
 
 def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
-    """Variance of each observation against the first of its track that is left, in px^2."""
+    """Variance of each observation relative to the first kept one of its track, in px^2."""
     variance = tracks.sigma * tracks.sigma
     variance -= np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
     np.maximum(variance, 0, out=variance)
@@ -85,7 +85,7 @@ def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
 
 
 def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
-    """Distance of each observation to the first of its track that is left, in px."""
+    """Distance of each observation to the first kept one of its track, in px."""
     squared = np.zeros(len(tracks.xy), dtype=np.float32)
     for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
         step = np.repeat(along[tracks.offsets[:-1]], np.diff(tracks.offsets))
@@ -98,7 +98,7 @@ def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
 def _error_shares(
     tracks: Tracks, error: NDArray[np.float32], way: NDArray[np.float32], wide_tracks: int
 ) -> NDArray[np.float32]:
-    """Error allowed in each frame as a share of the way, [num_frames]: what its wide views need."""
+    """Error allowed in each frame for wide baselines, as a share of the motion, [num_frames]."""
     if wide_tracks == 0:
         return np.zeros(tracks.num_frames, dtype=np.float32)
     shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)

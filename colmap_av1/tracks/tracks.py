@@ -62,10 +62,10 @@ def build_tracks(
     found where its displacement lands in the referenced frame, to the sub-pixel place
     that moves exactly onto it, and a track moves with its unit into a reference shown
     later. Where two tracks want one cell, a unit unless `options.cell` cuts it into parts, the
-    longer goes on. Frames are chained in display order
+    longer is continued. Frames are chained in display order
     and links to the nearest frame come first, so a frame that was coded far ahead is reached by
     the short steps between; frames that are never shown are chained through last. A unit without
-    motion of its own moves as those on either side of it do, where these agree. A unit without a
+    coded motion moves as those on either side of it do, where these agree. A unit without a
     track starts one at its centre. No cell holds two tracks, no frame sees a track twice. Frames
     are consumed one by one; beyond a few frames of motion, memory grows with the observations
     only.
@@ -165,7 +165,7 @@ def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
 
 
 def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
-    """The tracks that are seen in `min_length` frames or more, in their former order."""
+    """The tracks that are observed in `min_length` frames or more, in their former order."""
     lengths = np.diff(tracks.offsets)
     return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
 
@@ -229,7 +229,7 @@ def least_length(options: TrackOptions) -> int:
 
 
 def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:
-    """The options as the core counts: cells instead of their widths."""
+    """The options as the C++ core takes them: cells instead of their widths."""
     # Squares that tracks start in are not smaller than those that hold one.
     cell = options.cell or min(_UNIT, options.seeding)
     core = _core.TrackBuilderOptions()

@@ -56,7 +56,7 @@ class VideoSource:
 
 @dataclass(frozen=True)
 class TrackedVideo:
-    """The tracks of a video, and what was noticed while they were made.
+    """The tracks of a video, and the findings made on the way.
 
     Attributes:
         tracks: tracks through all shown frames.
@@ -76,7 +76,7 @@ class TrackedVideo:
 def open_source(
     video: Video, options: MatchOptions, *, beside: Path, clock: Clock, progress: Progress
 ) -> Iterator[VideoSource]:
-    """Find the AV1 stream of a video, or make it: its motion is read, not its pictures.
+    """Find the AV1 stream of a video, or make it by converting; motion is read from it.
 
     A stream that is made lasts as long as the body, unless the options say where it is kept.
 
@@ -85,7 +85,7 @@ def open_source(
         options: those of encoding and reading are used.
         beside: the file or folder that is being made, which gets the stream beside it meanwhile.
         clock: gets the stage "encoding" where a stream is made.
-        progress: told about the stage "encoding".
+        progress: called for the stage "encoding".
 
     Raises:
         VideoError: the video cannot be converted.
@@ -152,7 +152,7 @@ def track_video(
         one_size: refuse shown frames of several sizes, as refinement does.
         clock: gets the stages "motion" and "tracks", with refinement "decoding" and
             "refinement".
-        progress: told about the stages "motion" and "refinement".
+        progress: called for the stages "motion" and "refinement".
 
     Raises:
         VideoError: the video shows no frame.
@@ -200,7 +200,7 @@ def track_video(
     bits = 8 * source.stream.path.stat().st_size
     reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
     if reasons and source.stream is source.pictures:
-        notes.append(f"{'; '.join(reasons)}; or let --reencode 1 convert the video first")
+        notes.append(f"{'; '.join(reasons)}; or use --reencode 1 to convert the video first")
     inter_share = _inter_share(structure, num_frames, source.pictures.presented)
     return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
 

@@ -1,4 +1,4 @@
-"""What tells inputs, options, code and products from others: digests."""
+"""Digests of inputs, options, code and products."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _read_digest(path: Path) -> str:
 
 
 def file_record(path: Path) -> dict[str, Any]:
-    """What `is_as_recorded` tells later changes of a file by, as JSON holds it.
+    """The record by which `is_as_recorded` detects changes of a file, as JSON holds it.
 
     Raises:
         OSError: it cannot be read.
@@ -75,9 +75,9 @@ def file_record(path: Path) -> dict[str, Any]:
 def is_as_recorded(path: Path, record: dict[str, Any]) -> bool:
     """Whether a file is there and holds what it held when it was recorded.
 
-    It is read only where its times differ, as those of copies do, or were too fresh to be told
-    from later ones: all images of a long video take a while to read, most of all from a disk on
-    the network. One of the times is that of the last change of the file's attributes, which
+    It is read only where its times differ, as those of copies do, or were too recent to be
+    distinguished from later ones: all images of a long video take a while to read, most of all from
+    a network disk. One of the times is that of the last change of the file's attributes, which
     programs cannot set, so that other content under an old date is noticed, too.
     """
     try:
@@ -95,7 +95,7 @@ def _times(status: os.stat_result) -> list[int]:
 
 
 def _sure_times(status: os.stat_result) -> list[int] | None:
-    """The times of a file's changes; None where they may stay through another one."""
+    """The times of a file's changes; None where another change could leave them as they are."""
     times = _times(status)
     return times if time.time_ns() - max(times) > _UNSURE_NS else None
 
@@ -137,14 +137,14 @@ def digest_of(values: Iterable[Any], *, timed: bool = False) -> str:
         timed: the time that the result takes is of interest, too: all fields count.
 
     Raises:
-        TypeError: something is of another type, which nothing is known to tell apart by.
+        TypeError: something is of another type, whose values cannot be distinguished.
     """
     text = _spell(list(values), frozenset() if timed else WITHOUT_EFFECT)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _spell(value: Any, left_out: frozenset[str]) -> str:
-    """The value as text; that of another value is another one."""
+    """The value as text, different for different values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         names = (field.name for field in dataclasses.fields(value))
@@ -159,4 +159,4 @@ def _spell(value: Any, left_out: frozenset[str]) -> str:
         return repr(os.fspath(value))
     if value is None or type(value) in (bool, int, float, str):
         return repr(value)
-    raise TypeError(f"{value!r}: tell apart by a plain value")
+    raise TypeError(f"{value!r}: give a plain value")

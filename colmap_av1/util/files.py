@@ -1,4 +1,4 @@
-"""Files and folders that appear under their names only when whole, and only one run in each."""
+"""Files and folders that appear under their names only when complete; one run in each."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import h5py
 
 
 class _Storage(io.FileIO):
-    """A file that keeps its first failure to itself: the HDF5 library crashes where it learns."""
+    """A file that hides its first failure from the HDF5 library, which would crash."""
 
     failure: OSError | None = None
 

@@ -1,4 +1,4 @@
-"""What the stages of a long run tell: how far they are, and how long they took."""
+"""Progress of the stages of a long run, and the time they took."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _Item = TypeVar("_Item")
 
 
 def no_progress(stage: str, done: int, total: int | None) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that reports nothing."""
     del stage, done, total
 
 

@@ -29,7 +29,7 @@ def ending_in_order() -> Iterator[None]:
 
     Raises:
         KeyboardInterrupt: the process is interrupted.
-        SystemExit: it is told to end.
+        SystemExit: a signal ends it.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():

@@ -1,7 +1,7 @@
 """Stages of a long run that are kept in a folder, so that a later run resumes after them.
 
 A stage's record is written when all it makes is there: a key of what the result depends on, facts,
-and what tells the products from others. A later run takes over the stage where the key is the
+and the digests of the products. A later run takes over the stage where the key is the
 same and the products are as recorded. All else is made again, damaged records and products too.
 The key holds options and inputs by their content, and this package's code and version.
 """
@@ -38,7 +38,7 @@ class Kept:
 
     Attributes:
         facts: what the stage found, as JSON holds it.
-        digest: tells its result, products included, from others: what stages after it depend on.
+        digest: identifies its result, products included: what stages after it depend on.
         resumed: it was finished by an earlier run.
     """
 
@@ -133,7 +133,7 @@ def run_stage(
             raise  # of what is read
         raise ModelError(
             f"{into}: cannot be written: {error.strerror or error}: the stages before are kept, "
-            "run the same command again once that is mended"
+            "run the same command again once that is fixed"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What a container says of its video, and the packets of AV1; FFmpeg (through PyAV) demuxes."""
+"""Facts of a video in its container, and the packets of AV1; FFmpeg (through PyAV) demuxes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Packet:
 
 @dataclass(frozen=True)
 class VideoFile:
-    """What a file of any codec says of its video, without decoding.
+    """Facts of a video file of any codec, without decoding.
 
     It stands for the file's path where one is asked for.
 
@@ -89,7 +89,7 @@ class VideoFile:
 
 
 def read_file(video: str | os.PathLike[str]) -> VideoFile:
-    """Look into a file of any codec; the same object where that has been done.
+    """Read the facts of a file of any codec; the same object where that has been done.
 
     Raises:
         VideoError: as `decode_frames`.
@@ -197,7 +197,7 @@ class VideoStream:
             raise VideoError(f"{self.file}: holds no frame: give a video with pictures")
 
     def _missing_end(self, count: int, last: Any) -> str | None:
-        """What shows that the file is cut off, where demuxers end as if it were whole."""
+        """Evidence that the file is cut off, where demuxers end as if it were complete."""
         file = self.file
         if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
             return f"cut off: {count} of {file.num_packets} packets are there"
@@ -271,7 +271,7 @@ def _is_ivf_without_rate(path: Path) -> bool:
 
 @contextmanager
 def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
-    """Open a file of any container, with words for what can go wrong."""
+    """Open a file of any container, with clear messages for what can go wrong."""
     file: _IvfWithRate | None = None
     try:
         if not path.exists():

@@ -1,4 +1,4 @@
-"""How players show the pictures of a video: cut, turned, and with pixels that may not be square."""
+"""How players show the pictures of a video: cropped, turned, with pixels of any aspect."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def turn_of_matrix(matrix: Sequence[int]) -> Turn | None:
 
 
 def turned_back(display: Display) -> Display:
-    """What turns shown pictures back to how they are stored; what was cut off stays so."""
+    """The turn from shown pictures back to stored ones; what was cropped stays cropped."""
     (a, b), (c, d) = display.turn
     aspect = display.pixel_aspect if a else 1 / display.pixel_aspect
     return Display(turn=((a, c), (b, d)), pixel_aspect=aspect)

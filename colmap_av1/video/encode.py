@@ -1,4 +1,4 @@
-"""Conversion of any video to an AV1 stream whose motion is worth reading; ffmpeg does it."""
+"""Conversion of any video to an AV1 stream with good motion, by ffmpeg."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen
 
 
 def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
-    """How many frames are the same to ffmpeg, which wrote `count`, and to who reads pictures.
+    """How many of the `count` frames that ffmpeg wrote readers of pictures see as well.
 
     ffmpeg goes on after damage, and the frames it leaves out shift those that follow.
     """
@@ -326,7 +326,7 @@ def _mark(facts: Mapping[str, object]) -> str:
 
 
 def _mark_of(stream: Path) -> dict[str, str] | None:
-    """What a kept stream was made with; None where it is none."""
+    """The record of how a kept stream was made; None where there is none."""
     try:
         with av.open(os.path.abspath(stream)) as opened:
             tags = {key.lower(): value for key, value in opened.metadata.items()}
@@ -339,7 +339,7 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
 
 
 def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
-    """Whether a kept stream was made of the video with what is asked for now."""
+    """Whether a kept stream was made from the video with the present options."""
     if mark.get("encoder") not in ENCODERS or mark.get("source") != str(_size(video)):
         return False
     encoder = None if options.encoder == "auto" else options.encoder

@@ -1,4 +1,4 @@
-"""AV1 encoders of ffmpeg, their words, and which of them works here."""
+"""AV1 encoders of ffmpeg, their options, and which of them works here."""
 
 from __future__ import annotations
 
@@ -196,4 +196,4 @@ def reason_of(text: str) -> str:
     # Later lines say that the conversion failed, the first says why. Where ffmpeg itself has
     # not come to speak, whoever stands in its place has.
     grave = [line for line in lines if _GRAVE.search(line)] or lines
-    return _MESSAGE_SOURCE.sub("", grave[0]).rstrip(".") if grave else "it ended without a word"
+    return _MESSAGE_SOURCE.sub("", grave[0]).rstrip(".") if grave else "it ended without a message"

@@ -1,4 +1,4 @@
-"""A video: what its file says and how players show its pictures, read once and passed on."""
+"""A video: facts of its file and how players show its pictures, read once and passed on."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CROPPING = re.compile(r"^ +Frame Cropping: (\d+)/(\d+)/(\d+)/(\d+)$", re.MULTIL
 
 @dataclass(frozen=True, eq=False)
 class Video(VideoFile):
-    """A video that can be decoded: what its file says, and how players show its pictures.
+    """A video that can be decoded: facts of its file, and how players show its pictures.
 
     Attributes:
         picture_size: (width, height) in pixels of the pictures that `decode_frames` gives.
@@ -92,7 +92,7 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
 def _display(
     path: Path, frame: Any, crop: tuple[int, int, int, int], stored_aspect: float
 ) -> Display:
-    """How a decoded frame is shown, whose container cuts it and tells its pixels' shape."""
+    """How a decoded frame is shown: crop and pixel aspect come from its container."""
     matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
     turn = Display().turn if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
     if turn is None:

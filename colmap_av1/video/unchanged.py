@@ -1,4 +1,4 @@
-"""Files that are read several times, and must stay as they are meanwhile."""
+"""Files that are read several times, and must not change meanwhile."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_av1.errors import ColmapAv1Error, VideoError
 
 @dataclass(frozen=True)
 class FileState:
-    """What tells a file from such as take its place, or the same one written on.
+    """The state of a file, which differs where it is replaced or written to.
 
     Attributes:
         path: the file, as it was given.
@@ -45,14 +45,14 @@ def check_unchanged(*before: FileState) -> None:
     changed = next((state for state in before if file_state(state.path) != state), None)
     if changed is not None:
         raise VideoError(
-            f"{changed.path}: changed or went while it was read: let it be, and run the same "
-            "command again"
+            f"{changed.path}: changed or disappeared while it was read: leave it "
+            "unchanged, and run the same command again"
         )
 
 
 @contextmanager
 def unchanged(*before: FileState) -> Iterator[Callable[[], None]]:
-    """Refuse videos that do not stay as they were while the body reads them.
+    """Refuse videos that change while the body reads them.
 
     Yields:
         Refuses them at once where they have changed already: for before something is kept.

@@ -1,4 +1,4 @@
-"""Pictures of what the package sees: motion and tracks over frames, matches, models."""
+"""Drawings of motion and tracks over frames, of matches and of models."""
 
 from colmap_av1.view.matches import view_database
 from colmap_av1.view.model import serve_model, view_model

@@ -70,7 +70,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OptionError(
-                f"{path}: cannot be made: {error.strerror}: mend that, or give another path"
+                f"{path}: cannot be made: {error.strerror}: fix that, or give another path"
             ) from error
         yield write_file
         return

@@ -178,7 +178,7 @@ CHANGES = {
             "WHERE pair_id % 3 = 0",
             "UPDATE matches SET rows = 0, data = NULL WHERE pair_id % 3 = 0",
         ],
-        "note: 10 pairs were matched in vain",
+        "note: 10 pairs were matched without result",
         True,
     ),
     "no model": (

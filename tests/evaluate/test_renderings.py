@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_refused(photograph: np.ndarray, tmp_path: Path) ->
     small = write(tmp_path / "small.png", photograph[:100])
     with pytest.raises(ImageError, match="render at the size"):
         rendering_metrics([small], [large])
-    with pytest.raises(ImageError, match="is missing or no image"):
+    with pytest.raises(ImageError, match="is missing or not an image"):
         rendering_metrics([tmp_path / "none.png"], [large])
     with pytest.raises(ImageError, match="0 rendered images for 1 references"):
         rendering_metrics([], [large])

@@ -147,7 +147,7 @@ def test_other_pictures(tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="3 images, but the video has 2 frames"):
         frames_by_content(files, enumerate(pan(2, 2)))
     files[0].write_bytes(b"no image")
-    with pytest.raises(ImageError, match="is missing or no image"):
+    with pytest.raises(ImageError, match="is missing or not an image"):
         frames_by_content(files, enumerate(pan(12, 2)))
 
 

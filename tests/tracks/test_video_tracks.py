@@ -144,7 +144,7 @@ def test_a_poor_stream_is_told_of_where_it_could_be_converted(
     source = opened(often)
     (note,) = tracked(source).warnings
     assert note.startswith("a key frame every 4.0 frames")
-    assert note.endswith("; or let --reencode 1 convert the video first")
+    assert note.endswith("; or use --reencode 1 to convert the video first")
     video = ffmpeg("-i", often, "-c:v", "libx264", tmp_path / "video.mp4")
     assert tracked(replace(source, pictures=read_video(video))).warnings == ()
 

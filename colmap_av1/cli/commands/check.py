@@ -26,7 +26,7 @@ def add_check(commands: Any) -> None:
     command.add_argument(
         "--strict",
         action="store_true",
-        help="exit with status 1 where something stops the mappers",
+        help="exit with status 1 if the mappers cannot use the database",
     )
 
 

@@ -65,5 +65,5 @@ def _run(namespace: argparse.Namespace) -> None:
     print_result(namespace, compare_rows(result), result.warnings)
     if all(column.model is None for column in result.columns):
         raise EvaluationError(
-            f"{result.output}: no front-end gave a model: report.md there says why of each"
+            f"{result.output}: no front-end gave a model: report.md there gives the reason for each"
         )

@@ -33,9 +33,9 @@ def add_densify(commands: Any) -> None:
     command.add_argument(
         "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
     )
-    add_video(command, "the video that its images are frames of")
+    add_video(command, "the video from which its images were taken")
     add_output(command, "new folder for the model")
-    add_images(command, "folder of its images, where their names leave doubt about the frames")
+    add_images(command, "folder of its images, where their names do not determine the frames")
     add_options(command, DensifyOptions)
     add_quiet(command)
 

@@ -24,7 +24,7 @@ def add_encode(commands: Any) -> None:
         commands,
         "encode",
         _run,
-        "convert a video to a good AV1 stream",
+        "convert a video to an AV1 stream that is good for matching",
         "--video PATH --output PATH",
     )
     add_video(command, "a video that ffmpeg decodes")

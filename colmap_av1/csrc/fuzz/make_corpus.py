@@ -26,7 +26,7 @@ _NUM_RANDOM = 4
 
 
 def temporal_units(ivf: bytes) -> list[bytes]:
-    """The units of an IVF file; of a damaged one those that can be told."""
+    """The units of an IVF file; of a damaged one those that can be found."""
     units = []
     position = _IVF_HEADER_SIZE
     while position + _IVF_FRAME_HEADER_SIZE <= len(ivf):

@@ -1,1 +1,1 @@
-"""What is compared: front-ends, the images they share, the mapper after them."""
+"""The front-ends that are compared, the images they share, and the mapper on their databases."""

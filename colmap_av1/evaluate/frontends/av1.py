@@ -1,4 +1,4 @@
-"""The front-end that is this package's `match`."""
+"""This package's `match` as a front-end."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def frame_list(footage: Footage, path: Path, names: Collection[str] | None = Non
 
 
 def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOptions) -> bool:
-    """Whether neighbouring images lie behind each other; only known intrinsics tell."""
+    """Whether the camera moves along its axis; decided only with known intrinsics."""
     if options.camera.camera_params is None:
         return False
     tracks, chosen = prepared.tracks, prepared.chosen

@@ -1,4 +1,4 @@
-"""What a front-end is: images or video in, rows of a COLMAP database out; and a run of one."""
+"""A front-end: images or a video in, rows of a COLMAP database out; and a run of one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FrontendRun:
         database: the COLMAP database.
         seconds: wall time of each stage.
         cpu_seconds: CPU time of all stages together.
-        peak_memory: largest resident memory in bytes; None where the system does not tell.
+        peak_memory: largest resident memory in bytes; None where the system does not report it.
     """
 
     name: str

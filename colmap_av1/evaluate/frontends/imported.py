@@ -1,4 +1,4 @@
-"""The front-ends that are other programs: what they wrote in hloc's layout, verified by COLMAP."""
+"""Other programs as front-ends: their files in hloc's layout, verified by COLMAP."""
 
 from __future__ import annotations
 

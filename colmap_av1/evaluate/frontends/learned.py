@@ -1,4 +1,4 @@
-"""The front-ends of learned features and LightGlue's matches, from a program of their own."""
+"""Learned features with LightGlue's matches as front-ends, in a separate process."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _EXTRACTORS = {"disk": DISK, "aliked": ALIKED}
 
 
 def main() -> int:
-    """Do what standard input says."""
+    """Extract and match as the JSON on standard input says."""
     task = json.load(sys.stdin)
     torch.set_num_threads(task["num_threads"])
     torch.manual_seed(0)

@@ -29,7 +29,7 @@ class MapperRun:
         num_models: models that came out.
         seconds: wall time of the mapper.
         cpu_seconds: its CPU time.
-        peak_memory: largest resident memory in bytes; None where the system does not tell.
+        peak_memory: largest resident memory in bytes; None where the system does not report it.
     """
 
     model: Path | None

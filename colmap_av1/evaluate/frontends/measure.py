@@ -30,7 +30,7 @@ class Measured(Generic[_Result]):
         seconds: wall time.
         cpu_seconds: CPU time of all its threads and of the processes it waited for.
         peak_memory: largest resident memory of its process, or of one it waited for, in bytes,
-            the interpreter and its libraries included; None where the system does not tell.
+            the interpreter and its libraries included; None where the system does not report it.
     """
 
     result: _Result

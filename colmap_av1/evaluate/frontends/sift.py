@@ -1,4 +1,4 @@
-"""The front-ends that are COLMAP's: SIFT, matched between neighbours or all images."""
+"""COLMAP's SIFT as front-ends, matched sequentially or exhaustively."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What is measured: tracks, poses, clouds, renderings."""
+"""Metrics of tracks, poses, clouds and renderings."""

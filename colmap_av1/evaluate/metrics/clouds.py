@@ -65,7 +65,7 @@ def cloud_distances(
 
 
 def depth_differences(model: Any, reference: Any, *, pixels: float = 5.0) -> NDArray[np.float64]:
-    """How far the depths of a model's points are from those of points beside them.
+    """Relative differences of a model's depths to those of another model's points nearby.
 
     A point is looked at in the image in the middle of its track, and so are the three points of the
     reference that lie nearest to it there, of those that four images or more see. The one of the

@@ -1,4 +1,4 @@
-"""The tracks that the verified matches of a database make, whichever front-end wrote them."""
+"""Tracks joined from the verified matches of a database, whichever front-end wrote them."""
 
 from __future__ import annotations
 

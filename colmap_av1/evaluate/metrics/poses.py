@@ -17,7 +17,7 @@ from colmap_av1.model.colmap_model import camera_centres, posed_images
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """How far estimated poses are from the truth.
+    """Errors of estimated poses against the ground truth.
 
     Attributes:
         num_poses: frames whose pose is both estimated and known.
@@ -46,7 +46,7 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class Similarity:
-    """A move to other coordinates, x' = scale * rotation x + translation.
+    """A similarity transformation, x' = scale * rotation x + translation.
 
     Attributes:
         scale: the scale.
@@ -72,7 +72,7 @@ class Similarity:
 def fit_similarity(
     cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> Similarity | None:
-    """The similarity that fits the centres of poses best to those of others (Umeyama).
+    """The similarity that aligns camera centres best with those of other poses (Umeyama).
 
     Args:
         cam_from_world: float64 [n, 3, 4] poses, NaN where there is none.
@@ -100,7 +100,7 @@ def fit_similarity(
 def pose_errors(
     cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> PoseErrors | None:
-    """Compare poses with the truth after the similarity that fits their centres best (Umeyama).
+    """Compare poses with the ground truth after similarity alignment of their centres (Umeyama).
 
     Args:
         cam_from_world: float64 [num_frames, 3, 4] estimated poses, NaN where there is none.
@@ -176,7 +176,7 @@ def _in_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_
 def _relative_errors(
     aligned: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """RMS errors of the motion from each pose to the next: of the translation, of the turn."""
+    """RMS errors of the motion from each pose to the next: of translation and of rotation."""
     translation, turn = zip(*map(_motions, (aligned, truth)), strict=True)
     distance = np.linalg.norm(translation[0] - translation[1], axis=1)
     angle = np.degrees((turn[0] * turn[1].inv()).magnitude())
@@ -184,7 +184,7 @@ def _relative_errors(
 
 
 def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
-    """Translation, in the first camera's axes, and turn from each pose to the next."""
+    """Translation, in the first camera's axes, and rotation from each pose to the next."""
     rotation, step = cam_from_world[:, :, :3], np.diff(camera_centres(cam_from_world), axis=0)
     turn = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
     return np.einsum("nij,nj->ni", rotation[:-1], step), turn
@@ -193,7 +193,7 @@ def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 def _rotation_errors(
     estimated: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Angles in degrees between orientations [n, 3, 3] under the turn of the world that fits best.
+    """Angles in degrees between orientations [n, 3, 3] after the best rotation of the world.
 
     Not under the turn that fits the centres: these lie nearly on a line where a car drives, and
     leave the turn about it open.

@@ -1,4 +1,4 @@
-"""How close rendered images come to photographs: PSNR-Y, SSIM, VMAF, LPIPS, sharpness."""
+"""Metrics of rendered images against photographs: PSNR-Y, SSIM, VMAF, LPIPS, sharpness."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def rendering_metrics(
         progress: called with the number of images done so far.
 
     Raises:
-        ImageError: a file is missing or no image, or the sizes of a pair differ.
+        ImageError: a file is missing or not an image, or the sizes of a pair differ.
     """
     if len(rendered) != len(references) or not rendered:
         raise ImageError(
@@ -162,7 +162,7 @@ def _luma(image: _Image) -> NDArray[np.float64]:
 def _read(path: Path) -> _Image:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if image is None:
-        raise ImageError(f"{path}: is missing or no image: render it again")
+        raise ImageError(f"{path}: is missing or not an image: render it again")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -191,7 +191,7 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
                     pipe.write(_read(path).tobytes())
             words = process.communicate()[1].decode(errors="replace").split("\n")
         if process.returncode != 0:
-            reason = next((line for line in words if line.strip()), "it ended without a word")
+            reason = next((line for line in words if line.strip()), "it ended without a message")
             raise ImageError(f"ffmpeg cannot measure VMAF: {reason}")
         frames: list[dict[str, Any]] = json.loads((Path(folder) / "log.json").read_text())["frames"]
     names = ("psnr_y", "float_ssim", "vmaf")

@@ -1,4 +1,4 @@
-"""Sequences with what is truly known of their cameras."""
+"""Sequences with ground truth of their cameras."""
 
 from __future__ import annotations
 

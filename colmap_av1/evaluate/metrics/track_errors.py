@@ -1,4 +1,4 @@
-"""How far tracks stray from the truth, by the number of frames they are followed over."""
+"""Errors of tracks against ground truth, by the number of frames they span."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def epipolar_errors(
 def exact_errors(
     tracks: Tracks, transfer: Transfer, span: int, *, max_pairs: int | None = 50_000
 ) -> NDArray[np.float64]:
-    """Where tracks are, less where they would be had they kept to the surface point.
+    """Positions of tracks minus the true projections of their surface points.
 
     A point that another surface hides by then still has a true position: a track that goes on
     with what hides it is wrong by its distance to that.

@@ -1,4 +1,4 @@
-"""How many tracks there are, how long they are and how they cover the images."""
+"""Number and length of tracks, and how they cover the images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CELL = 16
 
 @dataclass(frozen=True)
 class TrackStatistics:
-    """Figures of the tracks as the images see them.
+    """Figures of tracks, counted in images.
 
     Attributes:
         num_images: number of images.
@@ -39,7 +39,7 @@ class TrackStatistics:
 
 
 def track_statistics(tracks: Tracks, frames: NDArray[np.integer] | None = None) -> TrackStatistics:
-    """Count tracks and what of the images they cover.
+    """Count tracks and the image area that they cover.
 
     Args:
         tracks: the tracks.

@@ -1,1 +1,1 @@
-"""What a comparison shows: results, pictures, the report."""
+"""Results, pictures and the report of a comparison."""

@@ -68,7 +68,7 @@ class _Panel:
 
 
 def colours_of(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each front-end, alike within a family."""
+    """A colour for each front-end, similar within a family."""
     taken = dict.fromkeys(_COLOURS, 0)
     found = {}
     for name in names:
@@ -132,7 +132,7 @@ def cost_chart(columns: Sequence[Column]) -> bytes:
 
 
 def length_chart(columns: Sequence[Column]) -> bytes:
-    """Curves of how many points so many images or more see, as SVG."""
+    """Curves of the number of points by their least track length, as SVG."""
     colours = colours_of([c.name for c in columns])
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10, 3.4), layout="constrained")
@@ -207,8 +207,8 @@ def _bars(axis: Any, panel: _Panel, colours: Mapping[str, str]) -> None:
     ]
     axis.barh(place, lengths, color=list(colours.values()), height=0.7)
     for y, length, is_known in zip(place, lengths, known, strict=True):
-        told = format(length, panel.spelling) if is_known else "-"
-        axis.text(length, y, f" {told}", va="center", fontsize=8)
+        label = format(length, panel.spelling) if is_known else "-"
+        axis.text(length, y, f" {label}", va="center", fontsize=8)
     axis.set_yticks(place, list(colours))
     axis.invert_yaxis()
     axis.margins(x=0.18)

@@ -17,7 +17,7 @@ from colmap_av1.model.figures import ModelFigures
 
 @dataclass(frozen=True)
 class Column:
-    """What one front-end gives and takes.
+    """Results and costs of one front-end.
 
     Attributes:
         name: the front-end, with " + all tracks" where all tracks are on the poses of its model.

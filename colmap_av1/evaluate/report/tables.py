@@ -57,31 +57,31 @@ def models_table(report: CompareReport) -> Table:
 
 
 def _about_models(report: CompareReport) -> str:
-    told = "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
-    told += "Error: reprojection error of the points, as COLMAP states it."
+    words = "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
+    words += "Error: reprojection error of the points, as COLMAP states it."
     if report.pose_reference:
         whose = _whose(report.pose_reference, report.is_truth)
-        told += (
+        words += (
             f" Poses against {whose}: ATE is the RMS distance of the camera centres after "
             "similarity alignment, as a share of the path's extent; the relative pose error is "
             "that of the motion from an image to the next, RMS, translation as a share of the "
-            "extent, and turn."
+            "extent, and rotation."
         )
         if report.is_truth:
-            told += " Before the share, the distance in the truth's unit."
+            words += " Before the share, the distance in the truth's unit."
     if report.cloud_reference:
         whose = _whose(
             report.cloud_reference,
             report.is_truth and report.cloud_reference == report.pose_reference,
         )
-        told += (
+        words += (
             f" Distances to the cloud of {whose}, as a share of the extent of its middle 90 %: "
             "Chamfer is the mean distance to the nearest point, averaged over both directions; "
             "Hausdorff the larger of the 95 % quantiles, with the largest distance behind it. A "
             "cloud that is denser than the one it is measured against has points where that one "
             "has none."
         )
-    return told
+    return words
 
 
 def _whose(source: str, is_truth: bool) -> str:
@@ -124,7 +124,7 @@ def cost_table(columns: Sequence[Column]) -> Table:
         row.append(", ".join(f"{k} {v:.1f}" for k, v in column.seconds.items()) or _NONE)
         rows.append(row)
     about = (
-        "Every stage ran in a process of its own; matching holds reading or extraction, matching "
+        "Every stage ran in a separate process; matching includes reading or extraction, matching "
         "and verification. Where other work runs beside it, wall time means little: read the CPU "
         "time."
     )
@@ -132,7 +132,7 @@ def cost_table(columns: Sequence[Column]) -> Table:
 
 
 def lengths_table(columns: Sequence[Column]) -> Table:
-    """How many images see a point."""
+    """Track lengths: the number of images that observe a point."""
     bounds = [*_LENGTH_CLASSES, math.inf]
     spans = list(itertools.pairwise(bounds))
     header = ["points seen by"]
@@ -154,7 +154,7 @@ def renderings_table(columns: Sequence[Column]) -> Table:
     header += ["Gaussians", "training, s", "share of the baseline's time"]
     base = next((c.training for c in columns if c.name == BASELINE), None)
     rows = []
-    told = ""
+    words = ""
     for column in columns:
         training = column.training
         if training is None:
@@ -172,13 +172,13 @@ def renderings_table(columns: Sequence[Column]) -> Table:
             share = share_of_time(training.states, base.states)
         row.append(f"{share:.0%}" if share is not None else _NONE)
         rows.append(row)
-        told = metrics.no_lpips or told
+        words = metrics.no_lpips or words
     about = (
         "Means over the test images, which are the odd ones; trained on the even ones. Q: Zhu and "
         "Milanfar's measure of sharpness, and its absolute difference to that of the photograph. "
         f"The baseline is {BASELINE}: when its last PSNR-Y is reached."
     )
-    return Table("Renderings", f"{about} No LPIPS: {told}." if told else about, header, rows)
+    return Table("Renderings", f"{about} No LPIPS: {words}." if words else about, header, rows)
 
 
 def _number(value: float) -> str:

@@ -121,7 +121,7 @@ def _write(path: Path, content: bytes) -> None:
 
 def _json(report: CompareReport) -> str:
     def plain(value: Any) -> Any:
-        """JSON knows neither paths nor numbers that are none."""
+        """Values as JSON holds them, which has neither paths nor NaN."""
         if isinstance(value, dict):
             return {str(k): plain(v) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
@@ -159,9 +159,11 @@ def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
     figures = [_crop("photograph", f"{name}, photograph", reference[rows, cols])]
     for column, training in trained:
         i = training.names.index(name)
-        told = f"{column}: {training.metrics.psnr_y[i]:.2f} dB, VMAF {training.metrics.vmaf[i]:.1f}"
+        label = (
+            f"{column}: {training.metrics.psnr_y[i]:.2f} dB, VMAF {training.metrics.vmaf[i]:.1f}"
+        )
         figures.append(
-            _crop(column.replace(" ", ""), told, _picture(training.renders[i])[rows, cols])
+            _crop(column.replace(" ", ""), label, _picture(training.renders[i])[rows, cols])
         )
     return figures
 
@@ -192,27 +194,27 @@ def _cloud_figures(
             "view": draw_perspective(cloud, view_of(model), footage.size),
             "plan": draw_plan(cloud, model, (640, 480)),
         }
-        told = f"{column.name}: {len(cloud.points):,} points"
+        label = f"{column.name}: {len(cloud.points):,} points"
         if like is not None and not cloud.is_aligned:
-            told += ", in its own coordinates"
+            label += ", in its own coordinates"
         for kind, picture in drawn.items():
             _, encoded = cv2.imencode(".png", picture)
             name = f"{column.name.replace(' ', '')}_{kind}.png"
             seen = {"view": "", "plan": ", from above"}[kind]
-            figures.append(_Figure(name, f"{told}{seen}", encoded.tobytes()))
+            figures.append(_Figure(name, f"{label}{seen}", encoded.tobytes()))
     return figures
 
 
 def _facts(report: CompareReport) -> str:
     known = "intrinsics given and kept" if report.fixed_intrinsics else "intrinsics unknown"
-    told = (
+    label = (
         f"{report.num_images} images of {report.num_frames} frames, "
         f"{report.size[0]}x{report.size[1]}; {known}; COLMAP's incremental mapper with the same "
         "settings for every front-end"
     )
     if report.forward_motion:
-        told += ", which may start with images that lie behind each other"
-    return f"{told}."
+        label += ", which may start with images along its direction of motion"
+    return f"{label}."
 
 
 def _notes(report: CompareReport) -> list[str]:

@@ -1,4 +1,4 @@
-"""3D Gaussians trained on a model: on half of its images, judged on the other half."""
+"""3D Gaussians trained on half of a model's images and evaluated on the other half."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def train_gaussians(
 
 
 def share_of_time(milestones: Sequence[Milestone], baseline: Sequence[Milestone]) -> float | None:
-    """Time until the PSNR-Y is the baseline's last, as a share of the baseline's whole time.
+    """Time until the baseline's final PSNR-Y is reached, as a share of the baseline's time.
 
     Between milestones it counts as rising evenly. None where it is never reached.
     """
@@ -128,7 +128,7 @@ def share_of_time(milestones: Sequence[Milestone], baseline: Sequence[Milestone]
 
 
 def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
-    """Write cameras and points of a model as plain arrays, which need no pycolmap to read.
+    """Write cameras and points of a model as plain arrays, readable without pycolmap.
 
     The file holds, for n images and m points: `files` [n], `is_test` bool [n], `cam_from_world`
     float32 [n, 4, 4], `K` float32 [n, 3, 3]; `points` float32 [m, 3], `colors` float32 [m, 3]
@@ -189,7 +189,7 @@ def _spacing(xyz: NDArray[np.float64]) -> NDArray[np.float32]:
 def _run(
     command: list[str], log: Path, progress: Callable[[int], None] | None
 ) -> list[dict[str, Any]]:
-    """Run the program, and return what it says of its milestones."""
+    """Run the program, and return the milestones that it reports."""
     states = []
     with (
         log.open("w+", encoding="utf-8", errors="replace") as errors,

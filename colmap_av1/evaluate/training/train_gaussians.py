@@ -166,14 +166,14 @@ def train(
 
 
 def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[View]]:
-    """The Gaussians to start with, the views to train on and those to test on."""
+    """The initial Gaussians, the views to train on and those to test on."""
     with np.load(path) as scene:
         arrays = {name: scene[name] for name in scene.files}
     views = []
     for i, file in enumerate(arrays["files"].tolist()):
         image = cv2.imread(file, cv2.IMREAD_COLOR)
         if image is None:
-            raise FileNotFoundError(f"{file}: is missing or no image")
+            raise FileNotFoundError(f"{file}: is missing or not an image")
         views.append(
             View(
                 name=Path(file).name,
@@ -192,7 +192,7 @@ def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[Vie
 
 
 def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: list[int]) -> None:
-    """Train, tell the progress, and render the test images at the milestones."""
+    """Train, report progress, and render the test images at the milestones."""
     iterations, seed, *milestones = numbers
     gaussians, train_views, test_views = read_scene(scene, device)
     seconds, started = 0.0, time.perf_counter()

@@ -1,4 +1,4 @@
-"""Folders that trainers of 3D Gaussians open, trainers run on them, and what they rendered."""
+"""Folders for trainers of 3D Gaussians, runs of trainers on them, and their renderings."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
     registered = sorted(posed_images(read_model(model)))
     if len(registered) < 2:
         raise EvaluationError(
-            f"{model}: one image cannot be parted for training and test: give a larger model"
+            f"{model}: one image cannot be split for training and test: give a larger model"
         )
 
     def make() -> dict[str, Any]:
