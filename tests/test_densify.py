@@ -119,7 +119,9 @@ def test_video_that_changes(clip: Path, tmp_path: Path, when: str) -> None:
         if stage == when and done == 9:
             video.touch()
 
-    with pytest.raises(VideoError, match=r"v\.mp4: changed or went while it was read: let it be"):
+    with pytest.raises(
+        VideoError, match=r"v\.mp4: changed or disappeared while it was read: leave it"
+    ):
         densify(model, video, tmp_path / "dense", progress=change)
     assert {p.name for p in tmp_path.iterdir()} == {"model", "v.mp4"}
     assert densify(model, video, tmp_path / "dense").num_points > 500

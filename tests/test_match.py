@@ -367,7 +367,9 @@ def test_video_that_changes(
         if stage == when and done == 3:
             change(video)
 
-    with pytest.raises(VideoError, match=r"v\.mp4: changed or went while it was read: let it be"):
+    with pytest.raises(
+        VideoError, match=r"v\.mp4: changed or disappeared while it was read: leave it"
+    ):
         match(tmp_path / "a.db", video, image_path=tmp_path / "frames", progress=progress)
     video.unlink(missing_ok=True)
     assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []

@@ -402,7 +402,7 @@ def test_video_that_changes(tmp_path: Path) -> None:
         if stage == "images" and done == 2:
             video.touch()
 
-    with pytest.raises(VideoError, match="changed or went while it was read"):
+    with pytest.raises(VideoError, match="changed or disappeared while it was read"):
         reconstruct(video, tmp_path / "out", options=changed, progress=change)
     assert not (tmp_path / "out" / "sparse").exists()
     assert not list((tmp_path / "out" / ".stages").glob("*.partial"))
@@ -485,7 +485,7 @@ def test_camera_that_stands_still(encode: Encode, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     wall = cv2.resize(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8), (320, 240))
     video = encode(np.stack([wall] * 8), tmp_path / "still.mp4")
-    with pytest.raises(ModelError, match=r"finds no start: too little parallax, in \d+ of"):
+    with pytest.raises(ModelError, match=r"finds no initial pair: too little parallax, in \d+ of"):
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()
     assert not (tmp_path / "out" / "sparse").exists()

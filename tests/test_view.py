@@ -90,7 +90,7 @@ def test_video_that_changes(panning: Path, tmp_path: Path, when: str) -> None:
         if stage == when and done == 4:
             video.touch()
 
-    with pytest.raises(VideoError, match="changed or went while it was read"):
+    with pytest.raises(VideoError, match="changed or disappeared while it was read"):
         view.view_video(video, tmp_path / "drawn.mp4", progress=change)
     assert list(tmp_path.iterdir()) == [video]
 

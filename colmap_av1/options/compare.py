@@ -58,7 +58,8 @@ class CompareOptions(Options):
         ("av1", "av1-refined", "sift-exhaustive", "sift-sequential"),
         "front-ends to compare, in this order: av1, av1-sparse, av1-dense, av1-refined, "
         "av1-refined-sparse, av1-refined-dense, sift-exhaustive, sift-sequential, disk-lightglue, "
-        "aliked-lightglue, and matches of other programs in hloc's layout as NAME=FEATURES.h5:MATCHES.h5",
+        "aliked-lightglue, and matches of other programs in hloc's layout as "
+        "NAME=FEATURES.h5:MATCHES.h5",
         common=True,
     )
     all_tracks: bool = option(

@@ -388,7 +388,10 @@ def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
     """A device as /dev/null is one for all: a file must not take its place."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "round").symlink_to("round")
-    for name, what in (("pipe", "is no plain file"), ("round", "is a link that leads nowhere")):
+    for name, what in (
+        ("pipe", "is not a regular file"),
+        ("round", "is a link that leads nowhere"),
+    ):
         with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
             write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
         with pytest.raises(DatabaseError, match=f"{name} {what}: give"):

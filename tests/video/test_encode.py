@@ -328,7 +328,7 @@ def test_video_that_changes(phone: Path, tmp_path: Path) -> None:
             with video.open("ab") as file:
                 file.write(b"more")
 
-    with pytest.raises(VideoError, match="changed or went while it was read"):
+    with pytest.raises(VideoError, match="changed or disappeared while it was read"):
         encode_video(video, tmp_path / "s.mp4", progress=write_on)
     assert list(tmp_path.iterdir()) == [video]
 

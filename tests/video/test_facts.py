@@ -41,7 +41,7 @@ def test_a_video_is_as_it_was_when_opened(clip: Path, tmp_path: Path) -> None:
     video = read_video(path)
     check_unchanged(video.state)
     os.utime(path, ns=(0, 0))
-    with pytest.raises(VideoError, match=r"v\.mp4: changed or went"):
+    with pytest.raises(VideoError, match=r"v\.mp4: changed or disappeared"):
         check_unchanged(video.state, read_video(path).state)
 
 
