@@ -58,7 +58,10 @@ from colmap_av1.evaluate import (
     run_measured,
 )
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import TriangulateOptions
 
+# All points of accurate depth, as other programs count theirs.
+SURVEY = TriangulateOptions(points="survey")
 # The ways, in the order of the table.
 WAYS = (
     render.SIFT_DATABASE,
@@ -185,13 +188,15 @@ def step_of_frontend(run: FrontendRun) -> Step:
 def run_reconstruct(footage: Footage, case: Case, output: Path) -> None:
     """From the stream to the dense model, as the command line does it."""
     options = MatchOptions(camera=footage.camera, images=ImageOptions(every=case.image_step))
-    reconstruct(footage.video, output, options=ReconstructOptions(match=options))
+    reconstruct(
+        footage.video, output, options=ReconstructOptions(match=options, triangulate=SURVEY)
+    )
 
 
 def run_densify(model: Path, footage: Footage, case: Case, output: Path) -> None:
     """Tracks on the poses of a model."""
     options = MatchOptions(images=ImageOptions(first_number=0))
-    densify(model, footage.video, output, options=DensifyOptions(match=options))
+    densify(model, footage.video, output, options=DensifyOptions(match=options, triangulate=SURVEY))
 
 
 def figures(step: Step, model: Path | None, material: Material, truth: Truth) -> Figures:

@@ -57,7 +57,9 @@ def models_table(report: CompareReport) -> Table:
 
 
 def _about_models(report: CompareReport) -> str:
-    words = "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
+    words = (
+        "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
+    )
     words += "Error: reprojection error of the points, as COLMAP states it."
     if report.pose_reference:
         whose = _whose(report.pose_reference, report.is_truth)
