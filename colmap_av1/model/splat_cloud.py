@@ -15,9 +15,10 @@ from colmap_av1.model.coverage import CELL, PosedCamera, visible_depth
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Images, evenly spread, that the cloud is made even and whole in: at least and at most so many, and
-# between these every so many-th.
-_KEY_IMAGES = (32, 128, 6)
+# Images, evenly spread, that the cloud is made even in: at least and at most so many, and between
+# these every so many-th; and those at most that it is made whole in.
+_EVEN_IMAGES = (32, 128, 6)
+_WHOLE_IMAGES = 128
 # Widths in pixels of the cells of these that one point each is wanted in, coarse ones first. Points
 # nearer than the last cost a trainer time and keep it from placing its own.
 _SPACINGS = (32, 16, 8)
@@ -60,22 +61,27 @@ def splat_cloud(
     Returns:
         Those of `points` that stay, in their order, then those that are added, in black.
     """
-    fewest, most, step = _KEY_IMAGES
-    num_keys = min(max(len(images) // step, fewest), most, len(images))
-    keys = np.unique(np.linspace(0, len(images) - 1, num_keys).astype(int))
-    stage = _stages(points, [images[i] for i in keys])
+    fewest, most, step = _EVEN_IMAGES
+    even = _spread(len(images), min(max(len(images) // step, fewest), most))
+    stage = _stages(points, [images[i] for i in even])
+    keys = _spread(len(images), _WHOLE_IMAGES)
     # Without an order within a stage its last ones would be of the last part of the video.
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
         kept = take_points(points, np.sort(order))
-        return _joined(kept, _filling(kept, images, keys.tolist()))
+        return _joined(kept, _filling(kept, images, keys))
     # Holes come before detail, but not before the surfaces that tell how deep they are.
     kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
-    filled = _filling(kept, images, keys.tolist())
+    filled = _filling(kept, images, keys)
     filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
     kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
     return _joined(kept, filled)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Indices from 0 to before `count`, evenly spread."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
 
 
 def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:

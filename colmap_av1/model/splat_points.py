@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +40,8 @@ _SUPPORT = 4
 # Width in pixels of the squares of an image that surroundings are, and points that they take.
 _AROUND = 48.0
 _FEWEST_AROUND = 8
+# Observations worked on at a time; bounds memory.
+_CHUNK = 500_000
 # Least angle in radians that is divided by.
 _TINY = 1e-12
 
@@ -61,6 +64,15 @@ class _Points:
     def middle(self) -> _Ints:
         """The observation in the middle of each point's."""
         return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
+
+    def parts(self) -> Iterator[_Points]:
+        """The points in order, some at a time; none where there are none."""
+        last = len(self.xyz)
+        chunk = np.searchsorted(self.offsets, np.arange(0, self.offsets[-1] + _CHUNK, _CHUNK))
+        for low, high in itertools.pairwise(np.unique(np.minimum(chunk, last))):
+            seen = slice(self.offsets[low], self.offsets[high])
+            offsets = self.offsets[low : high + 1] - self.offsets[low]
+            yield _Points(self.xyz[low:high], self.error[low:high], offsets, self.observation[seen])
 
     def take(self, rows: _Ints) -> _Points:
         """Some of the points, in the order of `rows`."""
@@ -145,6 +157,10 @@ def splat_points(
 
 def _distance_uncertainty(points: _Points, seen: _Seen) -> _Floats:
     """Expected error of each point's distance from the cameras, as a share of it."""
+    return np.concatenate([np.empty(0), *(_uncertainty(part, seen) for part in points.parts())])
+
+
+def _uncertainty(points: _Points, seen: _Seen) -> _Floats:
     owner = points.owner
     ray = points.xyz[owner] - seen.origins(points.observation)
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), _TINY)
@@ -152,8 +168,7 @@ def _distance_uncertainty(points: _Points, seen: _Seen) -> _Floats:
     narrowest = np.ones(len(points.xyz))
     for end in (starts, points.offsets[1:] - 1):
         cosine = np.einsum("ni,ni->n", ray, ray[end][owner])
-        if len(starts):
-            narrowest = np.minimum(narrowest, np.minimum.reduceat(cosine, starts))
+        narrowest = np.minimum(narrowest, np.minimum.reduceat(cosine, starts))
     angle = np.maximum(np.arccos(np.clip(narrowest, -1.0, 1.0)), _TINY)
     focal = seen.views.focal[seen.observations.view[points.middle]].mean(axis=1)
     return np.asarray(np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * points.error) / (focal * angle))
@@ -196,8 +211,11 @@ def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _See
 
 def _with_errors(points: _Points, seen: _Seen) -> _Points:
     """The points with the mean errors that they have where they are; without blind ones."""
-    error = seen.errors(points.xyz[points.owner], points.observation)
-    mean = np.add.reduceat(error, points.offsets[:-1]) / np.diff(points.offsets)
+    means = [np.empty(0)]
+    for part in points.parts():
+        error = seen.errors(part.xyz[part.owner], part.observation)
+        means.append(np.add.reduceat(error, part.offsets[:-1]) / np.diff(part.offsets))
+    mean = np.concatenate(means)
     return replace(points, error=mean).take(np.flatnonzero(np.isfinite(mean)))
 
 
@@ -220,14 +238,17 @@ def _points_far_away(
         return tracks
     middle = tracks.middle
     xyz = seen.origins(middle) + seen.rays(middle) * far
-    error = seen.errors(xyz[tracks.owner], tracks.observation)
-    kept = error <= options.max_reprojection_error
+    errors = [
+        seen.errors(part.xyz[part.owner], part.observation)
+        for part in replace(tracks, xyz=xyz).parts()
+    ]
+    kept = np.concatenate(errors) <= options.max_reprojection_error
     owner = tracks.owner[kept]
     counts = np.bincount(owner, minlength=len(left))
     far_away = _Points(
         xyz, np.zeros(len(left)), np.concatenate([[0], np.cumsum(counts)]), tracks.observation[kept]
     ).take(np.flatnonzero(counts >= options.min_observations))
-    return _with_errors(far_away, seen) if len(far_away.xyz) else far_away
+    return _with_errors(far_away, seen)
 
 
 def _in_order(one: _Points, two: _Points) -> _Points:
@@ -243,13 +264,27 @@ def _in_order(one: _Points, two: _Points) -> _Points:
 
 def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
     """Points that hang, nearly alone, before all that is around them in most of their images."""
-    rows = points.observation
-    distance = np.linalg.norm(points.xyz[points.owner] - seen.origins(rows), axis=1)
+    owner = points.owner.astype(np.int32)
+    by_view = np.argsort(seen.observations.view[points.observation], kind="stable")
+    ordered = seen.observations.view[points.observation[by_view]]
+    votes = np.zeros(len(points.xyz))
+    # Whole views, and as many at a time as make about a chunk.
+    ends = np.searchsorted(ordered, np.arange(len(seen.centres) + 1))
+    chunk = np.searchsorted(ends, np.arange(0, ends[-1] + _CHUNK, _CHUNK))
+    for low, high in itertools.pairwise(np.unique(np.minimum(chunk, len(ends) - 1))):
+        rows = by_view[ends[low] : ends[high]]
+        if len(rows):
+            alone = _alone_before(points.xyz[owner[rows]], points.observation[rows], seen)
+            votes += np.bincount(owner[rows], weights=alone, minlength=len(votes))
+    return np.asarray(votes > 0.5 * np.diff(points.offsets))
+
+
+def _alone_before(xyz: _Floats, rows: _Ints, seen: _Seen) -> NDArray[np.bool_]:
+    """Whether points at observations hang before what others show around, in the same square."""
+    distance = np.linalg.norm(xyz - seen.origins(rows), axis=1)
     view = seen.observations.view[rows]
     square = np.floor(seen.observations.rays[rows] * seen.views.focal[view] / _AROUND)
     square = square.astype(np.int64)
-    if len(rows) == 0:
-        return np.zeros(0, np.bool_)
     square -= square.min(axis=0)
     size = square.max(axis=0) + 1
     key = (view * size[0] + square[:, 0]) * size[1] + square[:, 1]
@@ -259,13 +294,13 @@ def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
     counts = np.diff(np.append(first, len(order)))
     group = np.repeat(np.arange(len(first)), counts)
     median = sorted_distance[first + counts // 2][group]
-    # Within a square distances ascend, so that those a factor off are found by their logarithms.
-    spread = float(np.ptp(np.log(sorted_distance))) + 1.0
-    scale = group * spread + np.log(sorted_distance / sorted_distance.min())
+    # Distances ascend within a square; shifted apart, those of other squares are out of reach.
+    scale = np.log(sorted_distance / sorted_distance.min())
     factor = np.log(_AS_NEAR)
+    scale += group * (scale.max() + 2 * factor)
     near = np.searchsorted(scale, scale + factor, "right") - np.searchsorted(scale, scale - factor)
-    # Near ones may reach into the squares beside in the list, which lie further off.
-    alone = (sorted_distance < _BEFORE * median) & (near < _SUPPORT)
-    alone &= counts[group] >= _FEWEST_AROUND
-    votes = np.bincount(points.owner[order], weights=alone, minlength=len(points.xyz))
-    return np.asarray(votes > 0.5 * np.diff(points.offsets))
+    alone = np.zeros(len(rows), np.bool_)
+    alone[order] = (
+        (sorted_distance < _BEFORE * median) & (near < _SUPPORT) & (counts[group] >= _FEWEST_AROUND)
+    )
+    return alone

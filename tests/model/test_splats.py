@@ -233,3 +233,16 @@ def test_centres_are_where_cameras_are() -> None:
     poses[:, :, 3] = np.arange(24).reshape(8, 3)
     for view, centre in zip(posed(poses), camera_centres(poses), strict=True):
         assert np.allclose(view.centre, centre)
+
+
+def test_many_points_are_looked_at_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same result."""
+    poses = moving(0.05)
+    truth = np.concatenate([scattered(2000, 8.0), [[-0.2, 0.1, 2.0]], scattered(100, 900.0)])
+    seen = see(truth, poses, 0.2)
+    at_once = splat_points(seen, views_of(poses), SPLATS)
+    monkeypatch.setattr("colmap_av1.model.splat_points._CHUNK", 500)
+    in_parts = splat_points(seen, views_of(poses), SPLATS)
+    assert len(at_once.xyz) > 2000
+    for name in ("xyz", "error", "offsets", "observation"):
+        assert np.array_equal(getattr(at_once, name), getattr(in_parts, name))
