@@ -51,6 +51,11 @@ _LEAST_STEP = 3
 # Inliers across a gap from which on mappers take it: they register an image by 30 points of its,
 # of which matches of two images give a part.
 _SURE_INLIERS = 100
+# Share of inter units from which on motion is what it seems: 85 % is usual, a drive has 50 to 60 %.
+_MUCH_MOTION = 0.6
+# Gaps that are probed below that, and how many of them, contradicted by pictures, prove it wrong.
+_NUM_PROBES = 6
+_NUM_BROKEN_PROBES = 2
 # Gaps that a warning names.
 _NUM_NAMED = 4
 
@@ -159,7 +164,11 @@ def link_video(
                 progress=progress,
             )
 
-    plan = _plan(matched, weak_gaps(inter_share, frames), options.links)
+    weak = weak_gaps(inter_share, frames)
+    probes = _probes(inter_share, weak, options.links)
+    if probes and len(link(_Plan.of_neighbours(probes)).report.broken_gaps) >= _NUM_BROKEN_PROBES:
+        weak[:] = True
+    plan = _plan(matched, weak, options.links)
     linked = LinkedImages(matched, no_tracks(len(inter_share), size), LinkReport())
     if plan.wanted:
         linked = link(plan)
@@ -240,6 +249,11 @@ class _Plan:
     key: list[int]
     effort: Literal["light", "full"] = "light"
 
+    @classmethod
+    def of_neighbours(cls, gaps: list[int]) -> _Plan:
+        """A look at the images on either side of some gaps, no more."""
+        return cls(np.array(gaps, np.int64), [[gap, gap + 1] for gap in gaps], [])
+
     @property
     def wanted(self) -> list[int]:
         """All images whose pictures are needed, ascending."""
@@ -250,6 +264,23 @@ def _plan(matched: MatchedImages, weak: NDArray[np.bool_], options: LinkOptions)
     gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
     around = [_images_around(int(gap), len(matched.keypoints)) for gap in gaps]
     return _Plan(gaps, around, _key_images(matched, options))
+
+
+def _probes(
+    inter_share: NDArray[np.float32], weak: NDArray[np.bool_], options: LinkOptions
+) -> list[int]:
+    """Gaps whose motion is compared with pictures to tell whether any motion is to be trusted.
+
+    None where most units are inter coded. Where a camera is too fast for its search, an encoder
+    takes what compresses well, and that need not be motion.
+    """
+    if options.links == "none" or len(inter_share) < 2:
+        return []
+    if float(np.median(inter_share[1:])) >= _MUCH_MOTION:
+        return []
+    strong = np.flatnonzero(~weak)
+    spread = np.linspace(0, len(strong) - 1, min(_NUM_PROBES, len(strong))).round().astype(int)
+    return [int(gap) for gap in strong[np.unique(spread)]]
 
 
 def _is_doubtful(gap: int, matched: MatchedImages) -> bool:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from synthetic_scene import alignment_error
 
+from colmap_av1.database.check import check
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.evaluate import model_poses
@@ -219,3 +220,15 @@ def test_frames_of_one_colour(encode: Encode, tmp_path: Path) -> None:
             encode(grey, tmp_path / "grey.mp4"),
             options=MatchOptions(links=LinkOptions(links="sift"), images=ImageOptions(every=1)),
         )
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_camera_too_fast_for_motion_is_linked(shared: Path, tmp_path: Path) -> None:
+    """A drone whose pictures move by 85 px a frame: the encoder finds next to no motion."""
+    video = shared / "sequences" / "drone_park" / "clip.mp4"
+    report = match(tmp_path / "a.db", video)
+    assert report.links.open_gaps == ()
+    assert len(report.links.weak_gaps) == 36
+    assert len(report.links.broken_gaps) > 12
+    assert check(tmp_path / "a.db").num_connected_images == 37
