@@ -181,7 +181,7 @@ def _notes(facts: dict[str, Any]) -> list[str]:
     if facts["num_flat_pairs"] > _MANY_FLAT * facts["num_verified_pairs"]:
         notes.append(
             f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "
-            "turns or the scene is flat: the depth of the points may be unreliable; film while "
+            "rotates or the scene is flat: the depth of the points may be unreliable; film while "
             "moving sideways"
         )
     if facts["far_views_largest"] is not None and facts["far_views_largest"] > _FAR_APART:
