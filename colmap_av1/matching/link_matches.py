@@ -39,12 +39,10 @@ class Links:
 
     Attributes:
         pairs: int32 [m, 2] indices of images, first < second, ascending.
-        matches: for each pair, uint32 [n, 2] indices of features.
         geometries: for each pair, its two-view geometry; its inliers are indices of features.
     """
 
     pairs: NDArray[np.int32]
-    matches: list[NDArray[np.uint32]]
     geometries: list[TwoViewGeometry]
 
 
@@ -71,21 +69,20 @@ def extract_features(
 def match_pairs(
     pairs: NDArray[np.int32],
     features: dict[int, Features],
-    keypoints: Sequence[ImageKeypoints],
     *,
     cameras: Sequence[Any],
     verify: VerifyOptions,
     run: RunOptions,
     progress: Progress,
 ) -> Links:
-    """Match the features of pairs of images and keep what agrees with a rigid scene."""
+    """Match the features of pairs of images and keep what agrees with a rigid scene.
+
+    Pairs of images of which one has no features are left out.
+    """
     nothing = np.empty((0, 2), np.float32)
-    views = [
-        ImageKeypoints(k.frame, xy, np.arange(len(xy), dtype=np.int64))
-        for k, xy in (
-            (k, features[i].xy if i in features else nothing) for i, k in enumerate(keypoints)
-        )
-    ]
+    xy = [features[i].xy if i in features else nothing for i in range(len(cameras))]
+    # Verification asks neither for frames nor for tracks.
+    views = [ImageKeypoints(0, own, np.arange(len(own), dtype=np.int64)) for own in xy]
     there = [i in features and j in features for i, j in pairs.tolist()]
     pairs = pairs[np.array(there, dtype=np.bool_)]
     matches = []
@@ -95,7 +92,7 @@ def match_pairs(
     options = replace(verify, min_num_inliers=max(verify.min_num_inliers, _MIN_GAP_INLIERS))
     geometries = verify_pairs(views, pairs, matches, cameras, options, run=run)
     kept = [k for k, g in enumerate(geometries) if len(g.inlier_matches) > 0]
-    return Links(pairs[kept], [matches[k] for k in kept], [geometries[k] for k in kept])
+    return Links(pairs[kept], [geometries[k] for k in kept])
 
 
 def supported_links(
@@ -120,12 +117,7 @@ def supported_links(
         for k, (i, j) in enumerate(pairs)
         if (i, j) not in revisits or (place[i], place[j]) in supported
     ]
-    return (
-        Links(
-            links.pairs[kept], [links.matches[k] for k in kept], [links.geometries[k] for k in kept]
-        ),
-        len(supported),
-    )
+    return Links(links.pairs[kept], [links.geometries[k] for k in kept]), len(supported)
 
 
 def broken_gaps(

@@ -204,7 +204,6 @@ def _link_images(
     links = match_pairs(
         tried,
         features,
-        matched.keypoints,
         cameras=cameras,
         verify=options.verify,
         run=options.run,

@@ -231,7 +231,7 @@ def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
     """The loss that refinement lowers: it ranks models that have the same inliers."""
     if model.matrix is None:
         return math.inf
-    algebraic, gradient = _epipolar_terms(model.matrix, points.spread_a, points.spread_b)
+    algebraic, gradient = epipolar_terms(model.matrix, points.spread_a, points.spread_b)
     squared = algebraic**2 / np.maximum(gradient, np.finfo(np.float64).tiny)
     return float(np.log1p(squared).sum())
 
@@ -260,7 +260,7 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
     b, to_b = _normalised(xb)
     rows = (b[:, None] * a).reshape(9, -1)
     F = np.linalg.eigh(rows @ rows.T)[1][:, 0].reshape(3, 3)
-    algebraic, gradient = _epipolar_terms(F, a[:2], b[:2])
+    algebraic, gradient = epipolar_terms(F, a[:2], b[:2])
     weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _ROUNDING)
     F = np.linalg.eigh((rows * weight) @ rows.T)[1][:, 0].reshape(3, 3)
     # Refinement takes the nearest matrix of rank two.
@@ -326,11 +326,11 @@ def _test(
 
 def epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
     """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
-    algebraic, gradient = _epipolar_terms(F, xa, xb)
+    algebraic, gradient = epipolar_terms(F, xa, xb)
     return np.asarray(algebraic**2 <= max_error**2 * gradient)
 
 
-def _epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floats]:
+def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floats]:
     """Algebraic error of matches [2, n], and the square of its gradient, float64 [n] each."""
     lines_b = F[:, :2] @ xa + F[:, 2:]
     lines_a = F.T[:2, :2] @ xb + F.T[:2, 2:]

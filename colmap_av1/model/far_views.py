@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.matching.features import FeatureExtractor, Features, match_features
-from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.verify import verify_pairs
+from colmap_av1.matching.features import FeatureExtractor, Features
+from colmap_av1.matching.link_matches import match_pairs
+from colmap_av1.matching.two_view_models import epipolar_terms
 from colmap_av1.model.colmap_model import ModelImage, camera_centres
-from colmap_av1.options import VerifyOptions
+from colmap_av1.options import RunOptions, VerifyOptions
+from colmap_av1.util.progress import no_progress
 
 _Floats = NDArray[np.float64]
 _Image = NDArray[np.uint8]
@@ -26,9 +27,6 @@ _MAX_ANGLE = 20.0
 _MAX_DISTANCE = 0.25
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500
-# Least matches of a pair that mean anything.
-_MIN_INLIERS = 20
-_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -83,25 +81,20 @@ class FarViewCheck:
 
     def result(self) -> FarViews:
         """What the pictures say; all that are needed have been added."""
-        there = [[i, j] for i, j in self._pairs.tolist() if {i, j} <= self._features.keys()]
-        pairs = np.array(there, dtype=np.int32).reshape(-1, 2)
-        nothing = np.empty((0, 2), np.float32)
-        views = [
-            ImageKeypoints(0, f.xy, np.arange(len(f.xy)))
-            if f
-            else ImageKeypoints(0, nothing, nothing[:, 0].astype(np.int64))
-            for f in (self._features.get(i) for i in range(len(self._images)))
-        ]
-        matches = [match_features(self._features[i], self._features[j]) for i, j in there]
+        cameras = [self._camera] * len(self._images)
         # Each pair is freed of outliers by a geometry of its own, not by the poses.
-        options = VerifyOptions(min_num_inliers=_MIN_INLIERS)
-        geometries = verify_pairs(views, pairs, matches, self._camera, options)
+        found = match_pairs(
+            self._pairs,
+            self._features,
+            cameras=cameras,
+            verify=VerifyOptions(),
+            run=RunOptions(),
+            progress=no_progress,
+        )
         names, errors = [], []
-        for (i, j), geometry in zip(there, geometries, strict=True):
-            inliers = geometry.inlier_matches
-            if len(inliers) < _MIN_INLIERS:
-                continue
-            error = self._errors(i, j, views[i].xy[inliers[:, 0]], views[j].xy[inliers[:, 1]])
+        for (i, j), geometry in zip(found.pairs.tolist(), found.geometries, strict=True):
+            a, b = geometry.inlier_matches.T
+            error = self._errors(i, j, self._features[i].xy[a], self._features[j].xy[b])
             names.append((self._images[i].name, self._images[j].name))
             errors.append(float(np.median(error)))
         return FarViews(tuple(names), np.array(errors))
@@ -114,13 +107,9 @@ class FarViewCheck:
         cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
         inverse = np.linalg.inv(self._camera.calibration_matrix())
         F = inverse.T @ cross @ rotation @ inverse
-        one = np.ones((len(xa), 1))
-        ha, hb = np.hstack([xa, one]), np.hstack([xb, one])
-        lines_b, lines_a = ha @ F.T, hb @ F
-        algebraic = np.abs((hb * lines_b).sum(axis=1))
-        squared = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+        algebraic, squared = epipolar_terms(F, xa.T.astype(np.float64), xb.T.astype(np.float64))
         # Per image: each has a part of the distance.
-        return np.asarray(np.sqrt(2) * algebraic / np.sqrt(np.maximum(squared, 1e-12)))
+        return np.asarray(np.sqrt(2) * np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-12)))
 
 
 def far_pairs(cam_from_world: _Floats) -> NDArray[np.int32]:

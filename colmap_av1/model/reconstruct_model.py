@@ -58,7 +58,7 @@ def _dense_cloud(
 
 
 def _write_images(
-    run: Run, folder: Path, placed: PosedImages, colours: Colours | MedianColours
+    run: Run, folder: Path, placed: PosedImages, camera: Any, colours: Colours | MedianColours
 ) -> FarViews:
     """Write the images, undistorted; look at their colours and at views from far apart on the way.
 
@@ -66,7 +66,6 @@ def _write_images(
         How far views from far apart disagree; the colours have all pictures added.
     """
     options, progress = run.options, run.progress
-    camera = pinhole_camera(placed.camera)
     undistort = undistortion(placed.camera, camera)
     far = FarViewCheck(placed.images, camera)
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
@@ -109,7 +108,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
         colours: Colours | MedianColours = MedianColours(cloud, size, len(images))
         if options.triangulate.points == "survey":
             colours = Colours(seen, view, points, len(images))
-        far_views = _write_images(run, partial / "images", placed, colours)
+        far_views = _write_images(run, partial / "images", placed, camera, colours)
         check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"

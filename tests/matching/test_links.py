@@ -139,7 +139,7 @@ def test_tracks_of_links_see_no_frame_twice(edges: list[tuple[int, int, int, int
     pairs = sorted(by_pair)
     matches = [np.array(sorted(by_pair[p]), np.uint32).reshape(-1, 2) for p in pairs]
     geometries = [TwoViewGeometry(TwoViewConfig.CALIBRATED, m) for m in matches]
-    links = Links(np.array(pairs, np.int32).reshape(-1, 2), matches, geometries)
+    links = Links(np.array(pairs, np.int32).reshape(-1, 2), geometries)
     frames = np.array([0, 10, 20, 30], np.int32)
     tracks = links_as_tracks(links, features, frames, 40, (100, 100))
     for start, stop in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True):
