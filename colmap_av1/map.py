@@ -12,6 +12,8 @@ from colmap_av1.database.reading import read_images
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size
 from colmap_av1.images.names import image_file
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
 from colmap_av1.model.mapper import map_poses
 from colmap_av1.options import MapOptions
@@ -30,7 +32,10 @@ class MapReport:
         num_images: images of the database.
         num_registered: images with a pose in each model, the most first.
         figures: figures of the model in folder 0.
+        far_views: how far views from far apart in time disagree, by the pictures of that model;
+            None where these cannot be read.
         seconds: wall time of each stage.
+        warnings: what the user should know.
     """
 
     output: Path
@@ -39,7 +44,9 @@ class MapReport:
     num_images: int
     num_registered: tuple[int, ...]
     figures: ModelFigures
+    far_views: FarViews | None
     seconds: dict[str, float]
+    warnings: tuple[str, ...]
 
     @property
     def model(self) -> Path:
@@ -100,18 +107,27 @@ def map_database(
                     "share too few matches, or too little parallax: see 'colmap-av1 check', "
                     "try the other --mapper, or give --camera_params when matching"
                 )
-            figures = model_figures(partial / "0")
             log.replace(partial / "mapper.log")
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
+    model = read_model(output / "0")
+    far_views: FarViews | None = None
+    try:
+        with clock.measure("far views"):
+            far_views = model_far_views(model, image_path, progress)
+        warning = far_views.warning
+    except ImageError as error:  # the model stands all the same
+        warning = f"far views are not compared: {error}"
     return MapReport(
         output=output,
         database=database,
         mapper=options.mapper,
         num_images=num_images,
         num_registered=num_registered,
-        figures=figures,
+        figures=model_figures(model),
+        far_views=far_views,
         seconds=clock.seconds,
+        warnings=() if warning is None else (warning,),
     )
 
 

@@ -33,9 +33,6 @@ from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
-# Pixels that views from far apart in time may disagree by before it is said: the surfaces of
-# models that hold together agree to less than one, or two with long focal lengths.
-_FAR_APART = 4.0
 
 
 @dataclass(frozen=True)
@@ -184,14 +181,8 @@ def _notes(facts: dict[str, Any]) -> list[str]:
             "rotates or the scene is flat: the depth of the points may be unreliable; film while "
             "moving sideways"
         )
-    if facts["far_views_largest"] is not None and facts["far_views_largest"] > _FAR_APART:
-        first, second = facts["far_views_apart"]
-        notes.append(
-            f"what images far apart in time show in common is up to "
-            f"{facts['far_views_largest']:.1f} px from where the poses put it, most between "
-            f"'{first}' and '{second}': surfaces may be doubled there; --links sift matches more "
-            "pictures"
-        )
+    if facts["far_views_warning"] is not None:
+        notes.append(facts["far_views_warning"])
     if facts["agreeing"] < LEAST_AGREEING:
         notes.append(
             f"only {facts['agreeing']:.0%} of the tracks agree with the poses, which may be wrong: "

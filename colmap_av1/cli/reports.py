@@ -10,6 +10,8 @@ from colmap_av1.database.check import CheckReport
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
+from colmap_av1.model.far_views import FarViews
+from colmap_av1.model.figures import ModelFigures
 from colmap_av1.motion.info import StreamReport
 from colmap_av1.reconstruct import ReconstructReport
 
@@ -62,6 +64,8 @@ def map_rows(report: MapReport) -> Rows:
         ("mean track length", f"{figures.mean_track_length:.2f}"),
         ("focal length", f"{figures.focal_length:.2f} px"),
     ]
+    if report.far_views is not None:
+        rows += far_view_rows(report.far_views.median, report.far_views.largest)
     if len(report.num_registered) > 1:
         others = ", ".join(map(str, report.num_registered[1:]))
         rows.append(("further models", f"of {others} images, beside it"))
@@ -78,15 +82,32 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
+        *far_view_rows(report.far_views, report.far_views_largest),
         ("focal length", f"{report.focal_length:.2f} px"),
         *_link_rows(**report.links),
     ]
-    if report.far_views is not None:
-        largest = f"{report.far_views_largest:.2f} px at 90 %"
-        rows.insert(6, ("far views agree to", f"{report.far_views:.2f} px, {largest}"))
     if report.resumed:
         rows.append(("finished before", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def far_view_rows(median: float | None, largest: float | None) -> Rows:
+    """How far views from far apart in time disagree; none where none see the same."""
+    if median is None:
+        return []
+    return [("far views agree to", f"{median:.2f} px, {largest:.2f} px at 90 %")]
+
+
+def model_rows(figures: ModelFigures, far_views: FarViews) -> Rows:
+    """Figures of a model, and whether it holds together."""
+    return [
+        ("images", f"{figures.num_registered} with a pose"),
+        ("points", f"{figures.num_points}, in {figures.mean_track_length:.2f} images on average"),
+        ("coverage", f"{figures.coverage:.1%} of the images"),
+        ("mean reprojection error", f"{figures.mean_error:.3f} px"),
+        *far_view_rows(far_views.median, far_views.largest),
+        ("focal length", f"{figures.focal_length:.2f} px"),
+    ]
 
 
 def _link_rows(

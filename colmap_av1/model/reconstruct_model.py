@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import write_images
-from colmap_av1.model.colmap_model import ModelPoints, write_model
+from colmap_av1.model.colmap_model import ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage
 from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
@@ -30,6 +30,8 @@ from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
 _Image = NDArray[np.uint8]
+# Trainers want one camera.
+_CAMERA_ID = 1
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,13 @@ def _dense_cloud(
 
 
 def _write_images(
-    run: Run, folder: Path, placed: PosedImages, camera: Any, colours: Colours | MedianColours
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    camera: Any,
+    *,
+    cloud: ModelPoints,
+    colours: Colours | MedianColours,
 ) -> FarViews:
     """Write the images, undistorted; look at their colours and at views from far apart on the way.
 
@@ -67,7 +75,7 @@ def _write_images(
     """
     options, progress = run.options, run.progress
     undistort = undistortion(placed.camera, camera)
-    far = FarViewCheck(placed.images, camera)
+    far = FarViewCheck(placed.images, {_CAMERA_ID: camera}, lambda image: points_seen(cloud, image))
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
@@ -99,21 +107,26 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, chosen)
+        of_one = [replace(image, camera_id=_CAMERA_ID) for image in placed.images]
+        placed = replace(placed, images=of_one)
         camera = pinhole_camera(placed.camera)
-        images = [replace(image, camera_id=1) for image in placed.images]
         seen, view = seen_in(tracks, placed.frames)
         dense = _dense_cloud(run, placed, camera, seen, view)
         points, cloud = dense.points, dense.cloud
         size = int(camera.width), int(camera.height)
-        colours: Colours | MedianColours = MedianColours(cloud, size, len(images))
+        colours: Colours | MedianColours = MedianColours(cloud, size, len(placed.images))
         if options.triangulate.points == "survey":
-            colours = Colours(seen, view, points, len(images))
-        far_views = _write_images(run, partial / "images", placed, camera, colours)
+            colours = Colours(seen, view, points, len(placed.images))
+        far_views = _write_images(
+            run, partial / "images", placed, camera, cloud=cloud, colours=colours
+        )
         check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
-            write_model(folder, {1: camera}, images, replace(cloud, rgb=colours.rgb()))
+            write_model(
+                folder, {_CAMERA_ID: camera}, placed.images, replace(cloud, rgb=colours.rgb())
+            )
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),
@@ -122,7 +135,7 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
             "focal_length": float(camera.params[0]),
             "far_views": far_views.median,
             "far_views_largest": far_views.largest,
-            "far_views_apart": far_views.worst,
+            "far_views_warning": far_views.warning,
             "agreeing": points.num_agreeing / max(points.num_tracks, 1),
         }
 

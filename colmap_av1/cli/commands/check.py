@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
-from colmap_av1.cli.commands.shared import add_command, add_database
-from colmap_av1.cli.reports import check_rows
-from colmap_av1.cli.terminal import print_summary
+from colmap_av1.cli.commands.shared import add_command, add_images, add_quiet, print_result
+from colmap_av1.cli.reports import check_rows, model_rows
+from colmap_av1.cli.terminal import progress_bars
 from colmap_av1.database.check import check
+from colmap_av1.errors import OptionError
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.far_views import model_far_views
+from colmap_av1.model.figures import model_figures
 
 _FAILED_CHECK = 1
 
@@ -19,18 +24,49 @@ def add_check(commands: Any) -> None:
         commands,
         "check",
         _run,
-        "report what COLMAP's mappers will make of a database",
-        "--database PATH",
+        "report what COLMAP's mappers will make of a database, or whether a model holds together",
+        "{--database PATH | --model PATH --image_path PATH}",
     )
-    add_database(command)
+    command.add_argument("--database", "--database_path", metavar="PATH", help="a COLMAP database")
+    command.add_argument(
+        "--model",
+        "--model_path",
+        metavar="PATH",
+        help="folder of a COLMAP model: pictures of places seen again are held against its poses",
+    )
+    add_images(command, "folder of the model's images")
     command.add_argument(
         "--strict",
         action="store_true",
-        help="exit with status 1 if the mappers cannot use the database",
+        help="exit with status 1 if the mappers cannot use the database, or the model bends",
     )
+    add_quiet(command)
 
 
 def _run(namespace: argparse.Namespace) -> int:
-    result = check(namespace.database)
-    print_summary(check_rows(result))
-    return _FAILED_CHECK if namespace.strict and not result.mappable else 0
+    if namespace.database is None and namespace.model is None:
+        raise OptionError("nothing to check: give --database, or --model with --image_path")
+    if (namespace.model is None) != (namespace.image_path is None):
+        raise OptionError("a model is checked by its pictures: give both --model and --image_path")
+    good = True
+    if namespace.database is not None:
+        result = check(namespace.database)
+        print_result(namespace, check_rows(result))
+        good = result.mappable
+    if namespace.model is not None:
+        good = _check_model(namespace) and good
+    return 0 if good or not namespace.strict else _FAILED_CHECK
+
+
+def _check_model(namespace: argparse.Namespace) -> bool:
+    """Print what a model is like; whether views from far apart agree with it."""
+    model = read_model(namespace.model)
+    with progress_bars(namespace.quiet) as report:
+        far_views = model_far_views(model, Path(namespace.image_path), report)
+    warning = far_views.warning
+    print_result(
+        namespace,
+        model_rows(model_figures(model), far_views),
+        () if warning is None else (warning,),
+    )
+    return warning is None

@@ -47,4 +47,4 @@ def _run(namespace: argparse.Namespace) -> None:
             options=options,
             progress=report,
         )
-    print_result(namespace, map_rows(result))
+    print_result(namespace, map_rows(result), result.warnings)
