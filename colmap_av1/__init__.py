@@ -1,6 +1,9 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video."""
 
-from colmap_av1.util import signals  # noqa: F401 - first, so that the program ends quietly
+from colmap_av1.util import start  # first, so that the program ends quietly
+
+if start.is_program():
+    start.import_pycolmap()
 
 # isort: split
 from colmap_av1.database.check import CheckReport, check

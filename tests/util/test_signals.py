@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -22,17 +24,19 @@ SCRIPT = (
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals end otherwise there")
 
 
-def end_while_importing(words: list[str], number: int, folder: Path) -> tuple[int, str]:
+def end_while_importing(
+    words: list[str], number: int, folder: Path, after: str = "numpy.version"
+) -> tuple[int, str]:
     """Status of a program that is told to end before the package is there, and what it says."""
     command = [sys.executable, "-c", words[0], "-X", "importtime", *words[1:]]
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         for line in process.stderr:
-            if line.endswith(" numpy.version\n"):
+            if line.endswith(f" {after}\n"):
                 break
         process.send_signal(number)
         rest = process.stderr.read().splitlines()
-    assert not any(line.endswith("| colmap_av1") for line in rest) or words[0] == IGNORING
+    assert not any(line.endswith("| colmap_av1") for line in rest) or "SIG_IGN" in words[0]
     said = [line for line in rest if not line.startswith("import time:")]
     return process.returncode, "\n".join(said)
 
@@ -44,6 +48,50 @@ def test_signal_during_the_imports(tmp_path: Path, start: str, number: int) -> N
     program = ["-m", "colmap_av1"] if start == "module" else [str(tmp_path / "colmap-av1")]
     words = [HEEDING, *program, "--version"]
     assert end_while_importing(words, number, tmp_path) == (128 + number, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_after_pycolmap_has_set_its_own_handler(tmp_path: Path, number: int) -> None:
+    words = [HEEDING, "-m", "colmap_av1", "--version"]
+    assert end_while_importing(words, number, tmp_path, "pycolmap") == (128 + number, "")
+
+
+def test_signal_that_pycolmap_must_not_heed_either(tmp_path: Path) -> None:
+    words = [IGNORING.replace("SIGINT", "SIGTERM"), "-m", "colmap_av1", "info", "--video", "none"]
+    status, said = end_while_importing(words, signal.SIGTERM, tmp_path, "pycolmap")
+    assert (status, said) == (2, "colmap-av1: error: none: no such file: give the path of a video")
+
+
+MEASURING = """
+import sys, time
+from pathlib import Path
+from colmap_av1.evaluate.frontends.measure import run_measured
+try:
+    run_measured(time.sleep, 60, log=Path("log.txt"))
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists children so")
+def test_interrupt_of_a_group_while_a_process_of_it_starts(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", HEEDING, "-c", MEASURING]
+    with subprocess.Popen(
+        words, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        deadline = time.monotonic() + 60
+        # The first one watches shared memory, and ignores interrupts.
+        while len(children.read_text().split()) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        time.sleep(0.1)  # all signals wait while it is forked
+        child = Path("/proc") / children.read_text().split()[1]
+        lines = dict(line.split(":\t") for line in (child / "status").read_text().splitlines())
+        os.killpg(process.pid, signal.SIGINT)
+        assert int(lines["SigBlk"], 16) >> (signal.SIGINT - 1) & 1
+        assert process.communicate(timeout=60)[1] == ""
+    assert process.returncode == 130
 
 
 def test_ignored_signal_during_the_imports(tmp_path: Path) -> None:

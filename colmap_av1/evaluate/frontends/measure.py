@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from colmap_av1.errors import ColmapAv1Error, EvaluationError
 from colmap_av1.util.processes import bind
+from colmap_av1.util.start import held_back, let_through
 
 _Result = TypeVar("_Result")
 
@@ -55,8 +57,11 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_call, args=(os.getpid(), sender, log, function, args))
+    if os.name == "posix":
+        resource_tracker.ensure_running()  # its start lets interrupts through
     try:
-        process.start()
+        with held_back():  # while it starts an interrupt would be answered by a trace of its own
+            process.start()
         sender.close()
         outcome = receiver.recv()
     except EOFError:
@@ -100,6 +105,7 @@ def _call(
         # Libraries write to the descriptors, not to sys.stdout and sys.stderr.
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    let_through()
     outcome: Measured[Any] | ColmapAv1Error | str
     start, cpu = time.perf_counter(), _cpu_seconds()
     try:
