@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from colmap_av1.cli.terminal import PROGRAM
+from colmap_av1.cli.terminal import print_error, print_text
 
 BAD_INPUT = 2
+# The negative ones that argparse knows.
+_NUMBER = re.compile(r"-\d+|-\d*\.\d+")
 
 
 class Parser(argparse.ArgumentParser):
@@ -40,26 +43,35 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with a line that says what is wrong."""
-        self.exit(BAD_INPUT, f"{PROGRAM}: error: {message} (see {self.prog} --help)\n")
+        print_error(f"{message} (see {self.prog} --help)")
+        self.exit(BAD_INPUT)
 
     def refuse_unknown(self, words: Sequence[str]) -> None:
-        """Exit on an unknown option, and name the one nearest to it."""
+        """Exit on an unknown option, and name the one nearest to it, or on a value like one."""
         known = self._option_string_actions
-        for word in words:
+        for word, following in zip(words, [*words[1:], ""], strict=True):
             name = word.partition("=")[0]
+            takes_one = word in known and known[word].nargs is None
+            if takes_one and _like_an_option(following) and following not in known:
+                self.error(f"a value that begins with '-' follows '=': give {word}={following}")
             if name.startswith("--") and name != "--" and name not in known:
                 near = difflib.get_close_matches(name, known, n=1)
                 meant = f": did you mean {near[0]}?" if near else ""
                 self.error(f"there is no option {name}{meant}")
 
 
+def _like_an_option(word: str) -> bool:
+    """Whether argparse takes a word for an option, and so for no value."""
+    return word.startswith("-") and not word.startswith("--") and not _NUMBER.fullmatch(word)
+
+
 class _Help(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print(parser.short_help() if isinstance(parser, Parser) else parser.format_help(), end="")
+        print_text(parser.short_help() if isinstance(parser, Parser) else parser.format_help())
         parser.exit()
 
 
 class _FullHelp(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        parser.print_help()
+        print_text(parser.format_help())
         parser.exit()

@@ -25,8 +25,11 @@ from colmap_av1.cli.options import underscored
 from colmap_av1.cli.parser import BAD_INPUT, Parser
 from colmap_av1.cli.terminal import (
     PROGRAM,
+    StreamError,
     allow_any_file_name,
     print_error,
+    print_note,
+    print_text,
     warnings_as_lines,
 )
 from colmap_av1.errors import ColmapAv1Error
@@ -43,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; None: those of this process.
 
     Returns:
-        Exit status: 0, 1 where a check fails, 2 for bad input, 130 when interrupted, 141 where
-        nobody reads the output to its end.
+        Exit status: 0, 1 where a check fails, 2 for bad input and output that cannot be written,
+        130 when interrupted, 141 where nobody reads the output to its end.
 
     Raises:
         SystemExit: a signal ends the process.
@@ -55,23 +58,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             words = sys.argv[1:] if arguments is None else arguments
             namespace = _parse([underscored(word) for word in words])
             status: int | None = namespace.run(namespace)
-            sys.stdout.flush()
     except ColmapAv1Error as error:
         print_error(error)
         return BAD_INPUT
-    except BrokenPipeError:  # as before `head`, which has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _BROKEN_PIPE
+    except StreamError as error:
+        if isinstance(error.__cause__, BrokenPipeError):  # as before `head`, which has read enough
+            return _BROKEN_PIPE
+        print_error(f"standard output: cannot be written: {_reason(error.__cause__)}")
+        return BAD_INPUT
     except OSError as error:
-        if error.filename is None:
-            raise
-        what = f"{os.fsdecode(error.filename)}: {error.strerror}"
-        print_error(f"{what}: fix that, or give another path")
+        where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        print_error(f"{where}{_reason(error)}: fix that, or give another path")
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
+        print_note("interrupted")
         return _INTERRUPTED
     return status or 0
+
+
+def _reason(error: BaseException | None) -> str:
+    return str(getattr(error, "strerror", None) or error)
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
@@ -89,7 +95,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print(f"{PROGRAM} {importlib.metadata.version(PROGRAM)}")
+        print_text(f"{PROGRAM} {importlib.metadata.version(PROGRAM)}\n")
         parser.exit()
 
 

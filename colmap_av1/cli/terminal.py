@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import sys
 import warnings
 from collections.abc import Iterator
@@ -20,6 +22,10 @@ from colmap_av1.match import MatchReport
 from colmap_av1.util.progress import Progress, no_progress
 
 PROGRAM = "colmap-av1"
+
+
+class StreamError(Exception):
+    """Standard output takes nothing more, for the reason that is its cause."""
 
 
 @contextmanager
@@ -51,13 +57,13 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 def print_summary(rows: Rows) -> None:
     """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
     if not sys.stdout.isatty():
-        for name, value in rows:
-            print(f"{name}\t{value}")
+        print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
     table = Table(show_header=False)
     for name, value in rows:
         table.add_row(Text(name), Text(value))  # as they are: in brackets is no markup
-    Console().print(table)
+    with _writing():
+        Console().print(table)
 
 
 def print_next(report: MatchReport) -> None:
@@ -65,12 +71,39 @@ def print_next(report: MatchReport) -> None:
     with_colmap, with_ours, densify = report.next_commands
     if sys.stdout.isatty():
         # Printed bare, so that they can be copied from any terminal.
-        print(f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}")
-        print(f"Then, to train Gaussian splats:\n  {densify}")
+        print_text(
+            f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}\n"
+            f"Then, to train Gaussian splats:\n  {densify}\n"
+        )
     else:
-        print(f"next\t{with_colmap}\nor\t{with_ours}\nthen, for splats\t{densify}")
+        print_text(f"next\t{with_colmap}\nor\t{with_ours}\nthen, for splats\t{densify}\n")
     if report.image_path is None:
-        print(f"{PROGRAM}: IMAGES stands for a folder of the frames", file=sys.stderr)
+        print_note("IMAGES stands for a folder of the frames")
+
+
+def print_text(text: str) -> None:
+    """Write to standard output.
+
+    Raises:
+        StreamError: it cannot be written, or nobody reads it any more.
+    """
+    with _writing():
+        sys.stdout.write(text)
+
+
+@contextmanager
+def _writing() -> Iterator[None]:
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        _silence(sys.stdout)
+        raise StreamError from error
+
+
+def print_note(message: object) -> None:
+    """Print a line of standard error."""
+    _print_line(f"{PROGRAM}: {message}")
 
 
 def print_warning(message: object) -> None:
@@ -84,14 +117,24 @@ def print_error(message: object) -> None:
 
 
 def _print_line(text: str) -> None:
-    # Names of files may hold ends of lines.
-    print(text.replace("\n", "\\n"), file=sys.stderr)
+    try:
+        # Names of files may hold ends of lines.
+        print(text.replace("\n", "\\n"), file=sys.stderr, flush=True)
+    except OSError:  # there is nowhere left to say so
+        _silence(sys.stderr)
+
+
+def _silence(stream: Any) -> None:
+    """Let what a stream holds back go nowhere: Python would fail on it at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def allow_any_file_name() -> None:
-    """Let standard output take file names that are not valid text, as their bytes."""
+    """Let standard output take any file name, those that are no valid text as their bytes."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="surrogateescape")
+        holds_all = sys.stdout.encoding.lower().startswith("utf")
+        sys.stdout.reconfigure(errors="surrogateescape" if holds_all else "backslashreplace")
 
 
 @contextmanager

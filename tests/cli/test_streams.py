@@ -1,0 +1,51 @@
+"""Standard streams that are closed, full or not read: one line or none, and status 2 or 141."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.motion.motion_file import export_motion
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other shells and devices there")
+
+FULL = "colmap-av1: error: standard output: cannot be written: No space left on device\n"
+CLOSED = "colmap-av1: error: standard output: cannot be written: Bad file descriptor\n"
+CASES = {
+    "--version >&-": (2, CLOSED),
+    "--version >/dev/full": (2, FULL),
+    "--version 2>&- >&- <&-": (2, ""),
+    "match --help-all | true": (141, ""),
+    "info --video none.mp4 2>/dev/full": (2, ""),
+    "info --vdeo none.mp4 2>/dev/full": (2, ""),
+    "motion --video v.mp4 --output m.npz --quiet <&- >&- 2>&-": (0, ""),
+}
+
+
+def test_broken_streams(clip: Path, tmp_path: Path) -> None:
+    """All at once: each takes longer to start than to run."""
+    shutil.copyfile(clip, tmp_path / "v.mp4")
+    program = shlex.join([sys.executable, "-m", "colmap_av1"])
+    started = {}
+    for case in CASES:
+        line = f"set -o pipefail; {program} {case}"
+        started[case] = subprocess.Popen(
+            ["bash", "-c", line],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    found = {}
+    for case, process in started.items():
+        _, said = process.communicate(timeout=120)
+        found[case] = (process.returncode, said)
+    assert found == CASES
+    # What a library printed would have ended in a file that got a closed stream's number.
+    export_motion(clip, tmp_path / "again.npz")
+    assert (tmp_path / "m.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
