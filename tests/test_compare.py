@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -20,6 +21,7 @@ from colmap_av1.compare import compare
 from colmap_av1.database.hloc import export_hloc
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
 from colmap_av1.evaluate.frontends.learned import pairs_of
+from colmap_av1.evaluate.report.results import Column
 from colmap_av1.evaluate.training.trainers import match_renders
 from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
 
@@ -254,8 +256,8 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     copy = "import shutil, sys; shutil.copytree(*sys.argv[1:], dirs_exist_ok=True)"
-    words = f'{sys.executable} -c "{copy}" {{test}}/images {{renders}}'
-    command = f"cd {{data}} && {words} && echo {{iterations}}"
+    line = f'cd "$1" && {sys.executable} -c "{copy}" "$2"/images "$3" && echo "$4"'
+    command = f"sh -c '{line}' sh {{data}} {{test}} {{renders}} {{iterations}}"
     options = CompareOptions(
         match=OPTIONS, frontends=("av1",), all_tracks=False, trainer=command, iterations=7
     )
@@ -264,7 +266,8 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     training = column.training
     assert training.names == [f"frame_{i:06d}.png" for i in (6, 18, 30, 42)]
     assert training.metrics.psnr_y.tolist() == [60] * 4
-    assert (output / "splats" / "av1" / "training" / "log.txt").read_text() == "7\n"
+    log = output / "splats" / "av1" / "training" / "log.txt"
+    assert log.read_text() == "7\n"
     train = output / "splats" / "av1" / "split" / "train"
     model = pycolmap.Reconstruction(train / "sparse" / "0")
     names = [f"frame_{i:06d}.png" for i in (0, 12, 24, 36)]
@@ -280,7 +283,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
 
     # What fails leaves its line, and figures of the clouds.
     refused = {
-        "false {data}": "the trainer ended with status 1",
+        "false {data}": f"the trainer ended with status 1: see {log}",
         "echo {data}": "holds 0 renderings for 4 test images",
     }
     for command, told in refused.items():
@@ -322,6 +325,21 @@ def test_images_that_exist_and_nothing_to_measure_against(compared, video, tmp_p
     assert (column.poses, column.cloud, report.pose_reference) == (None, None, "")
     assert "no poses or cloud to measure against" in (report.output / "report.md").read_text()
     assert not (report.output / "footage" / "images").exists()
+
+
+def test_a_failed_training_has_a_status_of_its_own(video, tmp_path, monkeypatch, capsys):
+    error = "the trainer ended with status 1: see log"
+    model = SimpleNamespace(num_registered=2, num_points=9, coverage=0.5, mean_error=0.3)
+    failed = Column("av1", model=model, training_error=error)
+    fine = Column("sift", model=model)
+    for columns, status in (((fine, failed), 3), ((fine,), 0)):
+        report = SimpleNamespace(columns=columns, warnings=(), output=tmp_path, num_images=2)
+        monkeypatch.setattr(compare_module, "compare", lambda *_, found=report, **__: found)
+        words = ["compare", "--video", str(video), "--output", str(tmp_path), "--quiet"]
+        assert main(words) == status
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == f"colmap-av1: warning: av1: nothing is trained: {error}\n"
 
 
 def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):

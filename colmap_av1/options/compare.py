@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import string
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,9 +13,13 @@ from colmap_av1.options.commands import MatchOptions
 from colmap_av1.options.fields import Options, option, part
 from colmap_av1.options.model import TriangulateOptions
 
-# The trainer that is built in; others are shell commands with these placeholders.
+# The trainer that is built in; others are commands with these placeholders.
 GSPLAT = "gsplat"
 PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
+# Programs that run the word after -c.
+_SHELL = re.compile(r"(.*/)?((ba|da|k|z)?sh|python[0-9.]*)")
+# Words that only a shell understands.
+_OPERATOR = re.compile(r"&|&&|\||\|\||;|\d*[<>].*")
 
 
 @dataclass(frozen=True)
@@ -67,10 +73,10 @@ class CompareOptions(Options):
     )
     trainer: str | None = option(
         None,
-        "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a shell "
+        "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a "
         "command with {data}, the folder of that half, and as needed {test}, that of the other "
         "half, {output}, {renders}, which receives the renderings of the test images, {iterations} "
-        "and {name}",
+        "and {name}; a shell reads it only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
         common=True,
     )
     iterations: int = option(30_000, "iterations of the training", least=1)
@@ -83,21 +89,57 @@ class CompareOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.trainer is not None:
-            _check_trainer(self.trainer)
+        if self.trainer is not None and self.trainer != GSPLAT:
+            words_of_trainer(self.trainer)
 
 
-def _check_trainer(trainer: str) -> None:
-    """Refuse a command whose placeholders are unknown."""
-    if trainer == GSPLAT:
-        return
+def words_of_trainer(trainer: str) -> list[str]:
+    """The words of a trainer's command, split as a shell does, with their placeholders.
+
+    Raises:
+        OptionError: it cannot be split, a placeholder is unknown or has a format, {data} is
+            missing, or a shell would have to read it, or would read a value as code.
+    """
     known = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)
+    way_out = "quote it as for a shell"
     try:
-        fields = {name for _, name, _, _ in string.Formatter().parse(trainer) if name is not None}
+        words = shlex.split(trainer)
+        way_out = "write {{ for a brace"
+        fields = [field for word in words for field in _fields(word)]
     except ValueError as error:
-        raise OptionError(f"trainer '{trainer}': {error}: write {{{{ for a brace") from error
-    if not fields <= set(PLACEHOLDERS) or "data" not in fields:
+        raise OptionError(f"trainer '{trainer}': {error}: {way_out}") from error
+    names = {name for name, _, _ in fields}
+    if not names <= set(PLACEHOLDERS) or "data" not in names:
         raise OptionError(
             f"trainer '{trainer}': give '{GSPLAT}', or a command with {{data}} and others of "
             f"{known}"
+        )
+    formatted = next((name for name, spec, conversion in fields if spec or conversion), None)
+    if formatted is not None:
+        raise OptionError(f"trainer '{trainer}': give {{{formatted}}} without a format")
+    _check_shell(trainer, words)
+    return words
+
+
+def _fields(word: str) -> list[tuple[str, str | None, str | None]]:
+    """Name, format and conversion of each placeholder in a word."""
+    parsed = string.Formatter().parse(word)
+    return [(name, spec, conversion) for _, name, spec, conversion in parsed if name is not None]
+
+
+def _check_shell(trainer: str, words: list[str]) -> None:
+    """Refuse a command that only a shell understands, and values within a shell's line."""
+    example = 'sh -c \'train "$1" && render "$1" "$2"\' sh {data} {renders}'
+    shell = next((i for i, word in enumerate(words) if _SHELL.fullmatch(word)), len(words))
+    option = next((i for i in range(shell, len(words)) if re.match(r"-\w*c", words[i])), len(words))
+    if any(_fields(line) for line in words[option + 1 : option + 2]):
+        raise OptionError(
+            f"trainer '{trainer}': {words[shell]} would take a folder's name for code: give "
+            f"placeholders after its line, as in {example}"
+        )
+    operator = next((word for word in words if _OPERATOR.fullmatch(word)), None)
+    if operator is not None:
+        raise OptionError(
+            f"trainer '{trainer}': no shell reads it, so {operator} means nothing: ask for one, "
+            f"as in {example}"
         )

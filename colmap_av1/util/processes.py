@@ -18,11 +18,11 @@ ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 if os.getppid() == int(starter):
     os.execvp(command[0], command)
 """
-# A program that runs a shell command and ends with the process that started it, as does all that
-# the command started: the system would only end the shell.
-_SHELL = """
+# A program that runs a command and ends with the process that started it, as does all that the
+# command started: the system would only end the command.
+_GROUP = """
 import ctypes, os, signal, subprocess, sys
-starter, command = sys.argv[1:]
+starter, *command = sys.argv[1:]
 def end(*_):
     os.killpg(0, signal.SIGKILL)
 os.setpgid(0, 0)
@@ -30,7 +30,10 @@ signal.signal(signal.SIGTERM, end)
 ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 if os.getppid() != int(starter):
     end()
-status = subprocess.call(command, shell=True)
+try:
+    status = subprocess.call(command)
+except OSError as error:
+    sys.exit(f"{command[0]}: {error.strerror}")
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 os.killpg(0, signal.SIGTERM)  # what the command left in the background
 sys.exit(status if status >= 0 else 128 - status)
@@ -48,14 +51,11 @@ def bound(command: Sequence[str]) -> list[str]:
     return [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
 
 
-def bound_shell(command: str) -> list[str] | str:
-    """The same for a shell command and all that it starts, which ends with the command, too.
-
-    Elsewhere it is the command given, for a shell.
-    """
+def bound_group(command: Sequence[str]) -> list[str]:
+    """The same, for a command and all that it starts, which ends with the command, too."""
     if not _can_bind():
-        return command
-    return [sys.executable, "-I", "-S", "-c", _SHELL, str(os.getpid()), command]
+        return list(command)
+    return [sys.executable, "-I", "-S", "-c", _GROUP, str(os.getpid()), *command]
 
 
 def bind(starter: int) -> None:

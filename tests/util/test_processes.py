@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_av1.util.processes import bound, bound_shell
+from colmap_av1.util.processes import bound, bound_group
 
 BOUND = """
 import subprocess, sys, time
@@ -25,12 +25,12 @@ child = (
 subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
 time.sleep(60)
 """
-SHELL = """
+GROUP = """
 import shlex, subprocess, sys, time
-from colmap_av1.util.processes import bound_shell
+from colmap_av1.util.processes import bound_group
 child = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
 command = f"{shlex.join([sys.executable, '-c', child])} && echo not reached"
-subprocess.Popen(bound_shell(command))
+subprocess.Popen(bound_group(["sh", "-c", command]))
 time.sleep(60)
 """
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children so")
@@ -59,18 +59,20 @@ def test_a_program_without_a_folder_is_looked_for() -> None:
 
 
 @linux
-def test_a_bound_shell_runs_what_is_asked_for() -> None:
-    words = bound_shell("echo 'a b' && sh -c 'exit 3'")
+def test_a_bound_group_runs_what_is_asked_for() -> None:
+    words = bound_group(["sh", "-c", "echo \"$1\" '$1' && exit 3", "sh", "a  b; $(echo no)"])
     run = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert run.stdout == "a b\n"
+    assert run.stdout == "a  b; $(echo no) $1\n"
     assert run.returncode == 3
-    killed = subprocess.run(bound_shell("kill -KILL $$"), check=False)
+    killed = subprocess.run(bound_group(["sh", "-c", "kill -KILL $$"]), check=False)
     assert killed.returncode == 137
+    run = subprocess.run(bound_group(["./no such"]), capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (1, "./no such: No such file or directory\n")
 
 
 @linux
-def test_nothing_that_a_bound_shell_started_outlives_it() -> None:
-    words = bound_shell("sleep 60 & echo $!")
+def test_nothing_that_a_bound_group_started_outlives_it() -> None:
+    words = bound_group(["sh", "-c", "sleep 60 & echo $!"])
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as shell:
         assert shell.stdout is not None
         left = int(shell.stdout.readline())
@@ -86,7 +88,7 @@ def wait_for_end(process: int) -> None:
 
 
 @linux
-@pytest.mark.parametrize("program", [BOUND, BINDING, SHELL], ids=["bound", "binding", "shell"])
+@pytest.mark.parametrize("program", [BOUND, BINDING, GROUP], ids=["bound", "binding", "group"])
 def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=tmp_path

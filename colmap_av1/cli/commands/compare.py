@@ -44,7 +44,11 @@ def add_compare(commands: Any) -> None:
     add_quiet(command)
 
 
-def _run(namespace: argparse.Namespace) -> None:
+# A model was made, but a trainer failed on one.
+_FAILED_TRAINING = 3
+
+
+def _run(namespace: argparse.Namespace) -> int:
     from colmap_av1.compare import compare  # noqa: PLC0415 - slow to import
 
     options = given(namespace, CompareOptions)
@@ -60,10 +64,11 @@ def _run(namespace: argparse.Namespace) -> None:
     for column in result.columns:
         if column.error:
             print_warning(f"{column.name}: {column.error}")
-    for reason in sorted({column.training_error for column in result.columns} - {""}):
-        print_warning(f"nothing is trained: {reason}")
+        if column.training_error:
+            print_warning(f"{column.name}: nothing is trained: {column.training_error}")
     print_result(namespace, compare_rows(result), result.warnings)
     if all(column.model is None for column in result.columns):
         raise EvaluationError(
             f"{result.output}: no front-end gave a model: report.md there gives the reason for each"
         )
+    return _FAILED_TRAINING if any(column.training_error for column in result.columns) else 0

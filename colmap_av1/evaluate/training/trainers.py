@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import shutil
 import subprocess
 from collections.abc import Collection, Sequence
@@ -22,9 +21,9 @@ from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_m
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model.colmap_model import ModelPoints, posed_images, read_model, write_model
-from colmap_av1.options.compare import GSPLAT
+from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.util.digests import file_digest
-from colmap_av1.util.processes import bound_shell
+from colmap_av1.util.processes import bound_group
 from colmap_av1.util.stages import run_stage_in
 
 # What it says about a training; an upgrade of the rest repeats none.
@@ -77,10 +76,16 @@ def check_trainer(trainer: str) -> None:
     """Refuse a trainer that cannot run.
 
     Raises:
-        EvaluationError: a package that gsplat needs is missing.
+        EvaluationError: a package that gsplat needs is missing, or there is no such program.
     """
     if trainer == GSPLAT:
         check_packages("the trainer gsplat", ("torch", "gsplat", "pytorch_msssim"), "splatting")
+        return
+    program = words_of_trainer(trainer)[0]
+    if "{" not in program and shutil.which(program) is None:
+        raise EvaluationError(
+            f"trainer '{trainer}': there is no program {program}: install it, or give its path"
+        )
 
 
 def write_split(model: Path, image_path: Path, folder: Path) -> Split:
@@ -134,7 +139,7 @@ def train(
     """Train 3D Gaussians and measure their renderings; a finished training is not repeated.
 
     Args:
-        trainer: "gsplat", or the template of a shell command: `{data}` and `{test}` are the
+        trainer: "gsplat", or a command, see `words_of_trainer`: `{data}` and `{test}` are the
             halves, `{output}` an empty folder, `{renders}` the one that gets the renderings of
             the test images, `{iterations}` and `{name}` what they say.
         split: the data.
@@ -160,7 +165,7 @@ def train(
     def make() -> dict[str, Any]:
         for path in (folder / "output", renders):
             path.mkdir()
-        words = {
+        values = {
             "data": split.train.resolve(),
             "test": split.test.resolve(),
             "output": (folder / "output").resolve(),
@@ -168,8 +173,8 @@ def train(
             "iterations": iterations,
             "name": name,
         }
-        quoted = {key: shlex.quote(str(value)) for key, value in words.items()}
-        measured = run_measured(_run, trainer.format(**quoted), log=folder / "log.txt")
+        command = [word.format(**values) for word in words_of_trainer(trainer)]
+        measured = run_measured(_run, command, folder / "log.txt", log=folder / "log.txt")
         match_renders(renders, references)  # refuses others before they are kept
         return {"seconds": measured.seconds}
 
@@ -241,13 +246,10 @@ def _milestone(plain: dict[str, Any]) -> Milestone:
     return Milestone(**{**plain, "metrics": RenderingMetrics(**metrics)})
 
 
-def _run(command: str) -> None:
-    words = bound_shell(command)
-    status = subprocess.run(
-        words, shell=isinstance(words, str), check=False, stdin=subprocess.DEVNULL
-    ).returncode
-    if status != 0:
-        raise EvaluationError(f"the trainer ended with status {status}: its log.txt says more")
+def _run(command: Sequence[str], log: Path) -> None:
+    run = subprocess.run(bound_group(command), check=False, stdin=subprocess.DEVNULL)
+    if run.returncode != 0:
+        raise EvaluationError(f"the trainer ended with status {run.returncode}: see {log}")
 
 
 def _undistort(model: Path, image_path: Path, output: Path, names: Sequence[str]) -> None:

@@ -1,0 +1,35 @@
+"""Commands that train: no shell reads them, and what fails says where its log is."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.errors import EvaluationError
+from colmap_av1.evaluate.training.trainers import Split, check_trainer, train
+
+ANSWER = "import sys; print(sys.argv[1:]); sys.exit(3)"
+
+
+def test_names_of_folders_are_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "a b $(touch c) `touch d` '\"; touch e; {f}"
+    split = Split(folder / "data", folder / "train", folder / "test")
+    program = shlex.join([sys.executable, "-c", ANSWER])
+    command = f"{program} \"{{data}}\" --to='{{output}}/x' {{{{}}}}"
+    log = folder / "training" / "log.txt"
+    with pytest.raises(EvaluationError, match=re.escape(f"ended with status 3: see {log}")):
+        train(command, split, folder / "training", name="av1", iterations=7, milestones=())
+    output = folder / "training" / "output" / "x"
+    assert log.read_text() == f"{[str(split.train), f'--to={output}', '{}']}\n"
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_a_program_that_is_not_there_is_missed_before_the_work() -> None:
+    check_trainer(f"{sys.executable} {{data}}")
+    with pytest.raises(EvaluationError, match=r"there is no program \./train: install it, or give"):
+        check_trainer("./train {data}")
