@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -177,6 +178,9 @@ def info_rows(report: StreamReport) -> Rows:
     )
     if report.num_cut:
         frames += f", {report.num_cut} hidden by an edit list"
+    motion = f"{report.median_motion:.2f} px per frame"
+    if math.isnan(report.median_motion):
+        motion = "none"
     display = report.display
     cropped = any(display.crop)
     return [
@@ -191,7 +195,7 @@ def info_rows(report: StreamReport) -> Rows:
         ("frames", frames),
         ("references", ", ".join(references) or "none"),
         ("inter units", f"{report.inter_share:.1%}"),
-        ("median motion", f"{report.median_motion:.2f} px per frame"),
+        ("median motion", motion),
         ("bytes per frame", f"{report.bytes_per_frame:.0f}"),
         ("bits per pixel", f"{report.bits_per_pixel:.3f}"),
         ("for matching", "; ".join(report.reasons) or "good"),

@@ -23,6 +23,7 @@ from colmap_av1.images.names import (
 from colmap_av1.images.recognising import check_content, frames_by_content
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.util.texts import read_lines
 
 _Image = NDArray[np.uint8]
 
@@ -258,7 +259,7 @@ def _read_entries(
 ) -> list[tuple[int, int, str]]:
     """Number of the line, frame and image name of each entry of a list of frames."""
     try:
-        lines = Path(path).read_text().splitlines()
+        lines = read_lines(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise ImageError(

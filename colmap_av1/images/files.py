@@ -24,7 +24,7 @@ from colmap_av1.images.names import (
 )
 from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
-from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
@@ -285,6 +285,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """
     # COLMAP, too, takes pixels as they are stored and leaves an orientation in EXIF alone.
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    if not may_read(path):
+        raise ImageError(f"{path}: no permission to read it: change that")
     image = cv2.imread(str(path), how) if path.is_file() else None
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
@@ -302,6 +304,8 @@ def image_size(path: Path) -> tuple[int, int]:
         with av.open(os.path.abspath(path)) as container:
             if container.streams.video:
                 size = container.streams.video[0].width, container.streams.video[0].height
+    except PermissionError as error:
+        raise ImageError(f"{path}: no permission to read it: change that") from error
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise ImageError(f"{path}: is not a readable image: remove it") from error
     if size == (0, 0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
+from colmap_av1.util.files import may_read
 
 _FILES = ("cameras", "images", "points3D")
+# Files of folders of models, as `map` and `densify` write them.
+MODEL_FILES = re.compile(r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log")
 
 # Records of COLMAP's binary files, little-endian and packed.
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])
@@ -189,6 +193,9 @@ def read_model(model: str | os.PathLike[str]) -> Any:
         inside = next((p for p in found if ".stages" not in p.parts), None)
         hint = f": did you mean {inside.parent}?" if inside else ": give a folder a mapper wrote"
         raise ModelError(f"{path}: holds no COLMAP model (cameras, images, points3D){hint}")
+    for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):
+        if not may_read(file):
+            raise ModelError(f"{file}: no permission to read it: change that")
     unreadable = ModelError(
         f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
         "update pycolmap"

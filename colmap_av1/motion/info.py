@@ -50,7 +50,8 @@ class StreamReport:
         reference_distances: share of references by signed display distance, counted in
             units; negative is the past.
         hidden_reference_share: share of references to frames that are never shown.
-        median_motion: median length of the units' displacements in pixels per shown frame.
+        median_motion: median length of the units' displacements in pixels per shown frame; NaN
+            where none refers to a shown frame.
         bytes_per_frame: size of the stream per shown frame.
         bits_per_pixel: the same in bits per pixel.
         reasons: why the stream is poor for matching; empty where it is good.
@@ -182,7 +183,8 @@ class Structure:
     def reasons(self, bits_per_pixel: float) -> tuple[str, ...]:
         """Why streams of such a structure and rate are poor for matching; empty if they are not."""
         if self.num_shown < 3:
-            return (f"only {self.num_shown} frames are shown: a track needs more",)
+            frames = "1 frame is" if self.num_shown == 1 else f"{self.num_shown} frames are"
+            return (f"only {frames} shown: a track needs more",)
         if self.inter_units == 0:
             return ("every frame is intra coded, so there is no motion: encode it with -g 9999",)
         reasons = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,21 +38,34 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """The same for a folder, made with those above it, that does not exist yet or is empty.
+
+    Args:
+        path: the folder.
+        overwrite: replace one that is not empty, see `check_new_folder`.
 
     Raises:
         OSError: the folder cannot be made or given its name.
     """
-    partial = _partial(path)
+    path = path.resolve()
+    partial, before = _partial(path), _partial(path.with_name(f"{path.name}.before"))
     try:
         partial.mkdir(parents=True)
         yield partial
-        if path.exists():
+        if path.exists() and overwrite:
+            path.replace(before)
+        elif path.exists():
             path.rmdir()
-        partial.replace(path)
+        try:
+            partial.replace(path)
+        except OSError:
+            if before.exists():
+                before.replace(path)
+            raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(before, ignore_errors=True)
 
 
 @contextmanager
@@ -63,6 +77,7 @@ def scratch_folder(beside: Path) -> Iterator[Path]:
     Raises:
         OSError: it cannot be made.
     """
+    beside = beside.resolve()
     remove_leftovers(beside.parent, beside.name)
     scratch = _partial(beside.with_name(f"{beside.name}.scratch"))
     # Of a process that had this one's number: it is gone, for this one has only begun.
@@ -74,18 +89,46 @@ def scratch_folder(beside: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def check_new_folder(path: Path) -> None:
+def check_new_folder(path: Path, own: re.Pattern[str], *, overwrite: bool = False) -> None:
     """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
+
+    Args:
+        path: the folder.
+        own: paths of files in folders that may be replaced.
+        overwrite: replace a folder that holds nothing else.
 
     Raises:
         OptionError: it is there and not empty, or nothing can be made where it is to be.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise OptionError(f"{path}: is there and not empty: give a new folder")
-    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if path.exists() and not path.is_dir():
+        raise OptionError(f"{path}: is a file: give a new folder")
+    if path.is_dir() and any(path.iterdir()):
+        if not overwrite:
+            raise OptionError(f"{path}: is there and not empty: give a new folder, or --overwrite")
+        held = (p.relative_to(path).as_posix() for p in path.rglob("*") if not _is_folder(p))
+        other = next((name for name in held if not own.fullmatch(name)), None)
+        if other is not None:
+            raise OptionError(f"{path}: holds {other}, which stays: give a new folder")
+    path = path.resolve()
+    above = next(folder for folder in path.parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise OptionError(f"{path}: cannot be made in {above}: give another folder")
     remove_leftovers(path.parent, path.name)
+
+
+def may_read(path: Path) -> bool:
+    """Whether the system lets this process read a file; True where it is not there, too."""
+    try:
+        path.open("rb").close()
+    except PermissionError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _partial(path: Path) -> Path:

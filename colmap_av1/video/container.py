@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -27,6 +28,8 @@ _IVF_FRAME_HEADER_SIZE = 12
 _IVF_RATE_OFFSET = 16  # rate and scale, 32 bits each
 _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
 _AV1C_HEADER_SIZE = 4
+# As a path spells it, with one slash.
+_ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]+):/(?P<rest>.*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -274,11 +277,22 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
     """Open a file of any container, with clear messages for what can go wrong."""
     file: _IvfWithRate | None = None
     try:
+        address = _ADDRESS.match(str(path))
+        if address and not path.exists():
+            raise VideoError(
+                f"{address['scheme']}://{address['rest']}: is no file: fetch it first, and give "
+                "its path"
+            )
         if not path.exists():
             raise VideoError(f"{path}: no such file: give the path of a video")
         if path.is_dir():
             raise VideoError(f"{path}: is a folder: give a video file")
-        if path.is_file() and path.stat().st_size == 0:
+        if not path.is_file():
+            raise VideoError(
+                f"{path}: is a pipe or device, but a video is read several times: copy it to a "
+                "file first"
+            )
+        if path.stat().st_size == 0:
             raise VideoError(f"{path}: is an empty file: give the path of a video")
         if _is_ivf_without_rate(path):
             file = _IvfWithRate(path)

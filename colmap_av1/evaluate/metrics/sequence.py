@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ImageError, VideoError
+from colmap_av1.util.texts import read_lines
 
 _WHAT_TO_GIVE = "give lines of 'name tx ty tz qx qy qz qw', or the folder of a COLMAP model"
 
@@ -116,7 +117,7 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
     try:
-        lines = path.read_text().splitlines()
+        lines = read_lines(path)
     except UnicodeDecodeError as error:
         raise ImageError(f"{path}: is no text: {_WHAT_TO_GIVE}") from error
     except OSError as error:

@@ -1,0 +1,29 @@
+"""Text files that users write, one entry a line."""
+
+from __future__ import annotations
+
+import codecs
+import os
+from pathlib import Path
+
+# No list of frames, images or poses comes near it.
+_LARGEST = 1 << 28
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def read_lines(path: str | os.PathLike[str]) -> list[str]:
+    """The lines of a text in UTF-8, or in UTF-16 with its mark of the order of bytes.
+
+    Raises:
+        OSError: it cannot be read, is larger than any list, or no regular file: a pipe gives what
+            it holds once only, and a device may have no end.
+        UnicodeDecodeError: it is no such text.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        what = "is a folder" if path.is_dir() else "is no regular file: copy it to one first"
+        raise OSError(None, what)
+    if path.stat().st_size > _LARGEST:
+        raise OSError(None, "is too large")
+    content = path.read_bytes()
+    return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig").splitlines()

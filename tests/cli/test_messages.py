@@ -1,0 +1,143 @@
+"""Messages name the cause: pipes, addresses, permissions, marks of byte order, leading signs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import Encode, make_frames
+
+from colmap_av1.cli import main
+from colmap_av1.database.hloc import read_hloc
+from colmap_av1.database.reading import read_images
+from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.images.files import image_size, read_image
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.video.container import open_stream
+from colmap_av1.video.encode import stream_of
+
+posix = pytest.mark.skipif(os.name != "posix", reason="there are no such files or users")
+
+
+def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a command which refuses its input says."""
+    try:
+        status: object = main(words)
+    except SystemExit as end:  # argparse's way out
+        status = end.code
+    out, err = capsys.readouterr()
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    return err
+
+
+@posix
+def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pipe, database = str(tmp_path / "pipe"), str(tmp_path / "a.db")
+    os.mkfifo(pipe)
+    for command in (["info"], ["match", "--database", database], ["encode", "--output", "x.mp4"]):
+        error = told([*command, "--video", pipe], capsys)
+        assert "is a pipe or device, but a video is read several times: copy it to a" in error
+    words = ["match", "--database", database, "--video", str(clip), "--frame_list", pipe]
+    assert "is no regular file: copy it to one first" in told(words, capsys)
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_addresses(capsys: pytest.CaptureFixture[str]) -> None:
+    for address in ("http://example.org/a b.mp4", "s3://bucket/v.mp4", "https://x:8/y?z#1"):
+        error = told(["info", "--video", address], capsys)
+        assert error == (
+            f"colmap-av1: error: {address}: is no file: fetch it first, and give its path\n"
+        )
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_lists_with_a_mark_of_byte_order(clip: Path, tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "list.txt").write_text("0 é0.png\n5 é5.png\n9 é9.png\n", encoding=encoding)
+    words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip), "--quiet"]
+    assert main([*words, "--frame_list", str(tmp_path / "list.txt")]) == 0
+    names = [image.name for image in read_images(tmp_path / "a.db")]
+    assert names == ["é0.png", "é5.png", "é9.png"]
+
+
+@pytest.mark.parametrize(
+    ("words", "way_out"),
+    [
+        (["--cosine", "-1e-3"], "--cosine=-1e-3"),
+        (["--camera-params", "-1,2,3"], "--camera_params=-1,2,3"),
+        (["--image_name", "-x%d.png"], "--image_name=-x%d.png"),
+        (["--database", "-a.db"], "--database=-a.db"),
+    ],
+)
+def test_values_that_begin_like_options(
+    words: list[str], way_out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = told(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
+    assert f"a value that begins with '-' follows '=': give {way_out} (see" in error
+
+
+def test_values_below_zero_are_values(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--cosine", "-0.5"], ["--cosine=-1e-3"], ["--cosine", "-1"]):
+        error = told(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
+        assert "none.mp4: no such file" in error
+
+
+def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["info"], ["match", "--database", "a.db"], ["reconstruct", "--output", "out"]):
+        error = told([*command, "--video", "none.mp4", "--operating_point", "99"], capsys)
+        assert error == "colmap-av1: error: operating_point is 99: give 0 to 31\n"
+
+
+def test_one_frame(encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = encode(make_frames(1), tmp_path / "one.mp4")
+    assert main(["info", "--video", str(video)]) == 0
+    table = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
+    assert "nan" not in " ".join(table.values())
+    assert table["median motion"] == "none"
+    assert table["for matching"] == "only 1 frame is shown: a track needs more"
+
+
+@pytest.fixture
+def others(clip: Path) -> Iterator[Path]:
+    """A folder of files that this process, without root's rights, must not read."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copyfile(clip, folder / "v.mp4")
+        cv2.imwrite(str(folder / "a.png"), np.zeros((8, 8, 3), np.uint8))
+        for file in ("a.h5", "s.mp4", "cameras.bin", "images.bin", "points3D.bin"):
+            (folder / file).write_bytes(b"content")
+        for file in folder.iterdir():
+            file.chmod(0)
+        shutil.copyfile(clip, folder / "open.mp4")
+        folder.chmod(0o755)
+        user = os.geteuid()
+        if user == 0:
+            os.seteuid(65534)
+        try:
+            yield folder
+        finally:
+            os.seteuid(user)
+
+
+READERS: list[tuple[str, Callable[[Path], object]]] = [
+    ("a.png", lambda folder: image_size(folder / "a.png")),
+    ("a.png", lambda folder: read_image(folder / "a.png")),
+    ("a.h5", lambda folder: read_hloc(folder / "a.h5", folder / "a.h5")),
+    ("cameras.bin", read_model),
+    ("v.mp4", lambda folder: open_stream(folder / "v.mp4")),
+    ("s.mp4", lambda folder: stream_of(folder / "open.mp4", folder / "s.mp4")),
+]
+
+
+@posix
+@pytest.mark.parametrize(("name", "read"), READERS)
+def test_files_that_must_not_be_read(
+    name: str, read: Callable[[Path], object], others: Path
+) -> None:
+    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission to read it: change that"):
+        read(others)
