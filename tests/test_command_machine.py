@@ -1,0 +1,336 @@
+"""Commands in any order, killed at any time, on files that were damaged meanwhile.
+
+No trace, no file of the user lost, and in the end the same bytes as without all that. It runs for
+some twenty seconds; COLMAP_AV1_MACHINE_SECONDS asks for more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from command_server import CommandServer, Outcome
+from conftest import PROJECT, Ffmpeg
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
+
+SECONDS = float(os.environ.get("COLMAP_AV1_MACHINE_SECONDS", "0"))
+QUICK = settings(
+    max_examples=3,
+    stateful_step_count=10,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command and what it does.
+
+    Attributes:
+        words: of its line.
+        outputs: files and folders that it makes.
+        inputs: files and folders that it reads.
+        once: what it made makes it refuse to run again.
+        resumes: it makes anew what is damaged of its output.
+    """
+
+    words: str
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    once: bool = False
+    resumes: bool = False
+
+
+COMMANDS = {
+    "match": Command(
+        "match --database a.db --video v.mp4 --image_path frames --every 2",
+        *(("a.db", "frames"), ("v.mp4", "frames")),
+        once=True,
+    ),
+    "convert": Command("match --database h.db --video h.mp4", ("h.db",), ("h.mp4",), once=True),
+    "motion": Command("motion --video v.mp4 --output motion.npz", ("motion.npz",), ("v.mp4",)),
+    "draw": Command("view --video v.mp4 --output drawn.mp4", ("drawn.mp4",), ("v.mp4",)),
+    "export": Command("export --database a.db --output hloc", ("hloc",), ("a.db",)),
+    "pair": Command(
+        "view --database a.db --image_path frames --output pair.png",
+        *(("pair.png",), ("a.db", "frames")),
+    ),
+    "map": Command(
+        "map --database a.db --image_path frames --output model",
+        *(("model",), ("a.db", "frames")),
+        once=True,
+    ),
+    "densify": Command(
+        "densify --model model/0 --video v.mp4 --output dense",
+        *(("dense",), ("model", "v.mp4")),
+        once=True,
+    ),
+    "reconstruct": Command(
+        "reconstruct --video v.mp4 --output out --every 2", ("out",), ("v.mp4",), resumes=True
+    ),
+}
+VIDEOS = ("v.mp4", "h.mp4")
+# Where files of the user may lie in the way.
+PLACES = (
+    *("a.db", "frames/frame_000004.png", "frames/notes.txt", "hloc/pairs.txt", "hloc/notes.txt"),
+    *("motion.npz", "drawn.mp4", "pair.png", "model/notes.txt", "model.log", "dense/cameras.bin"),
+    *("out/notes.txt", "h.db"),
+)
+# What says when and how long, and records that only the same folder can be resumed by.
+UNLIKE = {"report.json", "mapper.log", "model.log"}
+
+
+def contents(folder: Path, *roots: str) -> dict[str, str]:
+    """Digests of the files in some places that are the same each time."""
+    found = {}
+    for root in roots:
+        top = folder / root
+        for path in sorted(top.rglob("*")) if top.is_dir() else [top]:
+            name = path.relative_to(folder)
+            if path.is_file() and ".stages" not in name.parts and name.name not in UNLIKE:
+                found[name.as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+@dataclass
+class World:
+    """What all runs of the machine share: videos, and what each command makes of them alone."""
+
+    server: CommandServer
+    folder: Path
+    seconds: dict[str, float]
+
+    def made(self, *roots: str) -> dict[str, str]:
+        return contents(self.folder, *roots)
+
+
+class CommandMachine(RuleBasedStateMachine):
+    """A user's folder."""
+
+    world: World
+
+    @initialize()
+    def begin(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(dir=self.world.folder.parent))
+        for video in VIDEOS:
+            shutil.copyfile(self.world.folder / video, self.folder / video)
+        self.mine = dict.fromkeys(VIDEOS, "")
+        self.mine = contents(self.folder, *VIDEOS)
+
+    @rule(name=st.sampled_from(sorted(COMMANDS)))
+    def run(self, name: str) -> None:
+        command = COMMANDS[name]
+        reference = self.world.made(*command.inputs)
+        inputs = contents(self.folder, *command.inputs)
+        good = inputs.items() <= reference.items() and (
+            name == "match" or inputs.keys() == reference.keys()
+        )
+        in_the_way = self.in_the_way(command)
+        before = contents(self.folder, *command.outputs)
+        outcome = self.call(command.words)
+        assert outcome.status in (0, 2), outcome.said
+        if outcome.status == 0:
+            if good:
+                assert self.made_by(command) == self.world.made(*command.outputs)
+            assert not self.leftovers(command), os.listdir(self.folder)
+        else:
+            after = contents(self.folder, *command.outputs)
+            assert before.items() <= after.items() or command.resumes
+            assert not good or in_the_way, outcome.said
+
+    @rule(
+        name=st.sampled_from(sorted(COMMANDS)),
+        share=st.floats(0.0, 1.0),
+        number=st.sampled_from([signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT]),
+    )
+    def kill(self, name: str, share: float, number: signal.Signals) -> None:
+        command = COMMANDS[name]
+        after = share * self.world.seconds[name]
+        outcome = self.world.server.run(self.folder, f"{command.words} --quiet", number, after)
+        self.check_words(outcome)
+        quiet = {signal.SIGTERM: (143,), signal.SIGINT: (130,), signal.SIGKILL: (-9,)}[number]
+        assert outcome.status in (0, 2, *quiet), outcome
+        if number == signal.SIGTERM and outcome.status == 143:
+            assert outcome.said == ""
+        if number == signal.SIGINT and outcome.status == 130:
+            assert outcome.said in ("", "colmap-av1: interrupted\n")
+
+    @precondition(lambda self: self.derived())
+    @rule(data=st.data(), how=st.sampled_from(["cut", "flip", "empty", "more", "gone", "folder"]))
+    def damage(self, data: st.DataObject, how: str) -> None:
+        path = self.folder / data.draw(st.sampled_from(self.derived()), label="file")
+        content = path.read_bytes()
+        place = data.draw(st.integers(0, max(len(content) - 1, 0)), label="place")
+        if how == "cut":
+            os.truncate(path, place)
+        elif how == "flip" and content:
+            changed = bytearray(content)
+            changed[place] ^= 1 << place % 8
+            path.write_bytes(changed)
+        elif how == "more":
+            path.write_bytes(content + content[:place])
+        elif how == "empty":
+            path.write_bytes(b"")
+        elif how in ("gone", "folder"):
+            path.unlink()
+            if how == "folder":
+                path.mkdir()
+
+    @rule(place=st.sampled_from(PLACES))
+    def put(self, place: str) -> None:
+        path = self.folder / place
+        if not os.path.lexists(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"mine: {place}\n")
+            self.mine |= contents(self.folder, place)
+            # Not of those that are the same each time.
+            self.mine.setdefault(place, hashlib.sha256(path.read_bytes()).hexdigest())
+
+    @rule(name=st.sampled_from(sorted(COMMANDS)))
+    def clean(self, name: str) -> None:
+        """The user removes what a command made, and what lay in its way."""
+        for output in COMMANDS[name].outputs:
+            self.remove(output)
+
+    @invariant()
+    def nothing_of_the_user_is_lost(self) -> None:
+        for name, digest in getattr(self, "mine", {}).items():
+            path = self.folder / name
+            assert path.is_file(), name
+            assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, name
+
+    def teardown(self) -> None:
+        """Once more, with damaged files that no command makes again out of the way."""
+        if not hasattr(self, "folder"):
+            return
+        try:
+            for name in [n for n in self.mine if n not in VIDEOS]:
+                self.remove(name)
+            for command in COMMANDS.values():
+                reference = self.world.made(*command.outputs)
+                if not command.resumes and self.made_by(command) != reference:
+                    for output in command.outputs:
+                        self.remove(output)
+                if self.made_by(command) != reference:
+                    outcome = self.call(command.words)
+                    assert outcome.status == 0, outcome.said
+                assert self.made_by(command) == reference
+                assert not self.leftovers(command), os.listdir(self.folder)
+        finally:
+            shutil.rmtree(self.folder)
+
+    def call(self, words: str) -> Outcome:
+        outcome = self.world.server.run(self.folder, f"{words} --quiet")
+        self.check_words(outcome)
+        return outcome
+
+    def check_words(self, outcome: Outcome) -> None:
+        lines = outcome.said.splitlines()
+        assert all(line.startswith("colmap-av1: ") for line in lines), outcome.said
+        errors = [line for line in lines if line.startswith("colmap-av1: error: ")]
+        assert len(errors) == (outcome.status == 2), outcome.said
+
+    def made_by(self, command: Command) -> dict[str, str]:
+        made = contents(self.folder, *command.outputs)
+        return {name: digest for name, digest in made.items() if name not in self.mine}
+
+    def in_the_way(self, command: Command) -> bool:
+        """Whether there is a file of the user, or one that the command will not write again."""
+        found = contents(self.folder, *command.outputs)
+        damaged = found.items() - self.world.made(*command.outputs).items()
+        folders = any((self.folder / name).is_dir() for name in self.files_made(command))
+        there = bool(found) and (command.once or bool(damaged))
+        mine = any(
+            place.split("/")[0] in (*command.outputs, *(f"{o}.log" for o in command.outputs))
+            for place in self.mine
+        )
+        return (there and not command.resumes) or folders or mine
+
+    def files_made(self, command: Command) -> list[str]:
+        return list(self.world.made(*command.outputs))
+
+    def derived(self) -> list[str]:
+        """Files that commands made."""
+        roots = sorted({output for command in COMMANDS.values() for output in command.outputs})
+        files: list[str] = []
+        for root in roots:
+            top = self.folder / root
+            found = sorted(top.rglob("*")) if top.is_dir() else [top]
+            files += [p.relative_to(self.folder).as_posix() for p in found if p.is_file()]
+        return [f for f in files if f not in self.mine and not f.endswith(".lock")]
+
+    def leftovers(self, command: Command) -> list[str]:
+        """What killed runs left of a command's output."""
+        places = {Path(output).name for output in command.outputs}
+        hidden = [p.name for p in self.folder.iterdir() if p.name.endswith(".partial")]
+        inside = [
+            str(p) for output in command.outputs for p in (self.folder / output).rglob("*.partial")
+        ]
+        return [n for n in hidden if any(n.startswith(f".{place}.") for place in places)] + inside
+
+    def remove(self, name: str) -> None:
+        path = self.folder / name
+        for mine in [
+            m for m in self.mine if Path(m) == Path(name) or Path(name) in Path(m).parents
+        ]:
+            del self.mine[mine]
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def world(ffmpeg: Ffmpeg, tmp_path: Path) -> Iterator[World]:
+    folder = tmp_path / "world"
+    folder.mkdir()
+    scene = PROJECT / "examples" / "scene.mp4"
+    av1 = "-c:v libaom-av1 -usage realtime -cpu-used 6 -crf 20 -b:v 0 -lag-in-frames 0 -g 9999"
+    ffmpeg("-i", scene, *["-frames:v", "20", "-vf", "scale=160:90"], *av1.split(), folder / "v.mp4")
+    ffmpeg(
+        "-i",
+        scene,
+        *["-frames:v", "12", "-vf", "scale=160:90", "-c:v", "libx264"],
+        folder / "h.mp4",
+    )
+    with CommandServer() as server:
+        seconds = {}
+        for name, command in COMMANDS.items():
+            outcome = server.run(folder, f"{command.words} --quiet")
+            assert outcome.status == 0, outcome.said
+            seconds[name] = outcome.seconds
+        yield World(server, folder, seconds)
+
+
+@pytest.mark.slow
+def test_commands_in_any_order_killed_and_damaged(world: World) -> None:
+    machine = type("Machine", (CommandMachine,), {"world": world})
+    if not SECONDS:
+        run_state_machine_as_test(machine, settings=QUICK)
+        return
+    long = settings(QUICK, max_examples=20, stateful_step_count=20, derandomize=False)
+    end = time.monotonic() + SECONDS
+    while time.monotonic() < end:
+        run_state_machine_as_test(machine, settings=long)
