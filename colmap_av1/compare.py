@@ -28,6 +28,7 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.model.figures import model_figures
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
+from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
@@ -108,6 +109,8 @@ def compare(
     frontends = _chosen_frontends(options)
     if options.trainer is not None:
         check_trainer(options.trainer)
+    files = [file for frontend in frontends.values() for file in frontend.files]
+    check_folder(output, [video, image_path, reference, options.match.images.frame_list, *files])
     video = read_video(video, options.match.read.operating_point)
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(

@@ -15,6 +15,7 @@ from colmap_av1.errors import ImageError, ModelError, cannot_write
 from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import size_of_images
 from colmap_av1.model.colmap_model import (
+    MODEL_FILES,
     ModelImage,
     ModelPoints,
     posed_images,
@@ -43,6 +44,7 @@ from colmap_av1.tracks.video_tracks import (
     track_video,
 )
 from colmap_av1.util.files import check_new_folder, whole_folder
+from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
@@ -89,6 +91,7 @@ def densify(
     image_path: str | os.PathLike[str] | None = None,
     options: DensifyOptions | None = None,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> DensifyReport:
     """Triangulate the tracks of a video on the poses of an existing model.
 
@@ -102,6 +105,7 @@ def densify(
             they are where their names leave doubt.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
+        overwrite: replace an output that holds a model and nothing else.
 
     Raises:
         ModelError: there is no readable model with poses, it is not of this video, or the
@@ -116,7 +120,8 @@ def densify(
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
-    check_new_folder(output)
+    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
+    check_folder(output, [model, video, folder, options.match.images.frame_list])
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
@@ -155,7 +160,7 @@ def densify(
     with clock.measure("coverage"):
         covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
-        _write(output, cameras, images, replace(cloud, rgb=colours.rgb()))
+        _write(output, cameras, images, replace(cloud, rgb=colours.rgb()), overwrite)
     return DensifyReport(
         output=output,
         model=model,
@@ -208,10 +213,14 @@ def _add_pictures(
 
 
 def _write(
-    output: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
+    output: Path,
+    cameras: Mapping[int, Any],
+    images: Sequence[ModelImage],
+    points: ModelPoints,
+    overwrite: bool,
 ) -> None:
     try:
-        with whole_folder(output) as partial:
+        with whole_folder(output, overwrite=overwrite) as partial:
             write_model(partial, cameras, images, points)
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error

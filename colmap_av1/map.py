@@ -12,12 +12,13 @@ from colmap_av1.database.reading import read_images
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size
 from colmap_av1.images.names import image_file
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.colmap_model import MODEL_FILES, read_model
 from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
-from colmap_av1.model.mapper import map_poses
+from colmap_av1.model.mapper import is_mapper_log, map_poses
 from colmap_av1.options import MapOptions
 from colmap_av1.util.files import check_new_folder, whole_folder
+from colmap_av1.util.outputs import check_files, check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 
 
@@ -61,6 +62,7 @@ def map_database(
     *,
     options: MapOptions | None = None,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> MapReport:
     """Map a COLMAP database of any origin; the database stays as it is.
 
@@ -71,23 +73,26 @@ def map_database(
             most images, and `mapper.log`.
         options: which mapper, and how.
         progress: called with a stage's name, what is done, and of how much where known.
+        overwrite: replace an output that holds models and nothing else.
 
     Raises:
         DatabaseError: the database is missing, unreadable, or nothing that mappers can use.
         ImageError: an image of the database is not in the folder, or of another size.
         ModelError: the mapper fails or finds no model; `OUTPUT.log` is what it printed.
-        OptionError: the output is not empty.
+        OptionError: the output is not empty, or must not be replaced.
     """
     options = options if options is not None else MapOptions()
     progress = progress if progress is not None else no_progress
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
-    check_new_folder(output)
+    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
+    check_folder(output, [database, image_path])
+    log = output.resolve().with_name(f"{output.resolve().name}.log")
+    check_files([log], [database, image_path], is_own=is_mapper_log, overwrite=overwrite)
     num_images = _check_input(database, image_path)
 
-    log = output.with_name(f"{output.name}.log")
     try:
-        with whole_folder(output) as partial:
+        with whole_folder(output, overwrite=overwrite) as partial:
             with clock.measure("poses"):
                 copy = partial / "mapped.db"
                 copy_database(database, copy)

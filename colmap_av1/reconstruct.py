@@ -26,6 +26,7 @@ from colmap_av1.options import ReconstructOptions
 from colmap_av1.tracks.tracks import cut_tracks, join_tracks
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.files import whole_file
+from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
@@ -122,6 +123,7 @@ def reconstruct(
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()
+    check_folder(output, [video, options.match.images.frame_list])
     video = read_video(video, options.match.read.operating_point)
     # What can be refused is refused before the long work.
     check_fit(options.match, video.picture_size, video.display.pixel_aspect)

@@ -9,6 +9,7 @@ centres are whole numbers; where it fills COLMAP's databases it adds 0.5.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_r
 from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
 from colmap_av1.options import ExportOptions
 from colmap_av1.util.files import remove_leftovers, whole_file
-from colmap_av1.util.hdf5 import new_hdf5
+from colmap_av1.util.hdf5 import mark_of, new_hdf5
+from colmap_av1.util.outputs import check_files, made_by
 from colmap_av1.util.progress import Progress, no_progress
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
@@ -33,6 +35,8 @@ FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 # files of its first versions.
 _SEPARATOR, _OLD_SEPARATOR = "/", "_"
 _NO_MATCH = -1
+_MARK = made_by("export")
+_PAIRS_DIGEST = "pairs_sha256"
 # Writes a dataset of a file.
 _Write = Callable[..., h5py.Dataset]
 
@@ -64,6 +68,8 @@ def export_hloc(
     output: str | os.PathLike[str],
     options: ExportOptions | None = None,
     progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
 ) -> tuple[int, int]:
     """Write keypoints and matches of a COLMAP database as hloc lays them out.
 
@@ -75,10 +81,11 @@ def export_hloc(
 
     Args:
         database: the database file.
-        output: folder of the files; made where it is missing. Files of these names in it are
-            replaced.
+        output: folder of the files; made where it is missing. Those of an earlier export in it
+            are replaced.
         options: which matches are written.
         progress: called with a stage's name, what is done, and of how much.
+        overwrite: replace other files of these names, too.
 
     Returns:
         The numbers of images and of pairs.
@@ -86,13 +93,15 @@ def export_hloc(
     Raises:
         DatabaseError: the file is missing, unreadable, not a COLMAP database, holds no
             keypoints, or something that hloc's layout has no place for.
-        OptionError: the folder cannot be written.
+        OptionError: the folder cannot be written, or must not.
     """
     options = options if options is not None else ExportOptions()
     path, folder = Path(database), Path(output)
     report = progress if progress is not None else no_progress
     if is_new(path):
         raise DatabaseError(f"{path}: no such file, or empty: give the path of a COLMAP database")
+    files = [folder / name for name in (FEATURES, MATCHES, PAIRS)]
+    check_files(files, [path], is_own=_is_own, overwrite=overwrite)
     with open_unaltered(path) as connection:
         check_layout(connection, path)
         names = dict(connection.execute("SELECT image_id, name FROM images").fetchall())
@@ -106,6 +115,17 @@ def export_hloc(
                 options=options, report=report,
             )  # fmt: skip
     return len(counts), num_pairs
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a file is of an earlier export; of a list, the matches beside it say so."""
+    if path.name != PAIRS:
+        return mark_of(path) == _MARK
+    if mark_of(path.with_name(MATCHES)) != _MARK:
+        return False
+    with h5py.File(path.with_name(MATCHES), "r") as file:
+        digest = file.attrs.get(_PAIRS_DIGEST, hashlib.sha256().hexdigest())
+    return bool(digest == hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
@@ -142,8 +162,8 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
         with contextlib.ExitStack() as files:
             partial = [files.enter_context(whole_file(folder / name)) for name in names]
             with (
-                new_hdf5(partial[0]) as features,
-                new_hdf5(partial[1]) as matches,
+                new_hdf5(partial[0], _MARK) as features,
+                new_hdf5(partial[1], _MARK) as matches,
                 open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
             ):
                 yield features, matches, pairs
@@ -202,6 +222,7 @@ def _write_pairs(
     pair_ids = connection.execute(
         f"SELECT pair_id FROM {table} WHERE rows > 0 ORDER BY pair_id"
     ).fetchall()
+    listed = hashlib.sha256()
     for done, (pair_id,) in enumerate(pair_ids, 1):
         i, j = image_ids_from_pair_id(pair_id)
         num_rows, data = connection.execute(
@@ -223,8 +244,12 @@ def _write_pairs(
         matches0[found[:, 0]] = found[:, 1]
         group = f"{_pair_part(names[i])}{_SEPARATOR}{_pair_part(names[j])}"
         write(f"{group}/matches0", matches0)
-        write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
-        pairs.write(f"{names[i]} {names[j]}\n")
+        scores = write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
+        line = f"{names[i]} {names[j]}\n"
+        pairs.write(line)
+        listed.update(line.encode())
+        if done == len(pair_ids):
+            scores.file.attrs[_PAIRS_DIGEST] = listed.hexdigest()
         report("pairs", done, len(pair_ids))
     return len(pair_ids)
 
@@ -282,6 +307,8 @@ def _open_hloc(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r", libver="latest") as file:
             yield file
+    except PermissionError as error:
+        raise HlocError(f"{path}: no permission to read it: change that") from error
     except OSError as error:
         raise HlocError(f"{path}: not an HDF5 file, or damaged: write it anew") from error
 

@@ -18,12 +18,14 @@ from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import MapOptions
 from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
 # Poses that are nearly right need no more steps; COLMAP's own limits take five times as long.
 _ADJUSTMENT_STEPS = 20
 _ADJUSTMENT_TOLERANCE = 1e-5
+_LOG_START = f"{made_by('map')}\n".encode()
 
 # Not `-m`, nor with '' on the path: a checkout in the working folder would hide the package.
 _CHILD = """
@@ -194,6 +196,12 @@ def _check_whole(model: Path) -> None:
         ) from error
 
 
+def is_mapper_log(path: Path) -> bool:
+    """Whether a file is a log that a mapper left here before."""
+    with path.open("rb") as file:
+        return file.read(len(_LOG_START)) == _LOG_START
+
+
 def _run_apart(
     settings: dict[str, Any],
     hear: Callable[[str, str], None] | None,
@@ -206,8 +214,9 @@ def _run_apart(
     # The package is found where this one was.
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *sys.path])
     done, reason = False, ""
+    log.write_bytes(_LOG_START)
     with (
-        log.open("wb") as file,
+        log.open("ab") as file,
         subprocess.Popen(
             bound([sys.executable, "-c", _CHILD, json.dumps(settings)]),
             stdout=subprocess.PIPE,

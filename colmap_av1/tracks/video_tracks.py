@@ -19,7 +19,7 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks, show_tracks
-from colmap_av1.util.files import scratch_folder
+from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
@@ -92,6 +92,8 @@ def open_source(
         EncodeError: no AV1 encoder works, or the stream cannot be written.
         OptionError: `keep_stream` names a file that is none of this video's.
     """
+    # Of a run that was killed while it converted another video.
+    remove_leftovers(beside.resolve().parent, beside.resolve().name)
     if video.codec == "av1" and not (options.reencode and inspect(video, options.reading).reasons):
         yield VideoSource(video, video)
         return

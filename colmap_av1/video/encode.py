@@ -24,7 +24,8 @@ from colmap_av1.errors import (
     cannot_write,
 )
 from colmap_av1.options import EncodeOptions
-from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.files import may_read, remove_leftovers, whole_file
+from colmap_av1.util.outputs import check_files
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import VideoFile, open_stream, read_file
@@ -100,11 +101,7 @@ def encode(
     path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
-    if output.exists():
-        if path.exists() and output.samefile(path):
-            raise OptionError(f"{output}: is the video itself: give another output")
-        if not overwrite:
-            raise OptionError(f"{output}: exists: give another output, or --overwrite")
+    check_files([output], [path], overwrite=overwrite)
     if not output.parent.is_dir():
         raise EncodeError(f"{output}: the folder does not exist: make it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
@@ -187,6 +184,8 @@ def stream_of(
         raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
     file = with_counted_packets(read_file(video))
     if output.exists():
+        if not may_read(output):
+            raise OptionError(f"{output}: no permission to read it: change that")
         mark = _mark_of(output)
         if mark is None:
             raise OptionError(
@@ -333,7 +332,7 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
     except (av.error.FFmpegError, OSError, ValueError):
         return None
     name, *words = tags.get("comment", "").split(" ")
-    if name != _MARK:
+    if name != _MARK or not all("=" in word for word in words):
         return None
     return dict(word.split("=", 1) for word in words)
 

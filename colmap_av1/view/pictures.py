@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -17,24 +19,86 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.outputs import check_files, made_by
 
 Image = NDArray[np.uint8]
 # Set, because x264's output depends on their number.
 _ENCODER_THREADS = 4
+_MARK = made_by("view")
+# Signature and header of a PNG file, with its checksum.
+_PNG_HEADER = 33
+# Bytes of a picture within which its mark is.
+_HEAD = 256
 
 
-def write_picture(picture: Image, output: str | os.PathLike[str]) -> None:
-    """Write a picture as PNG or JPEG, by the extension; whole or not at all.
+def check_picture(
+    output: str | os.PathLike[str],
+    inputs: Iterable[str | os.PathLike[str]] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Refuse an output that `write_picture` cannot or must not write, before anything is drawn.
+
+    Args:
+        output: the file.
+        inputs: what is drawn.
+        overwrite: replace a file that exists, if it was not drawn here either.
 
     Raises:
-        OptionError: another extension, or the file cannot be written.
+        OptionError: another extension, an input, or a file that is not drawn here.
     """
     path = Path(output)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise OptionError(f"{path}: give an output that ends in .png or .jpg")
-    _, encoded = cv2.imencode(path.suffix.lower(), picture)
+    check_files([path], inputs, is_own=is_drawn, overwrite=overwrite)
+
+
+def write_picture(
+    picture: Image, output: str | os.PathLike[str], *, overwrite: bool = False
+) -> None:
+    """Write a picture as PNG or JPEG, by the extension; whole or not at all.
+
+    Raises:
+        OptionError: as `check_picture` says, or the file cannot be written.
+    """
+    check_picture(output, overwrite=overwrite)
+    _write_picture(picture, Path(output))
+
+
+def is_drawn(path: Path) -> bool:
+    """Whether a picture or video says that it was drawn here."""
+    if path.suffix.lower() == ".mp4":
+        try:
+            with av.open(os.path.abspath(path)) as container:
+                return bool(container.metadata.get("comment") == _MARK)
+        except (av.error.FFmpegError, OSError, ValueError):
+            return False
+    try:
+        with path.open("rb") as file:
+            return _MARK.encode() in file.read(_HEAD)
+    except OSError:
+        return False
+
+
+def _write_picture(picture: Image, path: Path) -> None:
+    suffix = path.suffix.lower()
+    _, encoded = cv2.imencode(suffix, picture)
     with _output(path) as partial:
-        partial.write_bytes(encoded.tobytes())
+        partial.write_bytes(_marked(encoded.tobytes(), suffix))
+
+
+def _marked(content: bytes, suffix: str) -> bytes:
+    """A picture with a comment: a chunk of PNG after its header, or a segment of JPEG."""
+    words = _MARK.encode()
+    if suffix == ".png":
+        body = b"tEXtSoftware\0" + words
+        size, check = len(body) - 4, zlib.crc32(body)
+        comment, start = struct.pack(">I", size) + body + struct.pack(">I", check), _PNG_HEADER
+    else:
+        # After the first segment, which says that it is a JFIF file.
+        comment = b"\xff\xfe" + struct.pack(">H", len(words) + 2) + words
+        start = 4 + int.from_bytes(content[4:6], "big")
+    return content[:start] + comment + content[start:]
 
 
 def side_by_side(panels: Sequence[Image]) -> Image:
@@ -55,15 +119,22 @@ def bgr(
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0], dtype=np.uint8)
 
 
+def existing_pictures(path: Path) -> list[Path]:
+    """The files that `open_pictures` may replace."""
+    if path.suffix.lower() == ".mp4":
+        return [path]
+    return sorted(path.glob("frame_[0-9]*.png")) if path.is_dir() else []
+
+
 @contextmanager
 def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], None]]:
-    """Write pictures to an .mp4 file, or numbered to a folder."""
+    """Write pictures to an .mp4 file, or numbered to a folder; see `existing_pictures`."""
     if path.suffix.lower() != ".mp4":
         count = 0
 
         def write_file(picture: Image) -> None:
             nonlocal count
-            write_picture(picture, path / f"frame_{count:06d}.png")
+            _write_picture(picture, path / f"frame_{count:06d}.png")
             count += 1
 
         try:
@@ -75,6 +146,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
         yield write_file
         return
     with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
+        container.metadata["comment"] = _MARK
         rate = Fraction(frame_rate).limit_denominator(1001)
         stream: Any = container.add_stream("libx264", rate, options={"crf": "18"})
         stream.pix_fmt = "yuv420p"

@@ -15,12 +15,20 @@ from colmap_av1.errors import OptionError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.tracks.tracks import Tracks, build_tracks, order_by_frame, show_tracks
+from colmap_av1.util.outputs import check_files
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
-from colmap_av1.view.pictures import Image, bgr, open_pictures, side_by_side
+from colmap_av1.view.pictures import (
+    Image,
+    bgr,
+    existing_pictures,
+    is_drawn,
+    open_pictures,
+    side_by_side,
+)
 
 # Tracks are one to a unit of 4x4 pixels at most.
 _UNIT = 4
@@ -47,6 +55,7 @@ def view_video(
     tracks: TrackOptions | None = None,
     read: ReadOptions | None = None,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> int:
     """Draw motion and tracks over the frames of a video.
 
@@ -62,12 +71,13 @@ def view_video(
         tracks: how the motion is chained.
         read: how the bitstream is read.
         progress: called with a stage's name, what is done, and of how much where known.
+        overwrite: replace files that exist, if they were not drawn here either.
 
     Returns:
         The number of frames drawn.
 
     Raises:
-        OptionError: the output cannot be written.
+        OptionError: the output cannot be written, or must not.
         VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
         BitstreamError: the stream is damaged before its second frame, or with strict.
     """
@@ -82,6 +92,7 @@ def view_video(
             raise OptionError(
                 f"{path}: give an output that ends in .mp4, or a folder for PNG files"
             )
+        check_files(existing_pictures(path), [video], is_own=is_drawn, overwrite=overwrite)
         total = file.likely_num_packets
         chained = build_tracks(
             read_motion(video, read), tracks, lambda done: report("tracks", done, total)

@@ -203,7 +203,7 @@ def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
         stream_of(video, other)
     with pytest.raises(OptionError, match="exists: give another output, or --overwrite"):
         encode_video(video, other)
-    with pytest.raises(OptionError, match="is the video itself"):
+    with pytest.raises(OptionError, match="is the input itself"):
         encode_video(video, video, overwrite=True)
     assert other.read_bytes() == video.read_bytes() == phone.read_bytes()
     assert encode_video(video, other, overwrite=True).num_frames == 12
@@ -405,13 +405,18 @@ def test_killed_conversion_ends_and_is_cleaned_up_after(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
-def test_killed_match_is_cleaned_up_after(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+@pytest.mark.parametrize("next_video", ["phone", "clip"])
+def test_killed_match_is_cleaned_up_after(
+    next_video: str, ffmpeg: Ffmpeg, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """By the next run on that database, whether it converts its video or not."""
+    video = request.getfixturevalue(next_video)
     with long_conversion(ffmpeg, tmp_path, TO_A_DATABASE) as process:
         process.kill()
         process.wait(30)
     left = [p.name for p in tmp_path.iterdir() if p.name != "long.mp4"]
     assert left == [f".a.db.scratch.{process.pid}.partial"]
-    match(tmp_path / "a.db", phone)
+    match(tmp_path / "a.db", video)
     assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "a.db"}
 
 

@@ -6,9 +6,11 @@ import argparse
 from typing import Any
 
 from colmap_av1.cli.commands.shared import (
+    ONLY_MODELS,
     add_command,
     add_images,
     add_output,
+    add_overwrite,
     add_quiet,
     add_video,
     print_result,
@@ -35,6 +37,7 @@ def add_densify(commands: Any) -> None:
     )
     add_video(command, "the video from which its images were taken")
     add_output(command, "new folder for the model")
+    add_overwrite(command, ONLY_MODELS)
     add_images(command, "folder of its images, where their names do not determine the frames")
     add_options(command, DensifyOptions)
     add_quiet(command)
@@ -50,5 +53,6 @@ def _run(namespace: argparse.Namespace) -> None:
             image_path=namespace.image_path,
             options=options,
             progress=report,
+            overwrite=namespace.overwrite,
         )
     print_result(namespace, densify_rows(result), result.warnings)

@@ -8,6 +8,7 @@ from typing import Any
 from colmap_av1.cli.commands.shared import (
     add_command,
     add_output,
+    add_overwrite,
     add_quiet,
     add_video,
     print_result,
@@ -29,7 +30,7 @@ def add_encode(commands: Any) -> None:
     )
     add_video(command, "a video that ffmpeg decodes")
     add_output(command, "the stream: .mp4, .mkv, .webm or .ivf")
-    command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
+    add_overwrite(command)
     command.add_argument(
         "--strict",
         action="store_true",

@@ -6,9 +6,11 @@ import argparse
 from typing import Any
 
 from colmap_av1.cli.commands.shared import (
+    OTHERS_TOO,
     add_command,
     add_database,
     add_output,
+    add_overwrite,
     add_quiet,
     print_result,
 )
@@ -29,6 +31,7 @@ def add_export(commands: Any) -> None:
     )
     add_database(command)
     add_output(command, "folder for the files")
+    add_overwrite(command, OTHERS_TOO)
     add_options(command, ExportOptions)
     add_quiet(command)
 
@@ -36,6 +39,9 @@ def add_export(commands: Any) -> None:
 def _run(namespace: argparse.Namespace) -> None:
     options = given(namespace, ExportOptions)
     with progress_bars(namespace.quiet) as report:
-        num_images, num_pairs = export_hloc(namespace.database, namespace.output, options, report)
+        num_images, num_pairs = export_hloc(
+            *(namespace.database, namespace.output, options, report),
+            overwrite=namespace.overwrite,
+        )
     rows = [("images", str(num_images)), ("pairs", str(num_pairs))]
     print_result(namespace, [*rows, ("output", namespace.output)])

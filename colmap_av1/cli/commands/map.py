@@ -6,9 +6,11 @@ import argparse
 from typing import Any
 
 from colmap_av1.cli.commands.shared import (
+    ONLY_MODELS,
     add_command,
     add_database,
     add_output,
+    add_overwrite,
     add_quiet,
     print_result,
 )
@@ -33,6 +35,7 @@ def add_map(commands: Any) -> None:
         "--image_path", required=True, metavar="PATH", help="folder of the database's images"
     )
     add_output(command, "new folder for the models; 0 is the one with the most images")
+    add_overwrite(command, ONLY_MODELS)
     add_options(command, MapOptions)
     add_quiet(command)
 
@@ -46,5 +49,6 @@ def _run(namespace: argparse.Namespace) -> None:
             namespace.output,
             options=options,
             progress=report,
+            overwrite=namespace.overwrite,
         )
     print_result(namespace, map_rows(result), result.warnings)

@@ -6,8 +6,10 @@ import argparse
 from typing import Any
 
 from colmap_av1.cli.commands.shared import (
+    OTHERS_TOO,
     add_command,
     add_output,
+    add_overwrite,
     add_quiet,
     add_video,
     print_result,
@@ -29,6 +31,7 @@ def add_motion(commands: Any) -> None:
     )
     add_video(command)
     add_output(command, "a .npz or .h5 file")
+    add_overwrite(command, OTHERS_TOO)
     add_options(command, ReadOptions)
     add_quiet(command)
 
@@ -39,5 +42,6 @@ def _run(namespace: argparse.Namespace) -> None:
         count = export_motion(
             *(namespace.video, namespace.output, options),
             lambda done: report("motion", done, None),
+            overwrite=namespace.overwrite,
         )
     print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])

@@ -14,6 +14,8 @@ ABOUT_NAMES = (
     "'-' and '_' are alike in option names. COLMAP's spellings are accepted, such as "
     "--ImageReader.camera_model."
 )
+OTHERS_TOO = "replace files that exist, not only earlier output of this command"
+ONLY_MODELS = "replace an output that exists and holds nothing but models"
 ANY_VIDEO = "a video; one that is not AV1 is converted first"
 
 
@@ -66,6 +68,11 @@ def add_images(command: Parser, what: str) -> None:
 def add_output(command: Parser, what: str) -> None:
     """Add --output."""
     command.add_argument("--output", "--output_path", required=True, metavar="PATH", help=what)
+
+
+def add_overwrite(command: Parser, what: str = "replace an output that exists") -> None:
+    """Add --overwrite."""
+    command.add_argument("--overwrite", action="store_true", help=what)
 
 
 def add_quiet(command: Parser) -> None:

@@ -6,14 +6,21 @@ import argparse
 import threading
 from typing import Any
 
-from colmap_av1.cli.commands.shared import add_command, add_images, add_quiet, print_result
+from colmap_av1.cli.commands.shared import (
+    OTHERS_TOO,
+    add_command,
+    add_images,
+    add_overwrite,
+    add_quiet,
+    print_result,
+)
 from colmap_av1.cli.options import add_options, given
-from colmap_av1.cli.terminal import progress_bars
+from colmap_av1.cli.terminal import print_text, progress_bars
 from colmap_av1.errors import OptionError
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.view.matches import view_database
 from colmap_av1.view.model import serve_model, view_model
-from colmap_av1.view.pictures import write_picture
+from colmap_av1.view.pictures import check_picture, write_picture
 from colmap_av1.view.video import view_video
 
 
@@ -40,6 +47,7 @@ def add_view(commands: Any) -> None:
         metavar="PATH",
         help="an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
     )
+    add_overwrite(command, OTHERS_TOO)
     add_images(command, "folder of the database's images")
     command.add_argument(
         "--pair",
@@ -67,30 +75,35 @@ def _run(namespace: argparse.Namespace) -> None:
         return
     if namespace.output is None:
         raise OptionError("nowhere to draw: give --output")
+    output, overwrite = namespace.output, namespace.overwrite
     if namespace.model is not None:
-        write_picture(view_model(namespace.model), namespace.output)
+        check_picture(output, [namespace.model], overwrite=overwrite)
+        write_picture(view_model(namespace.model), output, overwrite=overwrite)
         return
     if namespace.database is not None:
         if namespace.image_path is None:
             raise OptionError("nothing to draw the matches on: give --image_path")
+        inputs = [namespace.database, namespace.image_path]
+        check_picture(output, inputs, overwrite=overwrite)
         picture = view_database(namespace.database, namespace.image_path, namespace.pair)
-        write_picture(picture, namespace.output)
+        write_picture(picture, output, overwrite=overwrite)
         return
     with progress_bars(namespace.quiet) as report:
         count = view_video(
-            *(namespace.video, namespace.output),
+            *(namespace.video, output),
             options=drawing,
             tracks=tracks,
             read=read,
             progress=report,
+            overwrite=overwrite,
         )
-    print_result(namespace, [("frames", str(count)), ("output", namespace.output)])
+    print_result(namespace, [("frames", str(count)), ("output", output)])
 
 
 def _serve(namespace: argparse.Namespace) -> None:
     server = serve_model(namespace.model, port=namespace.port)
     try:
-        print(f"http://127.0.0.1:{namespace.port} (end with Ctrl-C)", flush=True)
+        print_text(f"http://127.0.0.1:{namespace.port} (end with Ctrl-C)\n")
         threading.Event().wait()
     finally:
         server.stop()

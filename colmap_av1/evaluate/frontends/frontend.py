@@ -49,12 +49,14 @@ class Frontend:
             `digest_of`.
         made_by: folders of this package whose code changes the result.
         check: refuses what the front-end cannot run without, before any long work.
+        files: files of the user that it reads beside the footage.
     """
 
     run: Callable[[Footage, Path], dict[str, float]]
     depends_on: Callable[[Footage], tuple[Any, ...]]
     made_by: tuple[str, ...] = WHOLE_PACKAGE
     check: Callable[[], None] = lambda: None
+    files: tuple[Path, ...] = ()
 
 
 def run_measured_frontend(

@@ -31,6 +31,7 @@ def imported_frontend(features: Path, matches: Path) -> Frontend:
             images_digest(footage),
         ),
         (*OF_OTHERS, "database"),
+        files=(features, matches),
     )
 
 

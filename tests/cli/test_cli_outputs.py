@@ -1,0 +1,153 @@
+"""No command writes over an input, or over a file that it did not write."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import pycolmap
+import pytest
+
+from colmap_av1.cli import main
+
+
+@pytest.fixture(scope="module")
+def made(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a video, a database, its images and a model."""
+    folder = tmp_path_factory.mktemp("made")
+    shutil.copyfile(clip, folder / "v.mp4")
+    words = ["match", "--database", f"{folder}/a.db", "--video", f"{folder}/v.mp4"]
+    assert main([*words, "--image_path", f"{folder}/frames", "--quiet"]) == 0
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 50
+    (folder / "model").mkdir()
+    pycolmap.synthesize_dataset(options).write(folder / "model")
+    (folder / "notes.png").write_text("mine")
+    (folder / "notes.npz").write_text("mine")
+    (folder / "notes.log").write_text("mine")
+    return folder
+
+
+@pytest.fixture
+def work(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it to work in."""
+    shutil.copytree(made, tmp_path / "work")
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+VIEW_PAIR = "view --database a.db --image_path frames --output"
+INPUTS = [
+    "view --video v.mp4 --output v.mp4",
+    "view --video v.mp4 --output linked.mp4",
+    "view --video ./frames/../v.mp4 --output v.mp4",
+    f"{VIEW_PAIR} frames/frame_000003.png",
+    f"{VIEW_PAIR} pictures/frame_000003.png",
+    f"{VIEW_PAIR} hard.png",
+    "encode --video v.mp4 --output hard.mp4",
+    "motion --video linked.h5 --output linked.h5",
+    "export --database pairs.txt --output .",
+    "map --database model/a.db --image_path frames --output model",
+    "densify --model model --video v.mp4 --output model",
+    "reconstruct --video scene/v.mp4 --output scene",
+    "compare --video scene/v.mp4 --output scene",
+    "compare --video v.mp4 --image_path scene/images --output scene",
+]
+
+
+@pytest.mark.parametrize("words", INPUTS)
+def test_inputs_stay_even_with_overwrite(
+    words: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (work / "linked.mp4").symlink_to("v.mp4")
+    (work / "linked.h5").symlink_to("v.mp4")
+    (work / "hard.mp4").hardlink_to("v.mp4")
+    (work / "hard.png").hardlink_to("frames/frame_000003.png")
+    (work / "pictures").symlink_to("frames", target_is_directory=True)
+    shutil.copyfile("a.db", "pairs.txt")
+    shutil.copyfile("a.db", "model/a.db")
+    (work / "scene" / ".stages").mkdir(parents=True)
+    shutil.copyfile("v.mp4", "scene/v.mp4")
+    before = contents(work)
+    can_overwrite = words.split(maxsplit=1)[0] not in ("reconstruct", "compare")
+    for more in (["--overwrite"] * can_overwrite, []):
+        assert main([*words.split(), *more]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "input" in line or "is read, in" in line or "not empty" in line
+        assert contents(work) == before
+
+
+OTHERS = [
+    "view --model model --output notes.png",
+    f"{VIEW_PAIR} notes.png",
+    "view --video v.mp4 --output frames",
+    "motion --video v.mp4 --output notes.npz",
+    "export --database a.db --output .",
+    "map --database a.db --image_path frames --output notes",
+]
+
+
+@pytest.mark.parametrize("words", OTHERS)
+def test_files_of_others_stay(words: str, work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (work / "pairs.txt").write_text("frame_000000.png frame_000001.png\n")
+    before = contents(work)
+    assert main(words.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(": exists: give another output, or --overwrite")
+    assert contents(work) == before
+
+
+AGAIN = [
+    ("view --model model --output view.png", "view.png"),
+    ("view --model model --output view.jpg", "view.jpg"),
+    (f"{VIEW_PAIR} pair.png", "pair.png"),
+    ("view --video v.mp4 --output view.mp4", "view.mp4"),
+    ("view --video v.mp4 --output drawn", "drawn/frame_000000.png"),
+    ("motion --video v.mp4 --output motion.npz", "motion.npz"),
+    ("motion --video v.mp4 --output motion.h5", "motion.h5"),
+    ("export --database a.db --output hloc", "hloc/pairs.txt"),
+]
+
+
+@pytest.mark.parametrize(("words", "output"), AGAIN)
+def test_own_output_is_written_again_and_others_on_demand(
+    words: str, output: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words.split(), "--quiet"]) == 0
+    first = contents(work)
+    assert main([*words.split(), "--quiet"]) == 0
+    assert contents(work) == first
+    Path(output).write_text("mine")
+    assert main(words.split()) == 2
+    assert f"{output}: exists: give another output" in capsys.readouterr().err
+    assert Path(output).read_text() == "mine"
+    assert main([*words.split(), "--quiet", "--overwrite"]) == 0
+    assert contents(work) == first
+
+
+def test_models_are_replaced_on_demand_alone(
+    work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["map", "--database", "a.db", "--image_path", "frames", "--output", "model"]
+    before = contents(work)
+    assert main(words) == 2
+    assert "model: is there and not empty: give a new folder, or --over" in capsys.readouterr().err
+    (work / "model" / "notes.txt").write_text("mine")
+    assert main([*words, "--overwrite"]) == 2
+    assert "model: holds notes.txt, which stays" in capsys.readouterr().err
+    (work / "model" / "notes.txt").unlink()
+    assert contents(work) == before
+    # Where the mapper fails, what was there stays.
+    assert main([*words, "--overwrite"]) == 2
+    assert "model" in capsys.readouterr().err
+    after = contents(work)
+    assert {name: after[name] for name in before} == before
+    assert set(after) - set(before) <= {"model.log"}
+    assert not [name for name in os.listdir(work) if name.endswith(".partial")]
