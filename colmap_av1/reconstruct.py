@@ -12,13 +12,18 @@ from typing import Any
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.model.reconstruct_model import model_stage
-from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage
+from colmap_av1.model.reconstruct_poses import (
+    adjustment_stage,
+    pose_stage,
+    resection_stage,
+)
 from colmap_av1.model.reconstruct_stages import (
     Run,
     match_stage,
     pose_tracks,
     read_links,
     read_tracks,
+    some_images,
     track_stage,
 )
 from colmap_av1.model.track_points import LEAST_AGREEING
@@ -46,6 +51,7 @@ class ReconstructReport:
         database: COLMAP database of the tracks that the poses come from.
         num_frames: shown frames of the video.
         num_images: frames chosen as images.
+        num_key_images: those of them that were mapped; the others are placed between them.
         num_registered: images with a pose; only these are written.
         other_models: images of further models the mapper made, which are left out.
         num_tracks: tracks of the video.
@@ -71,6 +77,7 @@ class ReconstructReport:
     database: Path
     num_frames: int
     num_images: int
+    num_key_images: int
     num_registered: int
     other_models: tuple[int, ...]
     num_tracks: int
@@ -145,8 +152,11 @@ def _run_stages(run: Run) -> ReconstructReport:
     matched = match_stage(run, pose_tracks(run, tracks), chosen, inter_share, tracked)
     links, broken = read_links(run.stages)
     tracks = cut_tracks(tracks, broken.tolist())
-    posed = pose_stage(run, matched, len(chosen.names))
+    keyed = some_images(chosen, matched.facts["key_images"])
+    posed = pose_stage(run, matched, len(keyed.names))
     kept = {"tracks": tracked, "matches": matched, "poses": posed}
+    if len(keyed.names) < len(chosen.names):
+        kept["resection"] = posed = resection_stage(run, tracks, chosen, keyed, posed)
     if run.options.mapping.adjust:
         kept["adjustment"] = posed = adjustment_stage(run, tracks, links, chosen, posed)
     kept["model"] = model_stage(run, join_tracks(tracks, links), chosen, posed)

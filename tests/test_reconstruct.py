@@ -34,6 +34,7 @@ from colmap_av1.options import (
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
 
+STAGES = ("tracks", "matches", "poses", "resection", "adjustment", "model")
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 
@@ -216,7 +217,7 @@ def test_report(made: ReconstructReport, tmp_path: Path) -> None:
     # pycolmap brings a database to its own layout.
     shutil.copyfile(made.database, tmp_path / "copy.db")
     with pycolmap.Database.open(tmp_path / "copy.db") as database:
-        assert database.num_images() == NUM_IMAGES
+        assert database.num_images() == made.num_key_images == len(range(0, NUM_IMAGES, 2)) + 1
         assert database.num_verified_image_pairs() > NUM_IMAGES
 
 
@@ -241,7 +242,7 @@ def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:
     files = {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")}
     again = reconstruct(SCENE, made.output, options=OPTIONS)
-    assert again.resumed == ("tracks", "matches", "poses", "adjustment", "model")
+    assert again.resumed == STAGES
     assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
     assert replace(again, resumed=(), seconds=made.seconds) == made
 
@@ -259,6 +260,7 @@ def contents(output: Path) -> dict[str, bytes]:
         (".stages/tracks.npz", "tracks"),
         ("database.db", "matches"),
         (".stages/poses/0/images.bin", "poses"),
+        (".stages/placed/images.bin", "resection"),
         ("images/frame_000006.png", "model"),
         ("sparse/0/points3D.bin", "model"),
     ],
@@ -270,7 +272,7 @@ def test_damaged_products_are_made_again(
     output = tmp_path / "out"
     shutil.copytree(made.output, output)
     before = contents(output)
-    all_but = tuple(s for s in ("tracks", "matches", "poses", "adjustment", "model") if s != redone)
+    all_but = tuple(s for s in STAGES if s != redone)
     product = output / name
     size = product.stat().st_size
     for damage in (
@@ -288,13 +290,13 @@ def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path)
     shutil.copytree(made.output, output)
     before = contents(output)
     records = sorted((output / ".stages").glob("*.json"))
-    assert len(records) == 5
-    texts = ["", "[]", "7", '{"key": 3, "facts": null}', records[4].read_text()[:-40]]
+    assert len(records) == len(STAGES)
+    texts = ["", "[]", "7", "null", '{"key": 3, "facts": null}', records[5].read_text()[:-40]]
     for record, text in zip(records, texts, strict=True):
         record.write_text(text)
     assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()
     assert contents(output) == before
-    assert len(reconstruct(SCENE, output, options=OPTIONS).resumed) == 5
+    assert len(reconstruct(SCENE, output, options=OPTIONS).resumed) == len(STAGES)
 
 
 def test_only_what_changes_the_result_redoes(
@@ -308,7 +310,7 @@ def test_only_what_changes_the_result_redoes(
     shutil.copyfile(SCENE, video)
     match = replace(OPTIONS.match, read=ReadOptions(num_threads=1), run=RunOptions(num_threads=1))
     one = reconstruct(video, output, options=replace(OPTIONS, match=match))
-    assert one.resumed == ("tracks", "matches", "poses", "adjustment", "model")
+    assert one.resumed == STAGES
     monkeypatch.setattr("colmap_av1.util.stages.code_digest", lambda *_: "of an upgrade")
     assert reconstruct(SCENE, output, options=replace(OPTIONS, match=match)).resumed == ()
     assert contents(output) == before
@@ -318,7 +320,7 @@ def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> No
     before = (made.output / "sparse" / "0" / "points3D.bin").read_bytes()
     strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
     fewer = reconstruct(SCENE, made.output, options=strict)
-    assert fewer.resumed == ("tracks", "matches", "poses", "adjustment")
+    assert fewer.resumed == STAGES[:-1]
     assert fewer.num_points < made.num_points
     assert reconstruct(SCENE, made.output, options=OPTIONS).num_points == made.num_points
     assert (made.output / "sparse" / "0" / "points3D.bin").read_bytes() == before
@@ -440,9 +442,14 @@ def words_of(process: Path) -> bytes:
 
 def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
     shutil.copytree(made.output, tmp_path / "plain")
-    options = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
+    mapping = replace(OPTIONS.mapping, adjust=False)
+    placed = reconstruct(SCENE, tmp_path / "plain", options=replace(OPTIONS, mapping=mapping))
+    assert placed.resumed == STAGES[:-2]
+    # All images by the mapper, none by resection.
+    options = replace(OPTIONS, mapping=replace(mapping, key_images=False))
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)
-    assert plain.resumed == ("tracks", "matches", "poses")
+    assert plain.resumed == STAGES[:1]
+    assert plain.num_key_images == plain.num_registered == NUM_IMAGES
     mapped = read_model(plain.output / ".stages" / "poses" / "0")
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
     np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
@@ -500,7 +507,7 @@ def test_command_line(
     assert main(words) == 0
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
-    assert "finished before\ttracks, matches, poses, adjustment, model" in told.out
+    assert f"finished before\t{', '.join(STAGES)}" in told.out
     model = made.output / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(

@@ -78,6 +78,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
     rows = [
         ("output", str(report.output)),
         ("images", f"{report.num_registered} of {report.num_images} with a pose"),
+        ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),
         ("points", f"{report.num_points}, {report.num_observations} observations"),

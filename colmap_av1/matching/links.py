@@ -121,6 +121,7 @@ def link_video(
     size: tuple[int, int],
     inter_share: NDArray[np.float32],
     *,
+    images_apart: float = 1.0,
     display: Display | None,
     options: MatchOptions,
     clock: Clock,
@@ -136,6 +137,7 @@ def link_video(
         cameras: the camera of each image; images share one where it is the same object.
         size: (width, height) of the images in pixels.
         inter_share: see `TrackedVideo`.
+        images_apart: images that each of these stands for, where they are a choice of many.
         display: how pictures are shown in the images; None: as players show them.
         options: those of links, verification and reading are used.
         clock: gets the stage "links".
@@ -168,13 +170,13 @@ def link_video(
     probes = _probes(inter_share, weak, options.links)
     if probes and len(link(_Plan.of_neighbours(probes)).report.broken_gaps) >= _NUM_BROKEN_PROBES:
         weak[:] = True
-    plan = _plan(matched, weak, options.links)
+    plan = _plan(matched, weak, images_apart, options.links)
     linked = LinkedImages(matched, no_tracks(len(inter_share), size), LinkReport())
     if plan.wanted:
         linked = link(plan)
     if linked.report.doubtful_gaps:
         # As after a cut: what lies on either side may go on anywhere.
-        key = plan.key or _spread_images(matched)
+        key = plan.key or _spread_images(matched, images_apart)
         linked = link(replace(plan, key=key, effort="full"))
     if len(linked.matched.pairs) == 0:
         raise nothing_to_match(source.pictures.path, options)
@@ -259,10 +261,35 @@ class _Plan:
         return sorted({image for images in [*self.around, self.key] for image in images})
 
 
-def _plan(matched: MatchedImages, weak: NDArray[np.bool_], options: LinkOptions) -> _Plan:
+def images_to_link(
+    inter_share: NDArray[np.float32], frames: NDArray[np.int32], options: LinkOptions
+) -> NDArray[np.bool_]:
+    """Images whose pictures are matched across gaps that motion may not carry over.
+
+    Args:
+        inter_share: see `TrackedVideo`.
+        frames: int32 [num_images] frame of each image.
+        options: whether there are links.
+
+    Returns:
+        bool [num_images]; all where any motion is to be probed.
+    """
+    chosen = np.zeros(len(frames), dtype=np.bool_)
+    weak = weak_gaps(inter_share, frames)
+    if options.links != "none":
+        for gap in np.flatnonzero(weak).tolist():
+            chosen[_images_around(gap, len(frames))] = True
+    if _probes(inter_share, weak, options):
+        chosen[:] = True
+    return chosen
+
+
+def _plan(
+    matched: MatchedImages, weak: NDArray[np.bool_], images_apart: float, options: LinkOptions
+) -> _Plan:
     gaps = np.flatnonzero(weak) if options.links != "none" else np.empty(0, np.int64)
     around = [_images_around(int(gap), len(matched.keypoints)) for gap in gaps]
-    return _Plan(gaps, around, _key_images(matched, options))
+    return _Plan(gaps, around, _key_images(matched, images_apart, options))
 
 
 def _probes(
@@ -305,19 +332,19 @@ def _reach(matched: MatchedImages) -> int:
     return max(1, int(np.median(reach[: max(1, 2 * len(reach) // 3)])))
 
 
-def _key_images(matched: MatchedImages, options: LinkOptions) -> list[int]:
+def _key_images(matched: MatchedImages, images_apart: float, options: LinkOptions) -> list[int]:
     """Images that places seen again are looked for in; none where there can be none."""
     num_images, reach = len(matched.keypoints), _reach(matched)
-    is_long = num_images >= max(_LONG * reach, _LEAST_IMAGES)
+    is_long = num_images >= max(_LONG * reach, _LEAST_IMAGES / images_apart)
     if options.links == "none" or (options.links == "auto" and not is_long):
         return []
-    return _spread_images(matched)
+    return _spread_images(matched, images_apart)
 
 
-def _spread_images(matched: MatchedImages) -> list[int]:
+def _spread_images(matched: MatchedImages, images_apart: float) -> list[int]:
     """Images that lie so far apart that tracks reach over several of them."""
     num_images = len(matched.keypoints)
-    step = max(_LEAST_STEP, round(_KEY_SHARE * _reach(matched)))
+    step = max(1, round(_LEAST_STEP / images_apart), round(_KEY_SHARE * _reach(matched)))
     return list(range(step // 2, num_images, step))
 
 

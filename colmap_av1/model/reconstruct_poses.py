@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.model.colmap_model import ModelImage, posed_images, read_model, write_model
+from colmap_av1.model.colmap_model import (
+    ModelImage,
+    no_points,
+    posed_images,
+    read_model,
+    write_model,
+)
 from colmap_av1.model.mapper import adjust_model, map_poses
 from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run, pose_tracks
+from colmap_av1.model.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_frames, keep_tracks_of
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -32,6 +39,11 @@ _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_images=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.25
+# Tracks that images between key images are placed by, and views of these that make their points.
+_RESECTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
+)
+_FEWEST_VIEWS = 3
 # Poses follow from rays, however uncertain the points are that these meet in.
 _FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
@@ -117,6 +129,62 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     return (
         f"{no_start}: the parallax between images that share tracks is too little, or the "
         f"intrinsics do not fit: give --camera_model and --camera_params, or try --mapper {other}"
+    )
+
+
+def resection_stage(
+    run: Run, tracks: Tracks, chosen: ChosenImages, keyed: ChosenImages, posed: Kept
+) -> Kept:
+    """Place the images between the key images by the points of tracks that they see."""
+    options = run.options
+    seed, num_threads = options.match.run.seed, options.match.run.num_threads
+
+    def make(partial: Path) -> dict[str, Any]:
+        known = read_posed_images(run, posed, keyed)
+        with run.clock.measure("resection"):
+            seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
+            left = np.setdiff1d(chosen.frames, known.frames)
+            spread = select_tracks(keep_frames(seen_thrice, chosen.frames), _RESECTED)
+            seen, view = seen_in(spread, known.frames)
+            points = triangulate_images(
+                *(run, known, seen, view), pinhole=None, options=_FOR_POSES, progress=no_progress
+            )
+            sightings = sightings_of(points, seen, spread, left, known.camera)
+            poses = resect(
+                sightings,
+                interpolate_poses(
+                    np.array([i.cam_from_world for i in known.images]), known.frames, left
+                ),
+                float(known.camera.mean_focal_length()),
+                seed=seed,
+                num_threads=num_threads,
+                progress=lambda done: run.progress("resection", done, len(left)),
+            )
+        placed = dict(
+            zip(known.frames.tolist(), (i.cam_from_world for i in known.images), strict=True)
+        )
+        found = zip(left.tolist(), poses, strict=True)
+        placed |= {frame: pose for frame, pose in found if pose is not None}
+        camera_id = int(known.camera.camera_id)
+        images = [
+            ModelImage(i + 1, name, camera_id, placed[frame])
+            for i, (name, frame) in enumerate(
+                zip(chosen.names, chosen.frames.tolist(), strict=True)
+            )
+            if frame in placed
+        ]
+        folder = partial / "placed"
+        folder.mkdir()
+        write_model(folder, {camera_id: known.camera}, images, no_points())
+        return {"poses": "placed", "num_registered": len(images)}
+
+    return run_stage(
+        run.stages,
+        "resection",
+        [posed.digest, _RESECTED, seed],
+        into=run.stages,
+        products=["placed"],
+        make=make,
     )
 
 

@@ -6,6 +6,7 @@ Each stage leaves what the next one, and a later run, resume from.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.key_images import key_images
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     pair_images,
     shared_focal_length,
     verify_images,
 )
-from colmap_av1.matching.links import link_video
+from colmap_av1.matching.links import LinkedImages, images_to_link, link_video
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.model.track_points import chaining_for_points
@@ -124,6 +126,13 @@ def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages, NDArray[np.float32]
         return _tracks_of(file), chosen, file["inter_share"]
 
 
+def _write_links(folder: Path, linked: LinkedImages) -> None:
+    folder.mkdir()
+    broken = np.array([before for before, _ in linked.report.broken_gaps], np.int32)
+    with (folder / _LINKS).open("wb") as file:
+        np.savez(file, **vars(linked.tracks), broken=broken)
+
+
 def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
     """The links as tracks, and the frames before the gaps that no other track crosses."""
     with np.load(stages / _LINKS) as file:
@@ -149,21 +158,25 @@ def match_stage(
     inter_share: NDArray[np.float32],
     tracked: Kept,
 ) -> Kept:
-    """Write the database of the tracks that the poses come from, and of links."""
+    """Choose the key images; write the database of their tracks, and of links."""
     options, clock, progress = run.options, run.clock, run.progress
+    mapping, linking = options.mapping, options.match.links
     density = DensityOptions(
         preset="sparse",
-        max_tracks_per_image=options.mapping.pose_tracks_per_image,
-        spacing=options.mapping.pose_spacing,
+        max_tracks_per_image=mapping.pose_tracks_per_image,
+        spacing=mapping.pose_spacing,
     )
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("pairs"):
-            sparse = select_tracks(keep_frames(tracks, chosen.frames), density)
+            seen = keep_frames(tracks, chosen.frames)
+            index = _key_images(run, seen, chosen, inter_share)
+            keyed = some_images(chosen, index)
+            sparse = select_tracks(keep_frames(seen, keyed.frames), density)
         video = run.source.pictures
         paired = pair_images(
-            *(video.path, sparse, chosen, options.match),
-            needed=not may_link(inter_share, chosen.frames, options.match.links),
+            *(video.path, sparse, keyed, options.match),
+            needed=not may_link(inter_share, keyed.frames, linking),
             clock=clock,
             progress=progress,
         )
@@ -173,7 +186,8 @@ def match_stage(
         camera = make_camera(options.match.camera, *size, pixel_aspect, focal_length)
         matched = verify_images(paired, camera, options.match, clock=clock, progress=progress)
         linked = link_video(
-            *(run.source, matched, [camera] * len(chosen.names), size, inter_share),
+            *(run.source, matched, [camera] * len(keyed.names), size, inter_share),
+            images_apart=len(chosen.names) / len(keyed.names),
             display=None,
             options=options.match,
             clock=clock,
@@ -181,22 +195,20 @@ def match_stage(
         )
         matched = linked.matched
         with clock.measure("database"):
-            write_matched_images(partial / "database.db", chosen.names, camera, matched)
-        kept = partial / run.stages.name
-        kept.mkdir()
-        with (kept / _LINKS).open("wb") as file:
-            broken = np.array([before for before, _ in linked.report.broken_gaps], np.int32)
-            np.savez(file, **vars(linked.tracks), broken=broken)
+            write_matched_images(partial / "database.db", keyed.names, camera, matched)
+        _write_links(partial / run.stages.name, linked)
         return {
             "links": dataclasses.asdict(linked.report),
             "link_warnings": list(linked.report.warnings),
+            "key_images": index.tolist(),
+            "num_key_images": len(index),
             "num_pose_tracks": len(sparse.offsets) - 1,
             "guessed": not camera.has_prior_focal_length,
             **_pair_facts(matched),
         }
 
     match = options.match
-    given = (density, match.pairs, match.verify, match.camera, match.links)
+    given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
     return run_stage(
         run.stages,
         "matches",
@@ -205,6 +217,27 @@ def match_stage(
         products=["database.db", f"{run.stages.name}/{_LINKS}"],
         make=make,
     )
+
+
+def _key_images(
+    run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """The images that are mapped, by their index: all, where key images are not wanted."""
+    mapping = run.options.mapping
+    if not mapping.key_images:
+        return np.arange(len(chosen.frames))
+    return key_images(
+        tracks,
+        chosen.frames,
+        images_to_link(inter_share, chosen.frames, run.options.match.links),
+        spacing=mapping.pose_spacing,
+        num_cells=mapping.pose_tracks_per_image,
+    )
+
+
+def some_images(chosen: ChosenImages, index: Sequence[int] | NDArray[np.int64]) -> ChosenImages:
+    """Some of the images, by their index."""
+    return ChosenImages([chosen.names[i] for i in index], chosen.frames[np.asarray(index)])
 
 
 def _pair_facts(matched: MatchedImages) -> dict[str, Any]:

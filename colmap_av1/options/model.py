@@ -118,6 +118,11 @@ class MapperOptions(Options):
     refine_intrinsics: bool | None = option(
         None, "refine focal length and distortion; None: unless camera_params are given"
     )
+    key_images: bool = option(
+        True,
+        "map key images, as far apart as tracks connect them well, and place the others between "
+        "them by the points they see; 0: map all images",
+    )
     pose_tracks_per_image: int = option(
         600, "tracks of each image that poses are estimated from", least=50
     )

@@ -164,6 +164,15 @@ def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
     return keep_observations(tracks, wanted[tracks.frame])
 
 
+def keep_tracks_of(tracks: Tracks, frames: NDArray[np.int32], fewest: int) -> Tracks:
+    """The tracks that this many of some frames see at least, with all their observations."""
+    counted = np.zeros(tracks.num_frames, dtype=np.bool_)
+    counted[frames] = True
+    so_far = np.concatenate([[0], np.cumsum(counted[tracks.frame])])
+    counts = np.diff(so_far[tracks.offsets])
+    return keep_observations(tracks, np.repeat(counts >= fewest, np.diff(tracks.offsets)))
+
+
 def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
     """The tracks that are observed in `min_length` frames or more, in their former order."""
     lengths = np.diff(tracks.offsets)
