@@ -60,3 +60,11 @@ class EncodeOptions(Options):
         "preset on the encoder's own scale: -cpu-used of libaom (5 and above: its realtime mode), "
         "-preset of the others; None: the encoder's default",
     )
+    downscale: float | None = option(
+        None,
+        "width and height of pictures are divided by this before they are coded, and keypoints "
+        "are scaled back: images keep the video's size; None: by what leaves large pictures half "
+        "a megapixel or more; by 1 in encode, whose output is a video of its own",
+        least=1,
+        most=16,
+    )

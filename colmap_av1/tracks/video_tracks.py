@@ -11,16 +11,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import BitstreamError, EncodeError, ImageError, cannot_write
+from colmap_av1.errors import (
+    BitstreamError,
+    EncodeError,
+    ImageError,
+    VideoError,
+    cannot_write,
+)
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, inspect
 from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import EncodeOptions, MatchOptions
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
-from colmap_av1.tracks.tracks import Tracks, build_tracks, show_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks, scale_tracks, show_tracks
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import encode, stream_of
@@ -39,7 +46,7 @@ class VideoSource:
 
     Attributes:
         stream: the AV1 video whose motion is read. One that was made of another holds the frames
-            that the other's edit list hides, too.
+            that the other's edit list hides, too, and may be smaller than it.
         pictures: the video whose pictures become images: the same, or what it was made of.
         is_kept: the stream stays when the work is done.
     """
@@ -98,25 +105,40 @@ def open_source(
         yield VideoSource(video, video)
         return
     strict = options.read.strict
+    how = with_downscale(options.encode, video.picture_size)
     if options.keep_stream is not None:
         with clock.measure("encoding"):
             made = stream_of(
                 *(video, options.keep_stream),
                 strict=strict,
-                options=options.encode,
+                options=how,
                 progress=progress,
             )
-        yield VideoSource(read_video(made.output), video)
+        yield VideoSource(_stream_for(video, made.output, how), video)
         return
     with _scratch(beside) as folder:
         with clock.measure("encoding"):
             made = encode(
                 *(video, folder / "stream.mp4"),
                 strict=strict,
-                options=options.encode,
+                options=how,
                 progress=progress,
             )
-        yield VideoSource(read_video(made.output), video, is_kept=False)
+        yield VideoSource(_stream_for(video, made.output, how), video, is_kept=False)
+
+
+def _stream_for(video: Video, path: Path, options: EncodeOptions) -> Video:
+    """A stream that was made of a video; refused where its pictures have not the size asked for."""
+    stream = read_video(path)
+    wanted = coded_size(video.picture_size, options)
+    if stream.picture_size != wanted:
+        raise VideoError(
+            "{}: its pictures are {}x{}, not {}x{} as those of ".format(
+                path, *stream.picture_size, *wanted
+            )
+            + f"{video}: convert it by another --encoder"
+        )
+    return stream
 
 
 def with_stream_kept(options: MatchOptions, folder: Path) -> MatchOptions:
@@ -178,6 +200,9 @@ def track_video(
             tracks = remove_overlays(tracks)
             share_over_picture = 1 - len(tracks.offsets) / num_tracks
             tracks = show_tracks(tracks, source.stream.display, source.pictures.presented)
+            num_pixels = num_frames * tracks.width * tracks.height
+            if source.stream is not source.pictures:
+                tracks = scale_tracks(tracks, source.pictures.picture_size)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
@@ -200,7 +225,7 @@ def track_video(
         )
     # Of the whole file, so a rate that is found low is even lower.
     bits = 8 * source.stream.path.stat().st_size
-    reasons = structure.reasons(bits / (num_frames * tracks.width * tracks.height))
+    reasons = structure.reasons(bits / num_pixels)
     if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or use --reencode 1 to convert the video first")
     inter_share = _inter_share(structure, num_frames, source.pictures.presented)

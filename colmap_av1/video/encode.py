@@ -28,6 +28,7 @@ from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.outputs import check_files
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.video.coded_size import scaling
 from colmap_av1.video.container import VideoFile, open_stream, read_file
 from colmap_av1.video.encoders import (
     ENCODERS,
@@ -78,9 +79,9 @@ def encode(
     """Convert a video to AV1 with backward references only, and one intra frame.
 
     Every frame of the video becomes one of the stream, none is dropped or doubled, and time
-    stamps are kept. Pictures are turned as players turn them; sound is left out. The stream
-    appears under its name only when whole. Of a damaged video the frames before the damage are
-    converted, with a warning.
+    stamps are kept. Pictures are turned as players turn them, and downscaled where the options say
+    so; sound is left out. The stream appears under its name only when whole. Of a damaged video the
+    frames before the damage are converted, with a warning.
 
     Args:
         video: a video that ffmpeg decodes.
@@ -116,12 +117,15 @@ def encode(
         # Frames that an edit list hides are frames all the same, and good ones.
         before += ["-ignore_editlist", "1"]
     how = [
-        *("-i", f"file:{path}", "-map", f"0:{file.index}", "-vf", encoder.upload),
+        *("-i", f"file:{path}", "-map", f"0:{file.index}"),
+        *("-vf", ",".join([*scaling(options), encoder.upload])),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
         *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
     ]
     mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
+    if scaling(options):
+        mark["downscale"] = float(options.downscale or 1)
 
     def convert(partial: Path, num_frames: int | None = None) -> int:
         total = num_frames or file.num_packets
@@ -343,4 +347,6 @@ def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
         return False
     encoder = None if options.encoder == "auto" else options.encoder
     wanted = {"encoder": encoder, "quality": options.quality, "speed": options.speed}
+    if mark.get("downscale", "1.0") != str(float(options.downscale or 1)):
+        return False
     return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)

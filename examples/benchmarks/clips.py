@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from colmap_av1.evaluate import (
     read_sequence,
     run_frontend,
 )
+from colmap_av1.evaluate.metrics.sequence import Sequence
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
@@ -33,6 +35,10 @@ from colmap_av1.util.stages import run_stage_in
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
+# Matches of SIFT between images that lie far apart, held against the poses; not part of this
+# project.
+FAR_VIEWS = SEQUENCES.parent / "tools" / "loop_consistency.py"
+FAR = 10
 # As `colmap-av1 encode --encoder libaom --speed 6` does, so that figures stay comparable.
 ENCODING = (
     "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
@@ -189,6 +195,41 @@ def ffmpeg(*words: str) -> None:
     """Run ffmpeg."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y", *words]
     subprocess.run(command, check=True)
+
+
+def as_shot(sequence: Sequence, folder: Path) -> Path:
+    """The clip as it was shot, or its frames as H.264 of such a rate that nothing is lost."""
+    if sequence.source.is_file():
+        return sequence.source
+    video = folder / "video.mp4"
+    words = (*ffmpeg_input(sequence.source, sequence.fps), "-c:v", "libx264", "-preset")
+    words += ("veryfast", "-crf", "14", "-pix_fmt", "yuv420p")
+
+    def make() -> dict[str, Any]:
+        ffmpeg(*words, str(video))
+        return {}
+
+    run_stage_in(folder, words, make, products=[video], made_by=())
+    return video
+
+
+def far_views(model: Path, images: Path) -> dict[str, float]:
+    """How well views far apart agree with a model's poses: the columns of a row.
+
+    Args:
+        model: folder of a model with straight lines.
+        images: folder of its images.
+
+    Returns:
+        Median and 90 % quantile over pairs of images in pixels; nothing where the program that
+        measures it is absent.
+    """
+    if not FAR_VIEWS.is_file():
+        return {}
+    command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(FAR)]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
+    return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
 
 
 def known_truth(material: Material) -> Truth:

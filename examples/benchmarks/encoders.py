@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -61,10 +59,6 @@ CLIPS = {
     "shelfbox": 1,
     "kitchen": 2,
 }
-# Matches of SIFT between images that lie far apart, held against the poses; not part of this
-# project.
-FAR_VIEWS = ruler.SEQUENCES.parent / "tools" / "loop_consistency.py"
-FAR = 10
 
 
 @dataclass(frozen=True)
@@ -73,7 +67,7 @@ class Row:
 
     CPU seconds are those of ffmpeg for a megapixel of one frame, decoding of the source included;
     tracks those of so many frames and more; epipolar errors medians in pixels after so many frames;
-    far views medians in pixels over pairs of images, see FAR_VIEWS.
+    far views medians in pixels over pairs of images, see `clips.far_views`.
     """
 
     clip: str
@@ -148,7 +142,7 @@ def works(setting: EncodeOptions) -> bool:
 def measure(clip: str, folder: Path, setting: EncodeOptions) -> Row:
     """Convert a clip with a setting and make a model of it."""
     sequence = read_sequence(ruler.SEQUENCES / clip)
-    source = source_of(sequence, folder)
+    source = ruler.as_shot(sequence, folder / "source")
     where = folder / name_of(setting)
     stream, cpu_seconds = converted(source, where / "stream", setting)
     tracks = build_tracks(read_motion(stream))
@@ -170,24 +164,6 @@ def measure(clip: str, folder: Path, setting: EncodeOptions) -> Row:
         epipolar_8=errors.get(8),
         **modelled(sequence, source, stream, where / "model", setting),
     )
-
-
-def source_of(sequence: Sequence, folder: Path) -> Path:
-    """The clip as it was shot, or its frames as H.264 of such a rate that nothing is lost."""
-    if sequence.source.is_file():
-        return sequence.source
-    first = min(sequence.source.iterdir())
-    pattern = sequence.source / f"%0{len(first.stem)}d{first.suffix}"
-    video = folder / "source" / "video.mp4"
-    words = ("-framerate", str(sequence.fps), "-i", str(pattern), "-c:v", "libx264", "-preset")
-    words += ("veryfast", "-crf", "14", "-pix_fmt", "yuv420p")
-
-    def make() -> dict[str, Any]:
-        ruler.ffmpeg(*words, str(video))
-        return {}
-
-    run_stage_in(video.parent, words, make, products=[video], made_by=())
-    return video
 
 
 def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path, float]:
@@ -232,7 +208,7 @@ def modelled(
             poses = model_poses(read_model(output / "sparse" / "0"), sequence.num_frames)
             errors = pose_errors(poses, sequence.cam_from_world)
             facts["ate"] = errors.ate if errors is not None else None
-        facts |= far_views(output)
+        facts |= ruler.far_views(output / "sparse" / "0", output / "images")
         shutil.rmtree(output)
         return facts
 
@@ -251,16 +227,6 @@ def reconstructed(source: Path, output: Path, options: ReconstructOptions) -> di
         "points": report.num_points,
         "error": report.mean_error,
     }
-
-
-def far_views(output: Path) -> dict[str, float]:
-    """How well views far apart agree, where that can be measured."""
-    if not FAR_VIEWS.is_file():
-        return {}
-    command = [sys.executable, str(FAR_VIEWS), str(output / "sparse" / "0"), str(output / "images")]
-    said = subprocess.run([*command, str(FAR)], capture_output=True, text=True, check=False).stdout
-    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
-    return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
 
 
 if __name__ == "__main__":

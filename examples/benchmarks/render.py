@@ -232,6 +232,74 @@ COMPARED_WITH = {
 }
 
 
+# Ways of `phone_to_folder.py`: as a whole, from the stream, and what both are compared with.
+FROM_FILE, FROM_STREAM, SIFT_FROM_FILE = "reconstruct", "reconstruct from AV1", "SIFT sequential"
+
+
+def phone_to_folder(rows: list[Row]) -> str:
+    """Both ways from a file to a model, as wholes."""
+    by_way = {(row["clip"], row["way"]): row for row in rows}
+    ways = {SIFT_FROM_FILE: "SIFT", FROM_FILE: "`reconstruct`"}
+
+    def less(heading: str, name: str, spelling: str) -> Column:
+        def cell(row: Row) -> str:
+            sift = by_way.get((row["clip"], SIFT_FROM_FILE))
+            if row["way"] != FROM_FILE or sift is None or not row.get(name):
+                return number(row, name, spelling)
+            times = float(sift[name]) / float(row[name])
+            return f"{number(row, name, spelling)}, {times:.1f}x less"
+
+        return Column(heading, cell)
+
+    def from_stream(row: Row) -> str:
+        sift, ours = (by_way.get((row["clip"], way)) for way in (SIFT_FROM_FILE, FROM_STREAM))
+        if row["way"] != FROM_FILE or sift is None or ours is None:
+            return ""
+        times = float(sift["cpu_s"]) / float(ours["cpu_s"])
+        return f"{number(ours, 'cpu_s', '.0f')}, {times:.1f}x less"
+
+    def far_views(row: Row) -> str:
+        return f"{number(row, 'far_views', '.2f')} / {number(row, 'far_views_90', '.2f')}"
+
+    columns = [
+        Column("clip", lambda row: f"`{row['clip']}`" if row["way"] == SIFT_FROM_FILE else ""),
+        Column("model", lambda row: ways[row["way"]]),
+        Column("images", lambda row: f"{row['registered'] or '-'} of {row['images'] or '-'}"),
+        figure("points", "points", ",.0f"),
+        figure("reprojection error", "error_px", ".3f", " px"),
+        figure("camera centres", "ate_of_extent", ".2%"),
+        Column("far views px", far_views),
+        less("seconds", "seconds", ".0f"),
+        less("CPU seconds", "cpu_s", ".0f"),
+        Column("from AV1", from_stream),
+        figure("memory", "memory_mb", ",.0f", " MB"),
+    ]
+    shown = sorted(
+        (row for row in rows if row["way"] in ways),
+        key=lambda row: (
+            [r["clip"] for r in rows].index(row["clip"]),
+            row["way"] != SIFT_FROM_FILE,
+        ),
+    )
+    return f"{markdown(columns, shown, left=2)}\n{measured_at(shown, 'clip')}"
+
+
+def phone_to_folder_steps(rows: list[Row]) -> str:
+    """CPU seconds of every step."""
+    clips = list(dict.fromkeys(row["clip"] for row in rows))
+    by_way = {(row["clip"], row["way"]): row for row in rows}
+
+    def of_step(way: str) -> Callable[[Row], str]:
+        return lambda row: number(by_way.get((row["clip"], way), {}), "cpu_s", ".1f")
+
+    steps = list(dict.fromkeys(row["way"] for row in rows if row["way"] not in _WHOLE))
+    columns = [words("clip", "clip"), *(Column(step, of_step(step)) for step in steps)]
+    return f"{markdown(columns, [{'clip': clip} for clip in clips])}\n{measured_at(rows, 'clip')}"
+
+
+_WHOLE = (FROM_FILE, SIFT_FROM_FILE)
+
+
 def end_to_end(rows: list[Row]) -> str:
     """All steps from a video to a model, as factors of SIFT's."""
     by_way = {(row["sequence"], row["way"]): row for row in rows}
@@ -365,6 +433,8 @@ def plain(rows: list[Row]) -> str:
 TABLES: dict[str, Callable[..., str]] = {
     "tracks": tracks,
     "dense_points": dense_points,
+    "phone_to_folder": phone_to_folder,
+    "phone_to_folder.steps": phone_to_folder_steps,
     "end_to_end": end_to_end,
     "end_to_end.summary": end_to_end_summary,
     "read_motion": read_motion,

@@ -1,0 +1,39 @@
+"""The size at which pictures are coded where only their motion is wanted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from colmap_av1.options import EncodeOptions
+
+# Pixels that a picture keeps at least where it is coded smaller than it is.
+_LEAST_PIXELS = 500_000
+
+
+def with_downscale(options: EncodeOptions, size: tuple[int, int]) -> EncodeOptions:
+    """The same options, with what pictures of a (width, height) are downscaled by."""
+    if options.downscale is not None:
+        return options
+    largest = math.isqrt(size[0] * size[1] // _LEAST_PIXELS)
+    return replace(options, downscale=float(max(1, largest)))
+
+
+def coded_size(size: tuple[int, int], options: EncodeOptions) -> tuple[int, int]:
+    """The (width, height) at which pictures of a (width, height) are coded."""
+    factor = options.downscale or 1.0
+    if factor == 1:
+        return size
+    # Even: encoders of hardware want that, and the colours are halved once more.
+    width, height = (max(2, 2 * math.floor(length / factor / 2 + 0.5)) for length in size)
+    return width, height
+
+
+def scaling(options: EncodeOptions) -> list[str]:
+    """Filters of ffmpeg that scale pictures to `coded_size`; none where they stay."""
+    factor = options.downscale or 1.0
+    if factor == 1:
+        return []
+    # Of the picture as it arrives: turned and cropped as players do.
+    width, height = (f"max(2\\,2*floor({side}/{factor!r}/2+0.5))" for side in ("iw", "ih"))
+    return [f"scale=w={width}:h={height}:flags=area"]

@@ -1,0 +1,169 @@
+"""Render a clip as a phone shoots it, of any length, with exact poses.
+
+python examples/benchmarks/phone_clip.py --seconds 10 --cache benchmark_phone
+
+The courtyard of `render_scene.py` at 1920x1080 and 30 frames a second, walked to and fro: with a
+hand's shake, motion blur of a 60th of a second, noise of a sensor, and H.264 of 16 Mbit a second
+with a key frame every second. A second of it is rendered in a minute or two; seconds that are in
+the cache are not rendered again, and a longer clip begins as a shorter one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import clips as ruler
+import cv2
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.util.files import whole_file
+
+SIZE = (1920, 1080)
+FOCAL = 1560.0
+FPS = 30
+# Seconds from one end of the way to the other, and what the camera turns about the scene by.
+_SWEEP = 6.0
+_ANGLES = (-22.0, 20.0)
+_EXPOSURE = 1 / 60
+_SAMPLES = 2  # over the exposure
+# Standard deviation in grey levels of a sensor's noise, and how far demosaicing spreads it.
+_NOISE, _SPREAD = 4.0, 0.6
+_SEED = 20240301
+PHONE = "-c:v libx264 -preset veryfast -b:v 16M -maxrate 24M -bufsize 24M -g 30 -bf 0"
+_LOSSLESS = "-c:v libx264 -preset ultrafast -qp 0"
+
+
+def main() -> int:
+    """Render a clip, and print where it is."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=int, default=10)
+    parser.add_argument("--cache", type=Path, required=True, help="folder for clips")
+    arguments = parser.parse_args()
+    print(phone_clip(arguments.cache, arguments.seconds))
+    return 0
+
+
+def phone_clip(cache: Path, seconds: int) -> Path:
+    """The clip of a length, rendered where the cache does not hold it."""
+    video = cache / f"phone_{seconds}s.mp4"
+    if video.exists():
+        return video
+    cache.mkdir(parents=True, exist_ok=True)
+    parts = [_rendered_second(cache, number) for number in range(seconds)]
+    listed = cache / f"parts_{seconds}s.txt"
+    listed.write_text("".join(f"file '{part.absolute()}'\n" for part in parts))
+    with whole_file(video) as partial:
+        words = ["-f", "concat", "-safe", "0", "-i", str(listed), *PHONE.split()]
+        ruler.ffmpeg(*words, "-pix_fmt", "yuv420p", "-f", "mp4", str(partial))
+    listed.unlink()
+    return video
+
+
+def poses_at(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n, 3, 4] world-to-camera poses at some times: an arc walked to and fro, unsteadily."""
+    rng = np.random.default_rng(_SEED)
+
+    def wobble(amplitude: float) -> NDArray[np.float64]:
+        # Steps and hand tremor: faster means smaller, as in real hand-held footage.
+        total = np.zeros(len(seconds))
+        for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
+            phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
+            total += share * np.sin(2 * math.pi * hertz * detune * seconds + phase)
+        return amplitude * total
+
+    along = (1 - np.cos(math.pi * seconds / _SWEEP)) / 2
+    angle = np.radians(_ANGLES[0] + (_ANGLES[1] - _ANGLES[0]) * along)
+    shift = np.stack([wobble(0.020), wobble(0.015), wobble(0.018)], 1)
+    turn = np.radians(np.stack([wobble(0.45), wobble(0.40), wobble(0.55)], 1))
+    # Nearer and further with time, so that no way back is the way there.
+    radius = 4.8 - 0.25 * np.sin(2 * math.pi * seconds / (2.7 * _SWEEP))
+    height = 1.6 + 0.15 * np.sin(2 * math.pi * seconds / (3.3 * _SWEEP))
+    target = np.array([0.10, 0.35, 0.62])
+    poses = np.empty((len(seconds), 3, 4))
+    for k in range(len(seconds)):
+        orbit = np.array([math.sin(angle[k]), -math.cos(angle[k]), 0]) * radius[k]
+        centre = np.array([0.1, 0.35, height[k]]) + orbit + shift[k]
+        forward = target - centre
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        look = np.stack([right, np.cross(forward, right), forward])
+        rotation = cv2.Rodrigues(turn[k])[0] @ look
+        poses[k] = np.c_[rotation, -rotation @ centre]
+    return poses
+
+
+def true_poses(num_frames: int) -> NDArray[np.float64]:
+    """[n, 3, 4] poses of the first frames, at the middle of their exposure."""
+    return poses_at(np.arange(num_frames) / FPS)
+
+
+@functools.cache
+def _painted() -> tuple[Any, Any, list[Any]]:
+    """The module that renders, the scene at this size, and its textures."""
+    module = ruler.load_render_scene()
+    module.SUPERSAMPLE = 1
+    width, height = SIZE
+    scene = dataclasses.replace(
+        module.build_scene(),
+        **{"width": width, "height": height, "fx": FOCAL, "fy": FOCAL},
+        **{"cx": width / 2, "cy": height / 2},
+    )
+    return module, scene, [module._texture(scene, k) for k in range(len(scene.surfaces))]
+
+
+def _picture(frame: int) -> NDArray[np.uint8]:
+    """uint8 [height, width, 3] RGB of a frame: its exposure's samples, averaged, and noise."""
+    module, scene, textures = _painted()
+    times = frame / FPS + _EXPOSURE * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)
+    rng = np.random.default_rng((_SEED, frame))
+    total = np.zeros((scene.height, scene.width, 3), np.float32)
+    for number, pose in enumerate(poses_at(times)):
+        # Samples lie within the pixels, too.
+        inside = ((number + 0.5) / _SAMPLES - 0.5) * np.array([1, -1]) * 0.5
+        shifted = dataclasses.replace(
+            scene,
+            cam_from_world=pose[None],
+            cx=scene.cx - inside[0],
+            cy=scene.cy - inside[1],
+        )
+        total += module.render_frame(shifted, textures, 0)
+    noise = rng.standard_normal(total.shape, np.float32)
+    noise = cv2.GaussianBlur(noise, (0, 0), _SPREAD)
+    noise *= _NOISE / noise.std()
+    return np.asarray(np.clip(np.round(total / _SAMPLES + noise), 0, 255).astype(np.uint8))
+
+
+def _rendered_second(cache: Path, number: int) -> Path:
+    part = cache / f"second_{number:03d}.mp4"
+    if part.exists():
+        return part
+    width, height = SIZE
+    with whole_file(part) as partial:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo"]
+        command += ["-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FPS), "-i", "-"]
+        command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv", *_LOSSLESS.split()]
+        command += ["-colorspace", "bt709", "-pix_fmt", "yuv420p", "-f", "mp4", str(partial)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+            assert process.stdin is not None
+            for frame in range(number * FPS, (number + 1) * FPS):
+                process.stdin.write(_picture(frame).tobytes())
+            process.stdin.close()
+        if process.returncode != 0:
+            raise RuntimeError(f"ffmpeg could not write {part}")
+    return part
+
+
+if __name__ == "__main__":
+    sys.exit(main())

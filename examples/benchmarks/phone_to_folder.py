@@ -1,0 +1,323 @@
+"""Measure the way from a video as it was shot to the folder that trainers open, beside SIFT.
+
+python examples/benchmarks/phone_to_folder.py --cache benchmark_phone
+
+For each clip `reconstruct` makes the folder from the file: conversion, and all that follows on
+the AV1 stream. Then ffmpeg writes the same images of the same file, and pycolmap extracts SIFT
+features, matches them sequentially and maps them, with its defaults. Every step has a process of
+its own. What is measured stays in the cache, so a run that was stopped is resumed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import clips as ruler
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import phone_clip
+import pycolmap
+import render
+from results import add_results, read_rows, save
+from rich.console import Console
+
+from colmap_av1 import (
+    CameraOptions,
+    ColmapAv1Error,
+    EncodeOptions,
+    ImageOptions,
+    MapOptions,
+    MatchOptions,
+    ReconstructOptions,
+    encode,
+    reconstruct,
+)
+from colmap_av1.evaluate import (
+    Footage,
+    MapperRun,
+    Measured,
+    measure_mapper,
+    model_figures,
+    model_poses,
+    pose_errors,
+    read_sequence,
+    run_measured,
+)
+from colmap_av1.evaluate.frontends.frontend import list_images
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
+from colmap_av1.video.coded_size import with_downscale
+from colmap_av1.video.facts import read_video
+
+RENDERED = re.compile(r"phone_(\d+)s")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A video and what is known of it.
+
+    Attributes:
+        name: of the clip.
+        video: the file as it was shot.
+        images: which frames become images.
+        camera: the true intrinsics, where they are given; else nothing.
+        poses: [num_frames, 3, 4] true poses; None where unknown.
+        forward_motion: the camera moves along its axis.
+    """
+
+    name: str
+    video: Path
+    images: ImageOptions
+    camera: CameraOptions
+    poses: ruler.Poses | None
+    forward_motion: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one step, or all steps of one way, took on one clip, and the model at its end."""
+
+    clip: str
+    way: str
+    cpu_s: float
+    seconds: float
+    memory_mb: float
+    images: int | None = None
+    registered: int | None = None
+    points: int | None = None
+    error_px: float | None = None
+    ate: float | None = None
+    ate_of_extent: float | None = None
+    far_views: float | None = None
+    far_views_90: float | None = None
+
+
+# Which frames become images: of the others all.
+IMAGES = {
+    "kitchen": ImageOptions(every=2),
+    "phone": ImageOptions(num_images=150),
+}
+
+
+def main() -> int:
+    """Measure both ways on every clip, and keep and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and results")
+    parser.add_argument(
+        "--clips",
+        nargs="+",
+        default=["log_building", "ditch", "holiday_display", "street", "phone_10s"],
+        metavar="NAME",
+        help="sequences of ../shared, or phone_10s for a rendered clip of 10 seconds",
+    )
+    add_results(parser, "phone_to_folder")
+    arguments = parser.parse_args()
+    console = Console(stderr=True)
+    for name in arguments.clips:
+        folder = arguments.cache.resolve() / name
+        try:
+            rows = measure(clip_of(name, folder), folder, console)
+        except ColmapAv1Error as error:
+            console.print(f"error: {name}: {error}", markup=False)
+            continue
+        save(arguments.results, [asdict(row) for row in rows], ("clip", "way"))
+    rows_of_all = read_rows(arguments.results)
+    print(render.phone_to_folder([r for r in rows_of_all if r["clip"] in arguments.clips]), end="")
+    return 0
+
+
+def clip_of(name: str, folder: Path) -> Clip:
+    """A sequence of ../shared, or a rendered clip."""
+    seconds = RENDERED.fullmatch(name)
+    if seconds is not None:
+        video = phone_clip.phone_clip(folder.parent / "clips", int(seconds[1]))
+        poses = phone_clip.true_poses(int(seconds[1]) * phone_clip.FPS)
+        return Clip(name, video, IMAGES["phone"], CameraOptions(), poses)
+    sequence = read_sequence(ruler.SEQUENCES / name)
+    case = next((case for case in ruler.CASES if case.name == name), None)
+    return Clip(
+        name,
+        ruler.as_shot(sequence, folder / "source"),
+        IMAGES.get(name, ImageOptions()),
+        CameraOptions() if sequence.camera is None else ruler.camera_options(sequence.camera),
+        sequence.cam_from_world,
+        case is not None and case.forward_motion,
+    )
+
+
+def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
+    """Both ways on a clip: a row for each step, and one for each way as a whole."""
+    console.print(f"{clip.name}: reconstruct", markup=False)
+    converted, made, output = folder_of(clip, folder / "reconstruct")
+    ours = [
+        row_of(clip, "conversion", converted),
+        row_of(clip, "reconstruct from AV1", made),
+    ]
+    with pycolmap.Database.open(output / "database.db") as database:
+        names = sorted(str(image.name) for image in database.read_all_images())
+    figures = figures_of(clip, output / "sparse" / "0", output / "images", len(names))
+    ours.append(replace(sum_of("reconstruct", ours), **figures))
+    console.print(f"{clip.name}: SIFT on {len(names)} images", markup=False)
+    steps, model, images = sift_of(clip, folder / "sift", names)
+    sift = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
+    total = sum_of("SIFT sequential", sift)
+    if model is not None:
+        straight = undistorted(model, images, folder / "sift" / "undistorted")
+        figures = figures_of(clip, model, None, len(names)) | ruler.far_views(*straight)
+        total = replace(total, **figures)
+    return [*ours, *sift, total]
+
+
+def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any], dict[str, Any], Path]:
+    """What conversion and the rest of `reconstruct` took, and the folder that it made."""
+    stream, output = folder / "converted" / "stream.mp4", folder / "made" / "output"
+
+    def convert() -> dict[str, Any]:
+        return taken(run_measured(run_encode, clip.video, stream, log=stream.parent / "log"))
+
+    source = file_digest(clip.video)
+    converted = run_stage_in(stream.parent, source, convert, products=[stream], timed=True).facts
+    match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=stream)
+    options = ReconstructOptions(match=match)
+
+    def make() -> dict[str, Any]:
+        log = output.parent / "log"
+        return taken(run_measured(run_reconstruct, clip.video, output, options, log=log))
+
+    given = [source, clip.images, clip.camera]
+    made = run_stage_in(output.parent, given, make, products=[output], timed=True).facts
+    return converted, made, output
+
+
+def run_encode(video: Path, stream: Path) -> None:
+    """Convert a video as `reconstruct` does first."""
+    options = with_downscale(EncodeOptions(), read_video(video).picture_size)
+    encode(video, stream, options=options)
+
+
+def run_reconstruct(video: Path, output: Path, options: ReconstructOptions) -> None:
+    """Make the folder; the stream is there already."""
+    reconstruct(video, output, options=options)
+
+
+def sift_of(
+    clip: Clip, folder: Path, names: list[str]
+) -> tuple[dict[str, dict[str, Any]], Path | None, Path]:
+    """What SIFT's steps took, its model and its images."""
+    images, database = folder / "frames" / "images", folder / "features" / "database.db"
+    frames = [int(Path(name).stem.rpartition("_")[2]) for name in names]
+    opened = read_video(clip.video)
+    footage = Footage(
+        video=clip.video,
+        image_path=images,
+        names=names,
+        frames=tuple(frames),
+        num_frames=max(frames) + 1,
+        size=opened.picture_size,
+        pixel_aspect=opened.display.pixel_aspect,
+        camera=clip.camera,
+    )
+
+    def write() -> dict[str, Any]:
+        images.mkdir()
+        log = images.parent / "log"
+        return taken(run_measured(run_ffmpeg, clip.video, images, names, frames, log=log))
+
+    def match() -> dict[str, Any]:
+        log = database.parent / "log"
+        extracted = run_measured(run_extraction, footage, database, log=log)
+        matched = run_measured(run_matching, database, log=log)
+        return {"features": taken(extracted), "matches": taken(matched)}
+
+    given = [file_digest(clip.video), names]
+    written = run_stage_in(images.parent, given, write, products=[images], timed=True).facts
+    given = [*given, clip.camera, pycolmap.__version__]
+    matching = run_stage_in(database.parent, given, match, products=[database], timed=True).facts
+    known = clip.camera.camera_params is not None
+    settings = MapOptions(refine_intrinsics=not known, forward_motion=clip.forward_motion)
+    mapped = measure_mapper(database, images, folder / "model", settings)
+    steps = {"frames": written, **matching, "mapper": taken(mapped)}
+    return steps, mapped.model, images
+
+
+def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -> None:
+    """Write frames of a video as images."""
+    wanted = "+".join(f"eq(n\\,{frame})" for frame in frames)
+    if frames == list(range(len(frames))):
+        wanted = f"lt(n\\,{len(frames)})"
+    numbered = folder / "%06d.png"
+    ruler.ffmpeg(
+        *("-i", str(video), "-vf", f"select='{wanted}'"),
+        *("-fps_mode", "passthrough", "-start_number", "0", str(numbered)),
+    )
+    for number, name in enumerate(names):
+        (folder / f"{number:06d}.png").replace(folder / name)
+
+
+def run_extraction(footage: Footage, database: Path) -> None:
+    """SIFT features of all images, with COLMAP's defaults."""
+    pycolmap.set_random_seed(0)
+    list_images(footage, database)
+    pycolmap.extract_features(database, footage.image_path, footage.names)
+
+
+def run_matching(database: Path) -> None:
+    """Matches of each image with those after it, with COLMAP's defaults."""
+    pycolmap.set_random_seed(0)
+    pycolmap.match_sequential(database)
+
+
+def taken(run: Measured[Any] | MapperRun) -> dict[str, Any]:
+    """What a measured process took."""
+    memory = (run.peak_memory or 0) / 1e6
+    return {"cpu_s": run.cpu_seconds, "seconds": run.seconds, "memory_mb": memory}
+
+
+def row_of(clip: Clip, way: str, step: dict[str, Any]) -> Row:
+    """The row of a step."""
+    return Row(clip.name, way, **step)
+
+
+def sum_of(way: str, steps: list[Row]) -> Row:
+    """The row of several steps one after the other."""
+    return Row(
+        steps[0].clip,
+        way,
+        cpu_s=sum(step.cpu_s for step in steps),
+        seconds=sum(step.seconds for step in steps),
+        memory_mb=max(step.memory_mb for step in steps),
+    )
+
+
+def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) -> dict[str, Any]:
+    """The figures of a model, those of Row; far views where its images are undistorted."""
+    reconstruction = read_model(model)
+    about = model_figures(reconstruction)
+    found: dict[str, Any] = {
+        "images": num_images,
+        "registered": about.num_registered,
+        "points": about.num_points,
+        "error_px": about.mean_error,
+    }
+    if clip.poses is not None:
+        errors = pose_errors(model_poses(reconstruction, len(clip.poses)), clip.poses)
+        if errors is not None:
+            found |= {"ate": errors.ate, "ate_of_extent": errors.ate / errors.extent}
+    return found if images is None else found | ruler.far_views(model, images)
+
+
+def undistorted(model: Path, images: Path, folder: Path) -> tuple[Path, Path]:
+    """A model with straight lines and its images, to be measured; none of the time counts."""
+    pycolmap.undistort_images(folder, model, images)
+    return folder / "sparse", folder / "images"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
