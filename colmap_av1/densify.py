@@ -57,6 +57,7 @@ class DensifyReport:
     Attributes:
         output: folder of the dense model.
         model: the model whose poses it has.
+        conversion: how the video was converted, in words; None where it is AV1.
         num_images: images of the model.
         num_tracks: tracks of the video that its images see often enough.
         agreeing: share of these that agree with the poses.
@@ -71,6 +72,7 @@ class DensifyReport:
 
     output: Path
     model: Path
+    conversion: str | None
     num_images: int
     num_tracks: int
     agreeing: float
@@ -164,6 +166,7 @@ def densify(
     return DensifyReport(
         output=output,
         model=model,
+        conversion=source.conversion,
         num_images=len(images),
         num_tracks=points.num_tracks,
         agreeing=agreeing,

@@ -46,6 +46,7 @@ class MatchReport:
         video: the video file.
         stream: the AV1 file whose motion was read: the video, or what it was converted to; None
             where that was not kept.
+        conversion: how the stream was made of the video, in words; None where it is the video.
         image_path: folder of the images; None where none was given.
         num_frames: shown frames of the video.
         num_coded_frames: frames with block data, hidden ones included.
@@ -72,6 +73,7 @@ class MatchReport:
     database: Path
     video: Path
     stream: Path | None
+    conversion: str | None
     image_path: Path | None
     num_frames: int
     num_coded_frames: int
@@ -201,6 +203,7 @@ def match(
         database=database,
         video=video.path,
         stream=source.stream.path if source.is_kept else None,
+        conversion=source.conversion,
         image_path=folder,
         num_frames=prepared.tracks.num_frames,
         num_coded_frames=prepared.tracked.num_coded_frames,

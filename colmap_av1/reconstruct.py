@@ -48,6 +48,7 @@ class ReconstructReport:
     Attributes:
         output: the folder with `images/` and `sparse/0/`, as trainers open it.
         video: the video.
+        conversion: how the video was converted, in words; None where it is AV1.
         database: COLMAP database of the tracks that the poses come from.
         num_frames: shown frames of the video.
         num_images: frames chosen as images.
@@ -74,6 +75,7 @@ class ReconstructReport:
 
     output: Path
     video: Path
+    conversion: str | None
     database: Path
     num_frames: int
     num_images: int
@@ -169,6 +171,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     return ReconstructReport(
         output=run.output,
         video=run.source.pictures.path,
+        conversion=run.source.conversion,
         database=run.output / "database.db",
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
         seconds=run.clock.seconds,

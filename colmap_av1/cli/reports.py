@@ -34,6 +34,7 @@ def match_rows(report: MatchReport) -> Rows:
     rows = [
         ("database", str(report.database)),
         ("stream", str(report.stream or "converted and not kept, see --keep_stream")),
+        *_conversion_row(report.conversion),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
         ("tracks", str(report.num_tracks)),
@@ -77,6 +78,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
     """What `reconstruct` made."""
     rows = [
         ("output", str(report.output)),
+        *_conversion_row(report.conversion),
         ("images", f"{report.num_registered} of {report.num_images} with a pose"),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
@@ -112,6 +114,10 @@ def model_rows(figures: ModelFigures, far_views: FarViews) -> Rows:
     ]
 
 
+def _conversion_row(conversion: str | None) -> Rows:
+    return [] if conversion is None else [("converted", conversion)]
+
+
 def _link_rows(
     *,
     num_images: int,
@@ -134,6 +140,7 @@ def densify_rows(report: DensifyReport) -> Rows:
     """What `densify` made."""
     return [
         ("output", str(report.output)),
+        *_conversion_row(report.conversion),
         ("images", str(report.num_images)),
         ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
         ("points", f"{report.num_points}, the model had {report.num_model_points}"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
-from colmap_av1.video.encode import encode, stream_of
+from colmap_av1.video.encode import EncodeReport, encode, stream_of
 from colmap_av1.video.facts import Video, frame_times, read_video
 from colmap_av1.video.unchanged import FileState
 
@@ -49,11 +49,13 @@ class VideoSource:
             that the other's edit list hides, too, and may be smaller than it.
         pictures: the video whose pictures become images: the same, or what it was made of.
         is_kept: the stream stays when the work is done.
+        conversion: what the stream was made of and how, in words; None where it is the video.
     """
 
     stream: Video
     pictures: Video
     is_kept: bool = True
+    conversion: str | None = None
 
     @property
     def files(self) -> tuple[FileState, ...]:
@@ -114,7 +116,7 @@ def open_source(
                 options=how,
                 progress=progress,
             )
-        yield VideoSource(_stream_for(video, made.output, how), video)
+        yield _made_source(video, made, how, is_kept=True)
         return
     with _scratch(beside) as folder:
         with clock.measure("encoding"):
@@ -124,21 +126,26 @@ def open_source(
                 options=how,
                 progress=progress,
             )
-        yield VideoSource(_stream_for(video, made.output, how), video, is_kept=False)
+        yield _made_source(video, made, how, is_kept=False)
 
 
-def _stream_for(video: Video, path: Path, options: EncodeOptions) -> Video:
-    """A stream that was made of a video; refused where its pictures have not the size asked for."""
-    stream = read_video(path)
-    wanted = coded_size(video.picture_size, options)
-    if stream.picture_size != wanted:
+def _made_source(
+    video: Video, made: EncodeReport, options: EncodeOptions, *, is_kept: bool
+) -> VideoSource:
+    """A video and its stream; refused where the stream's pictures have not the size asked for."""
+    stream = read_video(made.output)
+    size, wanted = (
+        "{}x{}".format(*pixels)
+        for pixels in (stream.picture_size, coded_size(video.picture_size, options))
+    )
+    if size != wanted:
         raise VideoError(
-            "{}: its pictures are {}x{}, not {}x{} as those of ".format(
-                path, *stream.picture_size, *wanted
-            )
-            + f"{video}: convert it by another --encoder"
+            f"{stream}: its pictures are {size}, not {wanted} as asked for of {video}: convert it "
+            "by another --encoder"
         )
-    return stream
+    shown = "{}x{}".format(*video.picture_size)
+    conversion = f"{video.codec} at {shown} to AV1 at {size} by {made.encoder}"
+    return VideoSource(stream, video, is_kept, conversion)
 
 
 def with_stream_kept(options: MatchOptions, folder: Path) -> MatchOptions:
@@ -218,18 +225,30 @@ def track_video(
                 )
             clock.seconds["refinement"] -= clock.seconds["decoding"]
     notes = [str(w.message) for w in caught]
+    # Of the whole file, so a rate that is found low is even lower.
+    bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels
+    notes += _notes(source, share_over_picture, structure.reasons(bits_per_pixel))
+    inter_share = _inter_share(structure, num_frames, source.pictures.presented)
+    return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
+
+
+def _notes(source: VideoSource, share_over_picture: float, reasons: Sequence[str]) -> list[str]:
+    """What the user should know of a video whose tracks are found."""
+    notes = []
     if share_over_picture >= _NOTABLE_SHARE:
         notes.append(
             f"{share_over_picture:.0%} of the tracks stand still while the picture moves, as "
             "logos and dashboards do: they are left out"
         )
-    # Of the whole file, so a rate that is found low is even lower.
-    bits = 8 * source.stream.path.stat().st_size
-    reasons = structure.reasons(bits / num_pixels)
     if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or use --reencode 1 to convert the video first")
-    inter_share = _inter_share(structure, num_frames, source.pictures.presented)
-    return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
+    dynamic_range = source.pictures.dynamic_range
+    if dynamic_range is not None:
+        notes.append(
+            f"the video is of high dynamic range ({dynamic_range}): images keep its values, which "
+            "look pale; give a video of standard range for the colours that players show"
+        )
+    return notes
 
 
 def _inter_share(

@@ -30,6 +30,8 @@ _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
 _AV1C_HEADER_SIZE = 4
 # As a path spells it, with one slash.
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]+):/(?P<rest>.*)", re.DOTALL)
+# Transfer characteristics of high dynamic range (ITU-T H.273, table 3).
+_HIGH_RANGES = {16: "PQ", 18: "HLG"}
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class VideoFile:
         duration: length in seconds; None where unknown.
         num_packets: packets of the video, usually one a frame; None where the container does
             not say.
+        dynamic_range: name of the transfer function of high dynamic range that its pictures
+            have, "HLG" or "PQ"; None where they have none.
     """
 
     path: Path
@@ -76,6 +80,7 @@ class VideoFile:
     frame_rate: float | None
     duration: float | None
     num_packets: int | None
+    dynamic_range: str | None
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -124,6 +129,7 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         frame_rate=float(rate) if rate and is_timed else None,
         duration=_stream_duration(container, stream) if is_timed else None,
         num_packets=stream.frames or None,
+        dynamic_range=_HIGH_RANGES.get(stream.codec_context.color_trc),
     )
 
 

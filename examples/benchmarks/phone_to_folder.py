@@ -183,7 +183,7 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any], dict[str, Any],
         return taken(run_measured(run_encode, clip.video, stream, log=stream.parent / "log"))
 
     source = file_digest(clip.video)
-    converted = run_stage_in(stream.parent, source, convert, products=[stream], timed=True).facts
+    converted = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True).facts
     match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=stream)
     options = ReconstructOptions(match=match)
 

@@ -116,11 +116,11 @@ def test_ten_bits_of_high_dynamic_range(
 ) -> None:
     """As newer phones film, 60 frames a second."""
     plain = encode(make_frames(12, 96, 64), tmp_path / "plain.mkv", "-c:v", "ffv1")
-    colours = ("-colorspace", "bt2020nc", "-color_primaries", "bt2020", "-color_trc", "smpte2084")
+    colours = "setparams=colorspace=bt2020nc:color_primaries=bt2020:color_trc=smpte2084"
     video = ffmpeg(
-        *("-i", plain, "-vf", "setpts=N/60/TB", "-fps_mode", "passthrough"),
+        *("-i", plain, "-vf", f"setpts=N/60/TB,{colours}", "-fps_mode", "passthrough"),
         *("-enc_time_base", "1/600", "-c:v", "libx265", "-tag:v", "hvc1", "-x265-params"),
-        *("log-level=error", "-pix_fmt", "yuv420p10le", *colours),
+        *("log-level=error", "-pix_fmt", "yuv420p10le"),
         tmp_path / "phone.mov",
     )
     options = EncodeOptions(encoder=encoder, quality=5)
@@ -138,6 +138,9 @@ def test_ten_bits_of_high_dynamic_range(
     found = match(tmp_path / "a.db", video, options=MatchOptions(encode=options))
     assert found.num_images == 12
     assert found.num_verified_pairs > 0
+    assert found.conversion is not None
+    assert found.conversion.startswith("hevc at 96x64 to AV1 at 96x64 by lib")
+    assert any("high dynamic range (PQ)" in warning for warning in found.warnings)
 
 
 def test_slow_motion_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
@@ -441,17 +444,29 @@ PICTURES = {"nvenc": "format=yuv420p", "vaapi": "format=nv12,hwupload"}
 OF_ALL_ENCODERS = {"-bf", "-q:v", "-global_quality", "-compression_level"}
 
 
+@pytest.mark.parametrize(
+    ("downscale", "scaled"),
+    [(None, ""), (2, "scale=w=max(2\\,2*floor(iw/2/2+0.5)):h=max(2\\,2*floor(ih/2/2+0.5)):")],
+)
 @pytest.mark.parametrize("name", HARDWARE)
 def test_what_hardware_encoders_are_asked(
-    phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    phone: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    name: str,
+    downscale: float | None,
+    scaled: str,
 ) -> None:
     """As on a machine that has the hardware, up to where it would be used."""
     asked = tmp_path / "asked"
     log = f'printf "%s\\n" "$@" > {asked}'
     script = f'case "$*" in *lavfi*) exit 0;; *) {log}; exit 1;; esac'
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, script)))
+    options = EncodeOptions(encoder=name, downscale=downscale)
     with pytest.raises(EncodeError, match="the encoder failed after 0 frames"):
-        encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder=name))
+        encode_video(phone, tmp_path / "out.mp4", options=options)
+    pictures = f"{scaled and f'{scaled}flags=area,'}{PICTURES.get(name, 'format=nv12')}"
     words = asked.read_text().splitlines()
     device = ["-vaapi_device", "/dev/dri/renderD128"] if name == "vaapi" else []
     assert words[words.index("-y") + 1 : words.index("-i")] == [
@@ -459,7 +474,7 @@ def test_what_hardware_encoders_are_asked(
         *("-ignore_editlist", "1"),
     ]
     assert words[words.index("-i") : words.index("-progress")] == [
-        *("-i", f"file:{phone}", "-map", "0:0", "-vf", PICTURES.get(name, "format=nv12")),
+        *("-i", f"file:{phone}", "-map", "0:0", "-vf", pictures),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux", "-c:v", f"av1_{name}"),
         *("-g", "9999", *HARDWARE[name].split()),
     ]
