@@ -29,6 +29,7 @@ from colmap_av1.tracks.video_tracks import (
     VideoSource,
     decodable_frames,
     open_source,
+    refine_in_images,
     times_of_frames,
     track_video,
 )
@@ -166,6 +167,11 @@ def prepare_images(
                 times=lambda: times_of_frames(source, tracks.num_frames),
                 decode=decode,
             )
+        refined = refine_in_images(
+            tracked, source, chosen.frames, options, clock=clock, progress=progress
+        )
+        if refined is not tracked:
+            tracked, tracks = refined, _tracks_as_shown(refined.tracks, source, fit)
     if folder is not None:
         check_image_folder(folder, chosen.names, size)
         kept = zip(chosen.names, chosen.frames.tolist(), strict=True)

@@ -35,6 +35,7 @@ from colmap_av1.tracks.tracks import Tracks, keep_frames, keep_long_tracks, leas
 from colmap_av1.tracks.video_tracks import (
     VideoSource,
     decoded_pictures,
+    refine_in_images,
     times_of_frames,
     track_video,
 )
@@ -86,6 +87,10 @@ def track_stage(run: Run) -> Kept:
                 times=lambda: times_of_frames(source, tracks.num_frames),
                 decode=lambda: decoded_pictures(source, options),
             )
+        tracked = refine_in_images(
+            tracked, source, chosen.frames, options, clock=clock, progress=progress
+        )
+        tracks = tracked.tracks
         if len(chosen.names) < LEAST_IMAGES:
             raise ImageError(
                 f"{len(chosen.names)} of {tracks.num_frames} frames become images: a model needs "

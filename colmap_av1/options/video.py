@@ -62,9 +62,10 @@ class EncodeOptions(Options):
     )
     downscale: float | None = option(
         None,
-        "width and height of pictures are divided by this before they are coded, and keypoints "
-        "are scaled back: images keep the video's size; None: by what leaves large pictures half "
-        "a megapixel or more; by 1 in encode, whose output is a video of its own",
+        "width and height of pictures are divided by this before they are coded; keypoints are "
+        "scaled back, those of the longest tracks corrected on the full pictures, and images keep "
+        "the video's size; None: by a whole number that leaves large pictures half a megapixel or "
+        "more; by 1 in encode, whose output is a video of its own",
         least=1,
         most=16,
     )

@@ -355,14 +355,28 @@ def _texture(
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     size = (window, window)
-    xx, xy, yy = (
-        cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)
-        for product in (dx * dx, dx * dy, dy * dy)
-    )
-    smallest = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy * xy))
-    softness = 1 / np.sqrt(np.maximum(smallest, 1e-6))
+    # In place: new memory for arrays of large pictures takes longer than what is done in it.
+    product = np.multiply(dx, dy)
+    xy = cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)
+    xx = cv2.boxFilter(np.multiply(dx, dx, out=product), cv2.CV_32F, size, dx, normalize=False)
+    yy = cv2.boxFilter(np.multiply(dy, dy, out=product), cv2.CV_32F, size, dy, normalize=False)
+    # The smaller eigenvalue: (xx + yy - sqrt((xx - yy)^2 + 4 xy^2)) / 2.
+    root = np.subtract(xx, yy, out=product)
+    root *= root
+    xy *= xy
+    xy *= 4
+    root += xy
+    np.sqrt(root, out=root)
+    xx += yy
+    xx -= root
+    xx *= 0.5
+    np.maximum(xx, 1e-6, out=xx)
+    np.sqrt(xx, out=xx)
+    softness = np.divide(1, xx, out=xx)
     mean = cv2.boxFilter(grey, cv2.CV_32F, size)
-    contrast = cv2.boxFilter(np.abs(grey - mean), cv2.CV_32F, size)
+    np.subtract(grey, mean, out=mean)
+    np.abs(mean, out=mean)
+    contrast = cv2.boxFilter(mean, cv2.CV_32F, size)
     return np.asarray(softness, np.float32), np.asarray(contrast, np.float32)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks.presets import limits_of
+from colmap_av1.tracks.presets import Limits, limits_of
 from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
 
 # Error in pixels that an observation has however accurate its motion is; keeps one sure
@@ -60,6 +60,22 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         sure = variance <= np.maximum(np.float32(max_variance), way, out=way)
         del way
         tracks, variance = keep_observations(tracks, sure), variance[sure]
+    return keep_observations(tracks, _spread(tracks, variance, limits))
+
+
+def spread_observations(tracks: Tracks, options: DensityOptions) -> NDArray[np.bool_]:
+    """Which observations `select_tracks` keeps where errors are not limited: bool [n]."""
+    return _spread(tracks, _variance_since_first(tracks), limits_of(options))
+
+
+def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: Limits) -> NDArray[np.bool_]:
+    """Which observations are kept so that tracks are long, accurate and spread; bool [n].
+
+    Args:
+        tracks: any tracks.
+        variance: float32 [n] variance of each observation in px^2, overwritten.
+        limits: how many tracks to keep, and how far apart.
+    """
     variance += _SIGMA_FLOOR**2
     weight = np.reciprocal(variance, out=variance)
     score = np.add.reduceat(weight, tracks.offsets[:-1])
@@ -73,7 +89,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         max_tracks_per_image=limits.max_tracks_per_image,
         min_length=limits.min_images,
     )
-    return keep_observations(tracks, kept.view(np.bool_))
+    return kept.view(np.bool_)
 
 
 def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import EncodeOptions, MatchOptions
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.refine_spread import refine_spread_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks, scale_tracks, show_tracks
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.progress import Clock, Progress
@@ -285,8 +286,54 @@ def decoded_pictures(source: VideoSource, options: MatchOptions) -> Iterator[tup
     )
 
 
+def refine_in_images(
+    tracked: TrackedVideo,
+    source: VideoSource,
+    frames: NDArray[np.int32],
+    options: MatchOptions,
+    *,
+    clock: Clock,
+    progress: Progress,
+) -> TrackedVideo:
+    """Correct the tracks that poses come from where motion was searched in smaller pictures.
+
+    Poses then are as exact as those of motion at full size. What is refined already, and a video
+    whose motion is of full size, is left as it is.
+
+    Args:
+        tracked: tracks of the video.
+        source: the video.
+        frames: int32 [n] frames that become images, ascending.
+        options: those of reading are used.
+        clock: gets the stage "refinement".
+        progress: called for the stage "refinement".
+
+    Raises:
+        BitstreamError: the video is damaged, and strict.
+    """
+    is_smaller = source.stream.picture_size != source.pictures.picture_size
+    if not is_smaller or options.refine.refine != "none":
+        return tracked
+    with clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        wanted = frozenset(frames.tolist())
+        pictures = decodable_frames(source.pictures, int(frames[-1]) + 1, options, wanted=wanted)
+        tracks = refine_spread_tracks(
+            tracked.tracks,
+            frames,
+            pictures,
+            lambda done: progress("refinement", done, len(frames)),
+        )
+    notes = (*tracked.warnings, *(str(w.message) for w in caught))
+    return replace(tracked, tracks=tracks, warnings=notes)
+
+
 def decodable_frames(
-    video: Video, num_frames: int, options: MatchOptions, display: Display | None = None
+    video: Video,
+    num_frames: int,
+    options: MatchOptions,
+    display: Display | None = None,
+    wanted: Container[int] | None = None,
 ) -> Iterator[tuple[int, _Image]]:
     """The pictures of the frames that have tracks; those before a damage, with a warning."""
     decoded = decode_frames(
@@ -294,6 +341,7 @@ def decodable_frames(
         operating_point=options.read.operating_point,
         num_threads=options.run.num_threads,
         display=display,
+        wanted=wanted,
     )
     count = 0
     try:

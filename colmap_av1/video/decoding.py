@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Container, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ def decode_frames(
     operating_point: int = 0,
     num_threads: int | None = None,
     display: Display | None = None,
+    wanted: Container[int] | None = None,
 ) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
     """Decode the frames that players show, as they show them but for film grain.
 
@@ -30,6 +31,7 @@ def decode_frames(
         num_threads: threads of the decoder; None: as many as it likes.
         display: how pictures are cut and turned; None: as players do. Pixels stay as wide as
             they are stored.
+        wanted: indices of the frames that are given, all others are decoded only; None: all.
 
     Yields:
         (index, image) in output order: the index counts the frames that players show, see
@@ -47,7 +49,7 @@ def decode_frames(
 
     def shown(number: int, frame: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         index = number if index_of is None else index_of.get(number)
-        if index is not None:
+        if index is not None and (wanted is None or index in wanted):
             yield index, shown_picture(frame.to_ndarray(format="bgr24"), how)
 
     count = 0

@@ -97,10 +97,10 @@ class Row:
     far_views_90: float | None = None
 
 
-# Which frames become images: of the others all.
+# Which frames become images; of other clips all do.
 IMAGES = {
     "kitchen": ImageOptions(every=2),
-    "phone": ImageOptions(num_images=150),
+    "phone": ImageOptions(every=2),
 }
 
 

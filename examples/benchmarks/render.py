@@ -441,6 +441,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "dav1d_profile": dav1d_profile,
     "verification": verification,
     "encoders": encoders,
+    "large_pictures": plain,
     "read_memory": plain,
     "long_video": plain,
     "image_pairs": plain,

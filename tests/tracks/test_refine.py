@@ -13,6 +13,7 @@ from colmap_av1.errors import ImageError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import RefineOptions
 from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.refine_spread import refine_spread_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.video.decoding import decode_frames
 
@@ -208,3 +209,32 @@ def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
             expected = np.sqrt(np.mean(found.sigma[start + 4][seen][part] ** 2))
             actual = np.sqrt(np.mean(errors[seen][part] ** 2))
             assert 0.5 < actual / expected < 2
+
+
+def test_few_tracks_are_corrected_in_the_images_alone() -> None:
+    tracks, truth = moving_tracks(0.15)
+    frames = np.arange(0, FRAMES, 3, dtype=np.int32)
+    asked = [item for item in pictures() if item[0] in frames]
+    done: list[int] = []
+    refined = refine_spread_tracks(tracks, frames, asked, done.append)
+    assert done == [1, 2, 3, 4]
+    np.testing.assert_array_equal(refined.offsets, tracks.offsets)
+    np.testing.assert_array_equal(refined.frame, tracks.frame)
+    elsewhere = ~np.isin(tracks.frame, frames)
+    np.testing.assert_array_equal(refined.xy[elsewhere], tracks.xy[elsewhere])
+    np.testing.assert_array_equal(refined.sigma[elsewhere], tracks.sigma[elsewhere])
+    textured = refined.confirmed & (tracks.frame > 0)
+    # As many as are spread over the picture, 10 pixels apart.
+    assert 300 < textured.sum() / 3 < len(tracks.offsets)
+    error = np.linalg.norm(refined.xy - truth.reshape(-1, 2), axis=1)[textured]
+    before = np.linalg.norm(tracks.xy - truth.reshape(-1, 2), axis=1)[textured]
+    assert np.median(error) < 0.25 * np.median(before)
+    assert (refined.sigma[textured] < tracks.sigma[textured]).mean() > 0.9
+
+
+def test_tracks_that_no_image_sees_stay() -> None:
+    tracks, _ = moving_tracks(0.15)
+    frames = np.array([0, FRAMES - 1], dtype=np.int32)
+    # Two images are too few for a selection.
+    refined = refine_spread_tracks(tracks, frames, pictures()[:1])
+    np.testing.assert_array_equal(refined.xy, tracks.xy)

@@ -1,16 +1,14 @@
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import av
 import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import Encode, Ffmpeg
+import render_scene
+from conftest import PROJECT, Encode, Ffmpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,19 +24,7 @@ from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
 from colmap_av1.video.facts import read_video
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 NUM_FRAMES = 8
-
-
-@pytest.fixture(scope="module")
-def scene() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("render_scene", EXAMPLES / "render_scene.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_scene"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +32,7 @@ def courtyard(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first frames of the rendered clip, 640x360, as H.264."""
     words = ("-frames:v", str(NUM_FRAMES), "-c:v", "libx264", "-crf", "10")
     folder = tmp_path_factory.mktemp("courtyard")
-    return ffmpeg("-i", EXAMPLES / "scene.mp4", *words, folder / "scene.mp4")
+    return ffmpeg("-i", PROJECT / "examples" / "scene.mp4", *words, folder / "scene.mp4")
 
 
 sides = st.integers(16, 8192)
@@ -109,9 +95,7 @@ def test_coded_pictures_lie_where_the_full_ones_do(
     assert np.abs(shift).max() < 0.02
 
 
-def test_keypoints_and_images_have_the_video_s_size(
-    courtyard: Path, scene: ModuleType, tmp_path: Path
-) -> None:
+def test_keypoints_and_images_have_the_video_s_size(courtyard: Path, tmp_path: Path) -> None:
     options = MatchOptions(
         encode=EncodeOptions("libaom", downscale=2), keep_stream=tmp_path / "stream.mp4"
     )
@@ -130,10 +114,12 @@ def test_keypoints_and_images_have_the_video_s_size(
     assert (camera.width, camera.height) == (640, 360)
     everywhere = np.concatenate(list(xy.values()))
     assert (everywhere.max(axis=0) > [600, 330]).all()
-    truth, visible = scene.transfer(scene.build_scene(), xy[0][matches[:, 0]], 0, 4)
+    scene = render_scene.build_scene()
+    truth, visible = render_scene.transfer(scene, xy[0][matches[:, 0]], 0, 4)
     error = np.linalg.norm(truth - xy[4][matches[:, 1]], axis=1)[visible]
     assert len(error) > 200
-    assert np.median(error) < 0.6
+    # Corrected in the full pictures: from the motion of small ones alone it is twice that.
+    assert np.median(error) < 0.25
 
 
 def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None:
