@@ -106,7 +106,7 @@ def test_a_stream_of_another_size_than_its_video_is_refused(
     larger = encode(make_frames(6, 208, 144), tmp_path / "larger.mp4", *AV1)
     ffmpeg("-i", larger, "-c", "copy", "-metadata", f"comment={mark}", stream)
     os.utime(stream)
-    with pytest.raises(VideoError, match=r"are 208x144, those of .*v\.mp4 192x128: .* --encoder"):
+    with pytest.raises(VideoError, match=r"are 208x144, not 192x128 .* of .*v\.mp4: .* --encoder"):
         prepared(video, options=options)
 
 

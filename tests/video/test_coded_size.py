@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 from colmap_av1.cli import main
 from colmap_av1.errors import VideoError
 from colmap_av1.match import match
-from colmap_av1.options import EncodeOptions, ImageOptions, MatchOptions, TrackOptions
+from colmap_av1.options import (
+    CameraOptions,
+    EncodeOptions,
+    ImageOptions,
+    MatchOptions,
+    ReconstructOptions,
+    TrackOptions,
+)
+from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.video_tracks import open_source, track_video
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.coded_size import coded_size, with_downscale
@@ -120,6 +128,36 @@ def test_keypoints_and_images_have_the_video_s_size(courtyard: Path, tmp_path: P
     assert len(error) > 200
     # Corrected in the full pictures: from the motion of small ones alone it is twice that.
     assert np.median(error) < 0.25
+
+
+def test_folder_of_a_downscaled_video_has_its_size(courtyard: Path, tmp_path: Path) -> None:
+    encode = EncodeOptions("libaom", downscale=2)
+    camera = CameraOptions(camera_model="PINHOLE", camera_params="520,520,320,180")
+    match_options = MatchOptions(encode=encode, camera=camera)
+    options = ReconstructOptions(match=match_options)
+    report = reconstruct(courtyard, tmp_path / "out", options=options)
+    assert report.num_registered == NUM_FRAMES
+    assert report.conversion == "h264 at 640x360 to AV1 at 320x180 by libaom-av1"
+    assert report.seconds["refinement"] > 0
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    (pinhole,) = model.cameras.values()
+    assert (pinhole.width, pinhole.height) == (640, 360)
+    written = cv2.imread(str(min((tmp_path / "out" / "images").iterdir())))
+    assert written.shape == (360, 640, 3)
+    scene = render_scene.build_scene()
+    seen = [(o.image_id, o.point2D_idx) for p in model.points3D.values() for o in p.track.elements]
+    xy = np.array([model.images[image].points2D[index].xy for image, index in seen])
+    assert (xy.max(axis=0) > [600, 330]).all()
+    projected = model.compute_mean_reprojection_error()
+    assert projected < 0.7
+    centres = {i.name: i.projection_center() for i in model.images.values()}
+    found = np.array([centres[name] for name in sorted(centres)])
+    truth = scene.cam_from_world[:NUM_FRAMES]
+    true_centres = -np.einsum("nji,nj->ni", truth[:, :, :3], truth[:, :, 3])
+    similar = pycolmap.estimate_sim3d(found, true_centres)
+    off = np.array([similar * centre for centre in found]) - true_centres
+    extent = np.linalg.norm(np.ptp(true_centres, axis=0))
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02 * extent
 
 
 def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None:
