@@ -127,8 +127,7 @@ def densify(
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
-    camera_of_name = {name: cameras[image.camera_id] for name, image in posed.items()}
-    sizes = {name: (int(c.width), int(c.height)) for name, c in camera_of_name.items()}
+    sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
     video = read_video(video, options.match.read.operating_point)
     with unchanged(video.state):
         size = _check_input(model, video, folder, sizes, options)
@@ -178,6 +177,11 @@ def densify(
         seconds=clock.seconds,
         warnings=tracked.warnings,
     )
+
+
+def _size(camera: Any) -> tuple[int, int]:
+    """(width, height) in pixels of the images of a pycolmap.Camera."""
+    return int(camera.width), int(camera.height)
 
 
 def _choose(
