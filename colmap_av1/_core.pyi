@@ -15,6 +15,7 @@ class Event:
     shown_decode_index: int
     temporal_unit: int
     num_units: int
+    num_wrong_trailing_bits: int
     is_repeated: bool
     is_shown: bool
     is_shown_key_frame: bool
@@ -34,6 +35,7 @@ class Parser:
         headers_only: bool = False,
         keep_blocks: bool = False,
         num_threads: int = 1,
+        strict: bool = False,
         max_frame_size: int = 268435456,
     ) -> None: ...
     def parse(self, data: bytes | memoryview) -> None: ...

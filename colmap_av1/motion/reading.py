@@ -69,11 +69,13 @@ def read_motion(
 
     Yields:
         One FrameMotion per coded frame. A damaged stream yields the frames before the
-        damage, and a warning names the damage; see Raises.
+        damage, and a warning names the damage; see Raises. Tiles that end with other bits than
+        the specification demands, as some encoders write them, are read as decoders read them,
+        and a warning says so.
 
     Raises:
-        BitstreamError: the stream is damaged before its first frame is complete, or anywhere
-            with `options.strict`.
+        BitstreamError: the stream is damaged before its first frame is complete; with
+            `options.strict`, it is damaged anywhere or a tile ends otherwise than specified.
         LimitError: a frame is larger than `options.max_frame_size`.
         VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
     """
@@ -82,17 +84,24 @@ def read_motion(
     display_index: dict[int, int] = {}
     for number, decode_index in enumerate(index.shown):
         display_index.setdefault(decode_index, number)
-    count = 0
+    count = num_irregular = 0
     try:
         for event in _read_events(video, options, index):
             if event.is_repeated:
                 continue
+            num_irregular += event.num_wrong_trailing_bits > 0
             yield _frame_motion(event, display_index)
             count += 1
     except BitstreamError as error:
         if options.strict or count == 0:
             raise
         warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
+    if num_irregular:
+        warnings.warn(
+            f"{video}: {num_irregular} of {count} frames have tiles that do not end with the bits "
+            "the specification demands; they are used as decoders use them",
+            stacklevel=2,
+        )
 
 
 def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
@@ -238,6 +247,7 @@ def _read_groups(
     parser = _core.Parser(
         operating_point=options.operating_point,
         num_threads=num_threads,
+        strict=options.strict,
         max_frame_size=options.max_frame_size,
     )
     first_packets = [group.first_packet for group in groups]

@@ -30,7 +30,9 @@ class ReadOptions(Options):
         least=1,
     )
     strict: bool = option(
-        False, "fail on a damaged stream instead of using the frames before the damage"
+        False,
+        "fail on a damaged stream instead of using the frames before the damage, and on tiles that "
+        "end otherwise than the specification demands",
     )
     max_frame_size: int = option(
         16384 * 16384,

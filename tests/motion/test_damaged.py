@@ -27,6 +27,7 @@ from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.video.container import packets
+from colmap_av1.video.decoding import decode_frames
 
 _DATA = PROJECT / "tests" / "data" / "conformance"
 _KIT = SHARED / "conformance"
@@ -286,7 +287,11 @@ def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
     tile = b"\x07\x80"
     first, damaged, second = (
         obu(4, bytes([number]) + data)
-        for number, data in ((0b10000000, tile), (0b10000000, b"\x07\x81"), (0b11100000, tile))
+        for number, data in (
+            (0b10000000, tile),
+            (0b10000000, tile + b"\x81" * 3),
+            (0b11100000, tile),
+        )
     )
     parser = _core.Parser()
     parser.parse(start + first + second)
@@ -298,6 +303,97 @@ def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
     assert parser.take_events() == []
     parser.parse(start + first + second)
     assert len(parser.take_events()) == 1
+
+
+# --- tiles that end otherwise than the specification demands -----------------------------------
+
+
+def last_obu_type(unit: bytes) -> int:
+    """Type of the last OBU of a temporal unit whose OBUs all have a size."""
+    position = last = 0
+    while position < len(unit):
+        last = (unit[position] >> 3) & 15
+        position += 2 if unit[position] & 4 else 1
+        size = shift = 0
+        while True:
+            byte = unit[position]
+            position += 1
+            size |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                break
+        position += size
+    return last
+
+
+def with_other_trailing_bits(path: Path, num: int, output: Path) -> int:
+    """Write a stream with other bits at the end of the first frames that end a temporal unit.
+
+    Returns the number of frames that are changed.
+    """
+    data = bytearray(path.read_bytes())
+    position, changed = 32, 0
+    while position < len(data) and changed < num:
+        (size,) = struct.unpack_from("<I", data, position)
+        unit = data[position + 12 : position + 12 + size]
+        position = end = position + 12 + size
+        if last_obu_type(unit) == 6 and unit[-1]:  # OBU_FRAME ends with a tile
+            # Bits 10...0 become 01...1: of the values that give the last symbols the same range,
+            # encoders take the largest, so the next smaller one does as well.
+            data[end - 1] -= 1
+            changed += 1
+    output.write_bytes(data)
+    return changed
+
+
+def motion_of(path: Path, **options: Any) -> tuple[list[str], list[str]]:
+    """Digests of the frames, and warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = [digest(vars(frame)) for frame in read_motion(path, ReadOptions(**options))]
+    return found, [str(w.message) for w in caught]
+
+
+@pytest.mark.parametrize("num", [1, 99])
+def test_other_trailing_bits_are_read_as_decoders_read_them(tmp_path: Path, num: int) -> None:
+    source, path = _DATA / "svt4_p6.ivf", tmp_path / "a.ivf"
+    changed = with_other_trailing_bits(source, num, path)
+    assert changed == 1 or 4 < changed < num
+    wanted, no_warnings = motion_of(source)
+    assert no_warnings == []
+    for num_threads in (1, 4):
+        found, told = motion_of(path, num_threads=num_threads)
+        assert found == wanted
+        (line,) = told
+        assert f"{changed} of {len(wanted)} frames have tiles that do not end" in line
+    with pytest.raises(BitstreamError, match="does not end with the bits"):
+        motion_of(path, strict=True)
+    assert motion_of(source, strict=True) == (wanted, [])
+
+    def pictures(video: Path) -> list[bytes]:
+        return [image.tobytes() for _, image in decode_frames(video)]
+
+    assert pictures(path) == pictures(source)
+
+
+def test_tile_that_goes_on_after_its_symbols_is_damaged() -> None:
+    start = obu(2, b"") + still_picture_sequence(64, 64)
+    frame = obu(3, bytes([0b00011000, 255, 0, 0, 0, 0x80]))
+    for tile, wrong in (
+        (b"\x07\x80", 0),
+        (b"\x07\x80\0\0\0", 0),
+        (b"\x07\x00", 1),
+        (b"\x07\x81", 1),
+    ):
+        parser = _core.Parser()
+        parser.parse(start + frame + obu(4, tile))
+        (event,) = parser.take_events()
+        assert event.num_wrong_trailing_bits == wrong
+        if wrong:
+            with pytest.raises(_core.BitstreamError, match="does not end with the bits"):
+                _core.Parser(strict=True).parse(start + frame + obu(4, tile))
+    with pytest.raises(_core.BitstreamError, match="goes on after its last symbol"):
+        _core.Parser().parse(start + frame + obu(4, b"\x07\x80\0\1"))
 
 
 # --- any damage to a small stream -------------------------------------------------------------

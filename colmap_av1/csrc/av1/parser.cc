@@ -242,6 +242,7 @@ void Parser::start_frame() {
   tile_first_block_.assign(num_tiles, 0);
   tile_num_blocks_.assign(num_tiles, 0);
   tile_local_warps_.assign(num_tiles, {});
+  tile_trailing_bits_valid_.assign(num_tiles, true);
   std::size_t first = 0;
   for (int row = 0; row < header_.tile_rows; ++row) {
     for (int col = 0; col < header_.tile_cols; ++col) {
@@ -320,6 +321,10 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
                      tile.data, tile.size, context_.blocks.get() + tile_first_block_[number]);
         tile_num_blocks_[number] = parser.num_blocks();
         tile_local_warps_[number] = parser.local_warps();
+        tile_trailing_bits_valid_[number] = parser.trailing_bits_valid();
+        if (options_.strict && !parser.trailing_bits_valid()) {
+          throw BitstreamError("tile does not end with the bits that the specification demands");
+        }
         if (!header_.disable_frame_end_update_cdf &&
             tile.number == header_.context_update_tile_id) {
           state_->cdfs = parser.cdfs();
@@ -364,6 +369,8 @@ void Parser::finish_frame() {
   seen_frame_header_ = false;
   if (!options_.headers_only) {
     collect_local_warps();
+    event_->num_wrong_trailing_bits = static_cast<int>(
+        std::count(tile_trailing_bits_valid_.begin(), tile_trailing_bits_valid_.end(), false));
     if (header_.disable_frame_end_update_cdf) state_->cdfs = context_.cdfs;
     save_motion(*seq_, context_, state_->saved_motion);
     const std::size_t units = context_.grid.size();

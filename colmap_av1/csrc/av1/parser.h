@@ -21,6 +21,8 @@ struct ParserOptions {
   bool keep_blocks = false;
   // Threads that parse the tiles of a tile group side by side; the result is the same.
   int num_threads = 1;
+  // Refuses tiles whose trailing bits are not those that the specification demands.
+  bool strict = false;
   // Largest accepted frame in luma samples.
   std::int64_t max_frame_size = std::int64_t{1} << 28;
 };
@@ -32,6 +34,7 @@ struct Event {
   int temporal_unit = 0;
   int obu_offset = 0;  // of the frame's first OBU in its temporal unit, in bytes
   int num_tile_groups = 0;
+  int num_wrong_trailing_bits = 0;  // tiles that end otherwise than the specification demands
   int shown_decode_index = -1;  // show_existing_frame: the event that decoded the frame
   // By RefFrame; -1 and 0 where there is none.
   std::array<int, TOTAL_REFS_PER_FRAME> ref_decode_index{};
@@ -128,6 +131,7 @@ class Parser {
   std::vector<std::size_t> tile_first_block_;
   std::vector<std::size_t> tile_num_blocks_;
   std::vector<std::vector<LocalWarp>> tile_local_warps_;
+  std::vector<char> tile_trailing_bits_valid_;
   std::vector<std::unique_ptr<TileParser>> tile_parsers_;  // one per thread
 };
 

@@ -23,9 +23,14 @@ void TileParser::parse(FrameContext& frame, int tile_row, int tile_col, const st
   cdf_ = frame.cdfs;
   symbols_.init(data, size, header_->disable_cdf_update);
   decode_tile();
-  if (!symbols_.trailing_bits_valid()) {
-    throw BitstreamError("tile does not end with the trailing bits the specification demands");
+  const TrailingBits trailing_bits = symbols_.trailing_bits();
+  if (trailing_bits == TrailingBits::kPastEnd) {
+    throw BitstreamError("tile ends before its last symbol");
   }
+  if (trailing_bits == TrailingBits::kData) {
+    throw BitstreamError("tile goes on after its last symbol");
+  }
+  trailing_bits_valid_ = trailing_bits == TrailingBits::kValid;
 }
 
 // 5.11.2 Decode tile syntax

@@ -11,6 +11,11 @@
 
 namespace colmap_av1::av1 {
 
+// What follows the last symbol of a tile. The specification demands a bit 1 and zeros to the end.
+// Encoders have shipped that wrote something else there, which decoders do not look at. More than
+// a byte or two is no ending, though: then the symbols before were not those that were coded.
+enum class TrailingBits { kValid, kOther, kData, kPastEnd };
+
 // Reads symbols coded with adaptive cumulative distributions.
 //
 // Two representations differ from the text of the specification, with the same results:
@@ -119,20 +124,21 @@ class SymbolDecoder {
   // Whether more bits were taken than a valid tile takes from behind its end (8.2.4).
   bool is_past_end() const { return 8 * (end_ - data_) + available_ - padding_bits_ < -14; }
 
-  // 8.2.4 Exit process for symbol decoder: whether the bits after the last symbol are the
-  // trailing bits that the specification demands.
-  bool trailing_bits_valid() const {
+  // 8.2.4 Exit process for symbol decoder: what the bits after the last symbol are.
+  TrailingBits trailing_bits() const {
     const std::int64_t size_bits = 8 * (end_ - begin_);
     const std::int64_t consumed = 8 * (data_ - begin_) + padding_bits_ - available_;
-    if (size_bits - consumed < -14) return false;
-    const std::int64_t position = consumed - 15;
-    const std::uint8_t* p = begin_ + (position >> 3);
+    if (size_bits - consumed < -14) return TrailingBits::kPastEnd;
+    const std::int64_t position = consumed - 15;  // trailingBitPosition
+    const std::uint8_t* first = begin_ + (position >> 3);
     const unsigned mask = 0xFFU >> (position & 7);
-    if ((*p & mask) != ((mask + 1) >> 1)) return false;
-    for (++p; p < end_; ++p) {
-      if (*p != 0) return false;
+    const std::uint8_t* last = end_;  // behind the last byte that is not 0
+    while (last > first + 1 && last[-1] == 0) --last;
+    if (last == first + 1) {
+      return (*first & mask) == ((mask + 1) >> 1) ? TrailingBits::kValid : TrailingBits::kOther;
     }
-    return true;
+    constexpr std::int64_t kOtherBytes = 2;
+    return last - first <= kOtherBytes ? TrailingBits::kOther : TrailingBits::kData;
   }
 
  private:

@@ -26,6 +26,8 @@ class TileParser {
   // Blocks of the last tile in decoding order.
   std::size_t num_blocks() const { return static_cast<std::size_t>(next_block_ - first_block_); }
   const std::vector<LocalWarp>& local_warps() const { return local_warps_; }
+  // Whether the tile ends with the bits that the specification demands.
+  bool trailing_bits_valid() const { return trailing_bits_valid_; }
   // CDFs after the last symbol (the "Saved" arrays of the exit process, 8.2.4).
   const CdfContext& cdfs() const { return cdf_; }
 
@@ -147,6 +149,7 @@ class TileParser {
   BlockInfo* first_block_ = nullptr;
   BlockInfo* next_block_ = nullptr;
   std::vector<LocalWarp> local_warps_;
+  bool trailing_bits_valid_ = true;
   int current_q_index_ = 0;
   std::array<std::int8_t, FRAME_LF_COUNT> delta_lf_{};
   bool read_deltas_ = false;

@@ -268,6 +268,7 @@ void bind_av1(nb::module_& m) {
       .def_ro("decode_index", &Event::decode_index)
       .def_ro("shown_decode_index", &Event::shown_decode_index)
       .def_ro("temporal_unit", &Event::temporal_unit)
+      .def_ro("num_wrong_trailing_bits", &Event::num_wrong_trailing_bits)
       .def_prop_ro("num_units", [](const Event& e) { return e.header.mi_rows * e.header.mi_cols; })
       .def_prop_ro("is_repeated", [](const Event& e) { return e.header.show_existing_frame; })
       .def_prop_ro(
@@ -297,12 +298,12 @@ void bind_av1(nb::module_& m) {
       .def(
           "__init__",
           [](Parser* self, int operating_point, bool headers_only, bool keep_blocks,
-             int num_threads, std::int64_t max_frame_size) {
+             int num_threads, bool strict, std::int64_t max_frame_size) {
             new (self) Parser(ParserOptions{operating_point, headers_only, keep_blocks, num_threads,
-                                            max_frame_size});
+                                            strict, max_frame_size});
           },
           "operating_point"_a = 0, "headers_only"_a = false, "keep_blocks"_a = false,
-          "num_threads"_a = 1, "max_frame_size"_a = std::int64_t{1} << 28)
+          "num_threads"_a = 1, "strict"_a = false, "max_frame_size"_a = std::int64_t{1} << 28)
       .def(
           "parse",
           [](Parser& self, nb::object data) {
