@@ -240,7 +240,9 @@ def check_rows(report: CheckReport) -> Rows:
         pair = f"widest pair {wide.displacement:.0f} px ({' - '.join(wide.names)})"
         rows.append(("parallax", f"{angle}, {pair}"))
     rows += [(finding.severity, finding.text) for finding in report.findings]
-    rows.append(("for mapping", "good" if report.mappable else "not ready"))
+    warned = any(finding.severity == "warning" for finding in report.findings)
+    ready = "usable, but for the warnings" if warned else "good"
+    rows.append(("for mapping", ready if report.mappable else "not ready"))
     return rows
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.database.contents import (
     Parallax,
@@ -17,9 +16,9 @@ from colmap_av1.database.contents import (
     pairs_with_rows,
     parallax_of,
 )
-from colmap_av1.database.file import check_layout, is_new, open_unaltered
+from colmap_av1.database.file import is_new, open_unaltered
+from colmap_av1.database.finding import Finding
 from colmap_av1.database.findings import (
-    Finding,
     frame_findings,
     image_findings,
     keypoint_findings,
@@ -27,9 +26,11 @@ from colmap_av1.database.findings import (
     orphan_findings,
     pair_findings,
 )
+from colmap_av1.database.findings_values import value_findings
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.two_view_geometry import config_name
+from colmap_av1.util.graphs import connected_components
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,11 @@ class CheckReport:
         """Whether nothing was found that stops the mappers."""
         return all(finding.severity != "error" for finding in self.findings)
 
+    @property
+    def damaged(self) -> bool:
+        """Whether it holds what no program writes, though mappers may work around it."""
+        return any(finding.damage for finding in self.findings)
+
 
 def check(database: str | os.PathLike[str]) -> CheckReport:
     """Read a COLMAP database of any version and say what the mappers will make of it.
@@ -104,7 +110,6 @@ def check(database: str | os.PathLike[str]) -> CheckReport:
         what = "is an empty file" if path.exists() else "no such file"
         raise DatabaseError(f"{path}: {what}: give the path of a COLMAP database")
     with open_unaltered(path) as connection:
-        check_layout(connection, path)
         return _check(connection, path)
 
 
@@ -114,7 +119,10 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     pairs = pairs_with_rows(connection, path, images)
     used = pairs.used
     layout, readers = layout_of(connection)
-    group = _largest_group(len(images.ids), pairs.index[used])
+    group = 0
+    if used.any():
+        connected = connected_components(len(images.ids), pairs.index[used])
+        group = int(np.bincount(connected).max())
     parallax = parallax_of(connection, path, images, pairs, cameras)
     configs = [config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
     sizes = [
@@ -122,6 +130,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     ]
     findings = [
         *image_findings(images, cameras),
+        *value_findings(images, pairs, cameras),
         *frame_findings(connection, images),
         *keypoint_findings(images, pairs),
         *pair_findings(pairs, images),
@@ -151,15 +160,3 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         parallax=parallax,
         findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
     )
-
-
-def _largest_group(num_images: int, edges: NDArray[np.int64]) -> int:
-    if len(edges) == 0:
-        return 0
-    # Slow to import, and nothing else of the package's daily work needs it.
-    from scipy.sparse import coo_array  # noqa: PLC0415
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(num_images, num_images))
-    _, label = connected_components(graph, directed=False)
-    return int(np.bincount(label).max())

@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import columns
-from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
+from colmap_av1.database.layout import columns
+from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row, stored_keypoints
 from colmap_av1.matching.mapper_limits import (
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
@@ -87,7 +87,9 @@ class Pairs:
         spread: float64 [m] how far these displacements differ, in pixels: parallax does that,
             and a turn of the camera much less.
         matched: for each image, bool [k] the keypoints that are inliers of a used pair.
-        num_astray: pairs with matches of keypoints that are not there.
+        num_astray: pairs with matches of keypoints that are not there, verified or not.
+        num_with_itself: pairs of an image with itself.
+        num_swapped: pairs whose first image has the larger id.
         num_foreign: pairs of images that are not listed, but with inliers enough to be used.
     """
 
@@ -100,6 +102,8 @@ class Pairs:
     spread: NDArray[np.float64]
     matched: list[NDArray[np.bool_]]
     num_astray: int
+    num_with_itself: int
+    num_swapped: int
     num_foreign: int
 
     @property
@@ -133,7 +137,7 @@ def images_with_rows(connection: sqlite3.Connection, path: Path) -> Images:
         if image_id in place:
             num_columns[place[image_id]] = row[1]
             if row[0]:
-                keypoints[place[image_id]] = keypoints_from_row(path, image_id, *row)[:, :2]
+                keypoints[place[image_id]] = stored_keypoints(path, image_id, *row)[:, :2]
     if columns(connection, "descriptors"):
         for image_id, count in connection.execute("SELECT image_id, rows FROM descriptors"):
             if image_id in place:
@@ -154,7 +158,13 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
     num_matches = dict(connection.execute("SELECT pair_id, rows FROM matches").fetchall())
     matched = [np.zeros(len(k), dtype=np.bool_) for k in images.keypoints]
     rows: dict[int, tuple[int, int, float, float]] = {}
-    num_astray = 0
+    num_points = [len(k) for k in images.keypoints]
+    astray: set[int] = set()
+    for pair_id, num_rows, data in connection.execute("SELECT pair_id, rows, data FROM matches"):
+        i, j = (place.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
+        found = matches_from_row(path, pair_id, num_rows, data)
+        if min(i, j) >= 0 and len(found) and (found >= [num_points[i], num_points[j]]).any():
+            astray.add(pair_id)
     for pair_id, num_rows, data, config in connection.execute(
         "SELECT pair_id, rows, data, config FROM two_view_geometries"
     ):
@@ -163,8 +173,9 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
         if min(i, j) < 0 or num_rows == 0:
             continue
         inliers = matches_from_row(path, pair_id, num_rows, data)
-        there = (inliers < [len(images.keypoints[i]), len(images.keypoints[j])]).all(axis=1)
-        num_astray += not there.all()
+        there = (inliers < [num_points[i], num_points[j]]).all(axis=1)
+        if not there.all():
+            astray.add(pair_id)
         a, b = inliers[there].T
         if len(a):
             step = images.keypoints[j][b].astype(np.float64) - images.keypoints[i][a]
@@ -189,7 +200,9 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
         displacement=geometry[:, 2],
         spread=geometry[:, 3],
         matched=matched,
-        num_astray=num_astray,
+        num_astray=len(astray),
+        num_with_itself=int(np.count_nonzero(index[listed][:, 0] == index[listed][:, 1])),
+        num_swapped=int(np.count_nonzero(index[listed][:, 0] > index[listed][:, 1])),
         num_foreign=sum(rows.get(int(p), (-1,))[0] >= MIN_INLIERS for p in pair_ids[~listed]),
     )
 

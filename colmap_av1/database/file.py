@@ -1,60 +1,30 @@
-"""The file of a COLMAP database: its layout, opening it, writing all of it or nothing.
+"""The file of a COLMAP database: opening it, writing all of it or nothing.
 
-A new file has the layout of COLMAP 3.8, the oldest still in use: later versions read it and
-migrate it, while older ones refuse what later ones make. SQLite is used directly, because
-opening a file with pycolmap migrates it.
+SQLite is used directly, because opening a file with pycolmap migrates it. A file may come from
+anywhere: it is opened so that nothing in it is run, and read only if it has COLMAP's layout.
 """
 
 from __future__ import annotations
 
 import contextlib
 import glob
+import itertools
 import secrets
 import sqlite3
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from colmap_av1.database.layout import SCHEMA, USER_VERSION, check_layout
 from colmap_av1.errors import DatabaseError, cannot_write
 
-# COLMAP's kMaxNumImages: image ids stay below it, and it spreads pair ids.
-MAX_NUM_IMAGES = 2147483647
-
-_USER_VERSION = 3800
 # Seconds to wait for another writer: one that is only closing a file is soon done.
 _BUSY_TIMEOUT = 2.0
-
-_SCHEMA = (
-    "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, "
-    "model INTEGER NOT NULL, width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, "
-    "prior_focal_length INTEGER NOT NULL)",
-    "CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, "
-    "name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL, "
-    "prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL, "
-    "prior_tx REAL, prior_ty REAL, prior_tz REAL, "
-    f"CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < {MAX_NUM_IMAGES}), "
-    "FOREIGN KEY(camera_id) REFERENCES cameras(camera_id))",
-    "CREATE UNIQUE INDEX index_name ON images(name)",
-    "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB, "
-    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)",
-    "CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB, "
-    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)",
-    "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-    "cols INTEGER NOT NULL, data BLOB)",
-    "CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, "
-    "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, "
-    "F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB)",
-)
-
-# Columns without which a file is not a COLMAP database; others are written where present.
-_REQUIRED_COLUMNS = {
-    "cameras": {"camera_id", "model", "width", "height", "params", "prior_focal_length"},
-    "images": {"image_id", "name", "camera_id"},
-    "keypoints": {"image_id", "rows", "cols", "data"},
-    "matches": {"pair_id", "rows", "cols", "data"},
-    "two_view_geometries": {"pair_id", "rows", "cols", "data", "config"},
-}
+# Instructions of SQLite's virtual machine that reading a file may take: so many, and so many for
+# each of its bytes, of which `check` takes 3 where all rows are empty and less elsewhere. Only
+# pages that refer to each other over and over take more.
+_BUDGET, _BUDGET_PER_BYTE = 2_000_000, 20
+_BUDGET_STEP = 10_000
 
 
 def is_new(path: Path) -> bool:
@@ -70,9 +40,8 @@ def is_new(path: Path) -> bool:
         return False
     if not target.parent.is_dir():
         raise DatabaseError(f"{path}: the folder does not exist: make it first")
-    for suffix in ("-journal", "-wal"):
+    for leftover in _logs(path):
         # SQLite would replay such a file into whatever database appears beside it.
-        leftover = path.with_name(path.name + suffix)
         if leftover.exists():
             raise DatabaseError(f"{leftover} is left from another database: remove it first")
     return True
@@ -91,25 +60,27 @@ def _target(path: Path) -> Path:
         raise DatabaseError(f"{path} is a link that leads nowhere: give another path") from error
 
 
-def open_database(
-    path: Path, named: Path | None = None
-) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Open an existing file, to read or write it, and close it at the end.
+def open_database(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
+    """Open an existing COLMAP database and close it at the end.
 
-    Args:
-        path: file to open.
-        named: path that messages name, where it differs.
+    Raises:
+        DatabaseError: it is no COLMAP database, is damaged, or SQLite fails in the body.
     """
-    return _connect(path, "mode=rw", named if named is not None else path)
+    return _open_checked(path, "mode=rw")
 
 
 def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Open an existing file to read it, without leaving a trace in it or beside it."""
+    """As `open_database`, to read it without leaving a trace in it or beside it."""
     # Without a log beside it the file is all there is, and SQLite needs no lock of its own.
-    target = _target(path)
-    logs = [target.with_name(target.name + end) for end in ("-journal", "-wal")]
-    busy = any(log.exists() and log.stat().st_size > 0 for log in logs)
-    return _connect(path, "mode=ro" if busy else "mode=ro&immutable=1", path)
+    busy = any(log.exists() and log.stat().st_size > 0 for log in _logs(_target(path)))
+    return _open_checked(path, "mode=ro" if busy else "mode=ro&immutable=1")
+
+
+@contextlib.contextmanager
+def _open_checked(path: Path, how: str) -> Iterator[sqlite3.Connection]:
+    with _connect(path, how, path) as connection:
+        check_layout(connection, path)
+        yield connection
 
 
 def copy_database(path: Path, copy: Path) -> None:
@@ -126,21 +97,50 @@ def copy_database(path: Path, copy: Path) -> None:
         source.backup(target)
 
 
+def _logs(target: Path) -> list[Path]:
+    return [target.with_name(target.name + end) for end in ("-journal", "-wal")]
+
+
 @contextlib.contextmanager
 def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
     """Open a file with the given parameters of SQLite's URI; its errors become ours."""
+    target = _target(path)
     try:
         with contextlib.closing(
             sqlite3.connect(
-                f"{_target(path).as_uri()}?{how}",
+                f"{target.as_uri()}?{how}",
                 uri=True,
                 timeout=_BUSY_TIMEOUT,
                 isolation_level=None,
             )
         ) as connection:
+            _run_nothing(connection)
+            _bound_reading(connection, target)
             yield connection
     except sqlite3.Error as error:
         raise DatabaseError(_explain(named, error, reading="mode=ro" in how)) from error
+
+
+def _run_nothing(connection: sqlite3.Connection) -> None:
+    """Let SQLite run nothing that the file's layout asks for; where it can, no triggers and views.
+
+    What it cannot forbid, `check_layout` refuses.
+    """
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
+    if sys.version_info >= (3, 12):
+        connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
+        connection.setconfig(sqlite3.SQLITE_DBCONFIG_ENABLE_TRIGGER, False)
+        connection.setconfig(sqlite3.SQLITE_DBCONFIG_ENABLE_VIEW, False)
+
+
+def _bound_reading(connection: sqlite3.Connection, target: Path) -> None:
+    """End what takes longer than a sound file can: SQLite then says that it was interrupted."""
+    size = sum(file.stat().st_size for file in (target, *_logs(target)) if file.exists())
+    steps = (_BUDGET + _BUDGET_PER_BYTE * size) // _BUDGET_STEP
+    # No Python runs in this, so signals wait for the statement's end: here they would be lost.
+    ends = itertools.chain(itertools.repeat(0, steps), itertools.repeat(1))
+    connection.set_progress_handler(ends.__next__, _BUDGET_STEP)
 
 
 def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
@@ -153,6 +153,8 @@ def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
     causes = {
         "locked": "it is in use by another process: wait until that is done, or end it",
         "busy": "it is in use by another process: wait until that is done, or end it",
+        "interrupted": "it is damaged, reading it comes to no end: restore it from a copy",
+        "decode": "it has text that is not UTF-8: rename its images so, or give another path",
         "not a database": "it is not a COLMAP database: give another path",
         "malformed": "it is damaged: restore it from a copy, or give another path",
         "full": "the disk is full: free some space",
@@ -173,15 +175,16 @@ def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
     partial = target.with_name(f".{target.name}.{secrets.token_hex(8)}.partial")
     try:
         partial.touch(exist_ok=False)
-        with open_database(partial, named=path) as connection:
+        with _connect(partial, "mode=rw", path) as connection:
+            connection.set_progress_handler(None, 0)  # there is nothing to read yet
             # The file is thrown away on any failure: nothing needs to be rolled back.
             connection.execute("PRAGMA journal_mode = OFF")
             connection.execute("BEGIN EXCLUSIVE")
             if not partial.exists():  # taken for a leftover before it was locked
                 raise DatabaseError(f"{path} is made by another process: run again")
-            for statement in _SCHEMA:
+            for statement in SCHEMA:
                 connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {_USER_VERSION}")
+            connection.execute(f"PRAGMA user_version = {USER_VERSION}")
             fill(connection)
             connection.execute("COMMIT")
         if not is_new(path):
@@ -217,34 +220,14 @@ def _remove_leftovers(target: Path) -> None:
 
 def write_existing(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
     """Add to a database in one transaction."""
-    with open_database(path) as connection:
+    with _connect(path, "mode=rw", path) as connection:
         connection.execute("BEGIN IMMEDIATE")
         try:
             check_layout(connection, path)
+            connection.set_progress_handler(None, 0)  # what is written has no bound
             fill(connection)
             connection.execute("COMMIT")
         except BaseException:
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
             raise
-
-
-def columns(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Names of a table's columns; none where the file has no such table."""
-    return {row[1] for row in connection.execute(f"PRAGMA table_info({table})")}
-
-
-def has_rows(connection: sqlite3.Connection, table: str) -> bool:
-    """Whether a table of the file has any row."""
-    return connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None
-
-
-def check_layout(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse a file that is not a COLMAP database."""
-    for table, required in _REQUIRED_COLUMNS.items():
-        missing = required - columns(connection, table)
-        if missing:
-            what = "table" if missing == required else f"{sorted(missing)[0]!r} in table"
-            raise DatabaseError(
-                f"{path}: it is not a COLMAP database (no {what} {table!r}): give another path"
-            )

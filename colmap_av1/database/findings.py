@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator
 
 import numpy as np
 import pycolmap
 
 from colmap_av1.database.contents import Images, Pairs, Parallax
-from colmap_av1.database.file import columns
+from colmap_av1.database.finding import Finding, some
+from colmap_av1.database.layout import columns
 from colmap_av1.matching.mapper_limits import (
     INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
@@ -22,21 +21,6 @@ from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
 
 # Share of keypoints without a match that is worth a line.
 _NOTED_SHARE = 0.01
-Severity = Literal["error", "warning", "note"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One finding in a database that matters for mapping it.
-
-    Attributes:
-        severity: "error": mappers stop or find nothing; "warning": a part is lost, or some
-            program stops; "note": nothing is wrong.
-        text: one line.
-    """
-
-    severity: Severity
-    text: str
 
 
 def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
@@ -46,7 +30,7 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
         return
     lost = [n for n, c in zip(images.names, images.camera_ids, strict=True) if c not in cameras]
     if lost:
-        yield Finding("error", f"{_some(lost, 'image')} without a camera: the mappers stop")
+        yield Finding("error", f"{some(lost, 'image')} without a camera: the mappers stop")
     unknown = sum(not camera.has_prior_focal_length for camera in cameras.values())
     if unknown:
         yield Finding(
@@ -80,7 +64,7 @@ def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[F
         if bare:
             yield Finding(
                 "error",
-                f"{_some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
+                f"{some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
                 "3.12 on stop; 'colmap-av1 match' completes the frames",
             )
     elif rigs and any(rigs.get(camera_id) != camera_id for camera_id in images.camera_ids):
@@ -98,17 +82,18 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     bare = [n for n, c, p in zip(images.names, counts, in_pair, strict=True) if p and not c]
     if bare:
         yield Finding(
-            "error", f"{_some(bare, 'image')} with matches but without keypoints: most mappers stop"
+            "error", f"{some(bare, 'image')} with matches but without keypoints: most mappers stop"
         )
     elif pairs.num_astray:
         yield Finding(
             "warning",
             f"{pairs.num_astray} pairs match keypoints that are not there: mappers leave such "
-            "matches out",
+            "matches out, and the others may be of other keypoints too",
+            damage=True,
         )
     empty = [n for n, c in zip(images.names, counts, strict=True) if not c]
     if empty and not bare:
-        yield Finding("warning", f"{_some(empty, 'image')} without keypoints")
+        yield Finding("warning", f"{some(empty, 'image')} without keypoints")
     uneven = [
         name
         for name, count, described in zip(images.names, counts, images.num_descriptors, strict=True)
@@ -117,7 +102,7 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     if uneven:
         yield Finding(
             "warning",
-            f"{_some(uneven, 'image')} with another number of descriptors than of keypoints: "
+            f"{some(uneven, 'image')} with another number of descriptors than of keypoints: "
             "guided matching and vocabulary trees stop, mappers ignore it",
         )
     total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)
@@ -237,9 +222,3 @@ def orphan_findings(connection: sqlite3.Connection, pairs: Pairs) -> Iterator[Fi
         ).fetchone()
         if count:
             yield Finding("note", f"{count} rows of '{table}' belong to no image")
-
-
-def _some(names: Sequence[str], what: str) -> str:
-    """A count and an example, such as "3 images (a.png, ...)"."""
-    plural = "s" if len(names) > 1 else ""
-    return f"{len(names)} {what}{plural} ({names[0]}{', ...' if plural else ''})"

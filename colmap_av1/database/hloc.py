@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import check_layout, is_new, open_unaltered
+from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
 from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
 from colmap_av1.options import ExportOptions
@@ -103,7 +103,6 @@ def export_hloc(
     files = [folder / name for name in (FEATURES, MATCHES, PAIRS)]
     check_files(files, [path], is_own=_is_own, overwrite=overwrite)
     with open_unaltered(path) as connection:
-        check_layout(connection, path)
         names = dict(connection.execute("SELECT image_id, name FROM images").fetchall())
         _check_names(path, sorted(names.values()))
         with _complete_files(folder) as (features, matches, pairs):

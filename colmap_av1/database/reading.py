@@ -11,12 +11,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import MAX_NUM_IMAGES, check_layout, is_new, open_database
+from colmap_av1.database.file import is_new, open_database
+from colmap_av1.database.layout import MAX_NUM_IMAGES
 from colmap_av1.errors import DatabaseError
 
 # A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
 # or a 2x2 affine shape.
 SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
+# Sides of an image in pixels that no camera and no image format has.
+_LONGEST_SIDE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,6 @@ def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
     if is_new(path):
         return []
     with open_database(path) as connection:
-        check_layout(connection, path)
         rows = connection.execute(
             "SELECT image_id, name, camera_id, COALESCE(width, 0), COALESCE(height, 0), "
             "COALESCE(keypoints.rows, 0) FROM images LEFT JOIN cameras USING (camera_id) "
@@ -93,18 +95,26 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
 
     Raises:
         DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a
-            camera of a model that the installed pycolmap does not know.
+            camera of a model that the installed pycolmap does not know, or that is none.
     """
     path = Path(database)
     if is_new(path):
         return {}
     with open_database(path) as connection:
-        check_layout(connection, path)
-        return cameras_of(connection, path)
+        cameras = cameras_of(connection, path)
+    for camera_id, camera in cameras.items():
+        fault = camera_fault(camera)
+        if fault:
+            raise DatabaseError(f"{path}: camera {camera_id} has {fault}: import the images again")
+    return cameras
 
 
 def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap.Camera]:
-    """Cameras of an open database, by id; see `read_cameras`."""
+    """Cameras of an open database, by id, whatever their sizes and parameters are.
+
+    Raises:
+        DatabaseError: a camera is of a model that the installed pycolmap does not know.
+    """
     rows = connection.execute(
         "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras "
         "ORDER BY camera_id"
@@ -112,21 +122,33 @@ def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap
     models = {int(model.value): model for model in pycolmap.CameraModelId.__members__.values()}
     cameras = {}
     for camera_id, model, width, height, params, prior in rows:
+        data = params or b""
         camera = pycolmap.Camera(
             camera_id=camera_id,
             model=models.get(model, pycolmap.CameraModelId.INVALID),
             width=width,
             height=height,
-            params=np.frombuffer(params or b"", dtype="<f8"),
+            params=np.frombuffer(data[: len(data) // 8 * 8], dtype="<f8"),
         )
-        if model not in models or not camera.verify_params():
+        if model not in models or len(data) % 8 or not camera.verify_params():
             raise DatabaseError(
-                f"{path}: camera {camera_id} has model {model} with {len(camera.params)} "
-                "parameters, which pycolmap does not know: update pycolmap"
+                f"{path}: camera {camera_id} has model {model} with parameters of {len(data)} "
+                "bytes, which pycolmap does not know: update pycolmap, or import the images again"
             )
         camera.has_prior_focal_length = bool(prior)
         cameras[camera_id] = camera
     return cameras
+
+
+def camera_fault(camera: pycolmap.Camera) -> str | None:
+    """What makes a camera none, in words that follow "has"; None where nothing does."""
+    if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
+        return f"a size of {camera.width}x{camera.height}"
+    if not np.isfinite(camera.params).all():
+        return "parameters that are not numbers"
+    if any(camera.params[i] <= 0 for i in camera.focal_length_idxs()):
+        return "a focal length of 0 or less"
+    return None
 
 
 def keypoints_from_row(
@@ -135,8 +157,21 @@ def keypoints_from_row(
     """Decode a row of keypoints: float32 [n, 2, 4 or 6], x and y first.
 
     Raises:
-        DatabaseError: the row contradicts itself.
+        DatabaseError: the row contradicts itself, or a keypoint's place is not a number.
     """
+    keypoints = stored_keypoints(path, image_id, num_rows, num_cols, data)
+    if not np.isfinite(keypoints[:, :2]).all():
+        raise DatabaseError(
+            f"{path}: image {image_id} has keypoints that are not numbers: "
+            "'colmap-av1 check' says what else is wrong"
+        )
+    return keypoints
+
+
+def stored_keypoints(
+    path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
+) -> NDArray[np.float32]:
+    """As `keypoints_from_row`, but places may be anything."""
     if num_cols not in SHAPES or len(data or b"") != 4 * num_rows * num_cols:
         raise DatabaseError(
             f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "

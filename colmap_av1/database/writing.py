@@ -12,7 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import columns, has_rows, is_new, write_existing, write_new
+from colmap_av1.database.file import is_new, write_existing, write_new
+from colmap_av1.database.layout import columns, has_rows
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.database.writing_frames import complete_frames
 from colmap_av1.database.writing_keypoints import append_keypoints

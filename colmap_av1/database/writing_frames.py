@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from pathlib import Path
 
-from colmap_av1.database.file import columns, has_rows
+from colmap_av1.database.layout import columns, has_rows
 from colmap_av1.errors import DatabaseError
 
 # COLMAP's SensorType of a camera.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import columns
+from colmap_av1.database.layout import columns
 from colmap_av1.database.reading import SHAPES, keypoints_from_row
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.pairs import ImageKeypoints

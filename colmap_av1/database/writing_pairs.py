@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import columns
+from colmap_av1.database.layout import columns
 from colmap_av1.database.reading import matches_from_row, pair_id_from_image_ids
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 

@@ -143,11 +143,22 @@ def image_file(root: Path, name: str) -> Path:
     """The file of an image in a folder.
 
     Raises:
-        ImageError: the name leads out of the folder.
+        ImageError: the name leads out of the folder, or is none that a file can have.
+    """
+    check_name(name)
+    return root / name
+
+
+def check_name(name: str) -> None:
+    """Check that an image's name, its path within the image folder, is that of a file in it.
+
+    Raises:
+        ImageError: it leads out of the folder, or is none that a file can have.
     """
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
         raise ImageError(
-            f"image '{name}' lies outside the image folder: give names within the folder"
+            f"image {name!r} lies outside the image folder: give names within the folder"
         )
-    return root / name
+    if not parts.parts or "\0" in name:
+        raise ImageError(f"image {name!r} has a name that no file can have: name it otherwise")

@@ -15,6 +15,7 @@ from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.graphs import connected_components
 
 # A feature within this many pixels of a track's keypoint is the same keypoint.
 _JOIN_DISTANCE = 1.0
@@ -115,14 +116,10 @@ def _both(
 
 def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
     """Number of the group of images that pairs connect, for each image: int32 [num_images]."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - slow to import
-
     used = [len(geometry.inlier_matches) >= MIN_INLIERS for geometry in matched.geometries]
-    i, j = matched.pairs[np.array(used, dtype=np.bool_)].T
-    count = len(matched.keypoints)
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), (count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    return connected_components(
+        len(matched.keypoints), matched.pairs[np.array(used, dtype=np.bool_)]
+    )
 
 
 def links_as_tracks(
@@ -133,9 +130,6 @@ def links_as_tracks(
     size: tuple[int, int],
 ) -> Tracks:
     """The links as tracks: features that are joined by links; those seen twice in a frame go."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - slow to import
-
     images = sorted(features)
     counts = [len(features[i].xy) for i in images]
     first = dict(zip(images, np.concatenate([[0], np.cumsum(counts)])[:-1].tolist(), strict=True))
@@ -146,9 +140,7 @@ def links_as_tracks(
     ]
     if not ends:
         return no_tracks(num_frames, size)
-    edges = np.concatenate(ends)
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), (total, total))
-    _, label = connected_components(graph, directed=False)
+    label = connected_components(total, np.concatenate(ends))
     frame = np.repeat(frames[images], counts)
     size_of = np.bincount(label, minlength=label.max() + 1)
     order = np.lexsort((frame, label))

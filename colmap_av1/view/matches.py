@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import check_layout, open_unaltered
+from colmap_av1.database.file import open_unaltered
 from colmap_av1.database.reading import (
     image_ids_from_pair_id,
     keypoints_from_row,
@@ -66,7 +66,6 @@ def _read_pair(
 ) -> tuple[tuple[str, str], list[NDArray[np.float32]], NDArray[np.uint32]]:
     """Names of a pair, keypoints [n, 2] of both images, and matches [m, 2] between them."""
     with open_unaltered(path) as connection:
-        check_layout(connection, path)
         images = dict(connection.execute("SELECT name, image_id FROM images").fetchall())
         if pair is None:
             row = connection.execute(
@@ -90,6 +89,10 @@ def _read_pair(
                 matches = matches_from_row(path, pair_id, *row)
                 break
         name_of = {image_id: name for name, image_id in images.items()}
+        if not {*ids} <= name_of.keys():
+            raise DatabaseError(
+                f"{path}: has matches of images that it does not list: give a pair that it lists"
+            )
         names = (name_of[ids[0]], name_of[ids[1]])
         if len(matches) == 0:
             raise DatabaseError(

@@ -38,7 +38,8 @@ def add_check(commands: Any) -> None:
     command.add_argument(
         "--strict",
         action="store_true",
-        help="exit with status 1 if the mappers cannot use the database, or the model bends",
+        help="exit with status 1 if the mappers cannot use the database, it is damaged, or the model "
+        "bends",
     )
     add_quiet(command)
 
@@ -52,7 +53,7 @@ def _run(namespace: argparse.Namespace) -> int:
     if namespace.database is not None:
         result = check(namespace.database)
         print_result(namespace, check_rows(result))
-        good = result.mappable
+        good = result.mappable and not result.damaged
     if namespace.model is not None:
         good = _check_model(namespace) and good
     return 0 if good or not namespace.strict else _FAILED_CHECK

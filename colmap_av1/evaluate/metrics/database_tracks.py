@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import numpy as np
+from numpy.typing import NDArray
 
+from colmap_av1.database.file import open_unaltered
+from colmap_av1.database.reading import (
+    image_ids_from_pair_id,
+    keypoints_from_row,
+    matches_from_row,
+)
 from colmap_av1.errors import DatabaseError
 from colmap_av1.evaluate.metrics.sequence import frame_number
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.graphs import connected_components
 
 
 def database_tracks(database: Path, num_frames: int) -> Tracks:
@@ -30,34 +33,20 @@ def database_tracks(database: Path, num_frames: int) -> Tracks:
         Tracks of two observations or more. The expected error is not known: NaN.
 
     Raises:
-        DatabaseError: the images differ in size, or there is none.
+        DatabaseError: it is no COLMAP database, is damaged, or its images differ in size, or there
+            is none.
         ImageError: an image's name holds no frame number.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        # pycolmap brings a database to its own layout.
-        copy = Path(folder) / database.name
-        shutil.copyfile(database, copy)
-        with pycolmap.Database.open(copy) as rows:
-            images = rows.read_all_images()
-            sizes = {(c.width, c.height) for c in rows.read_all_cameras()}
-            keypoints = [np.asarray(rows.read_keypoints(i.image_id))[:, :2] for i in images]
-            pair_ids, geometries = rows.read_two_view_geometries()
+    names, sizes, keypoints, edge = _read(database)
     if len(sizes) != 1:
         raise DatabaseError(
             f"{database}: holds images of {len(sizes)} sizes: give a database of one video"
         )
-    start = np.concatenate([[0], np.cumsum([len(k) for k in keypoints])])
-    row_of = {image.image_id: start[i] for i, image in enumerate(images)}
-    ends = [np.empty((0, 2), dtype=np.int64)]
-    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair_id)
-        matches = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
-        ends.append(matches + np.array([row_of[a], row_of[b]]))
-    edge = np.concatenate(ends)
-    count = int(start[-1])
-    graph = coo_array((np.ones(len(edge), dtype=np.int8), edge.T), shape=(count, count))
-    _, track = connected_components(graph, directed=False)
-    frame = np.repeat([frame_number(i.name) for i in images], np.diff(start)).astype(np.int32)
+    count = sum(map(len, keypoints))
+    track = connected_components(count, edge)
+    frame = np.repeat([frame_number(n) for n in names], [len(k) for k in keypoints]).astype(
+        np.int32
+    )
 
     _, place, seen = np.unique(
         track.astype(np.int64) * num_frames + frame, return_inverse=True, return_counts=True
@@ -78,3 +67,33 @@ def database_tracks(database: Path, num_frames: int) -> Tracks:
         sigma=np.full(len(row), np.nan, dtype=np.float32),
         confirmed=np.zeros(len(row), dtype=bool),
     )
+
+
+def _read(
+    database: Path,
+) -> tuple[list[str], set[tuple[int, int]], list[NDArray[np.float32]], NDArray[np.int64]]:
+    """Names, sizes of cameras, keypoints [n, 2] of each image, and inliers between all of them."""
+    with open_unaltered(database) as connection:
+        images = dict(connection.execute("SELECT image_id, name FROM images ORDER BY image_id"))
+        sizes = set(connection.execute("SELECT width, height FROM cameras").fetchall())
+        keypoints = {i: np.empty((0, 2), dtype=np.float32) for i in images}
+        for image_id, *row in connection.execute(
+            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
+        ):
+            if image_id in images:
+                keypoints[image_id] = keypoints_from_row(database, image_id, *row)[:, :2]
+        first = dict(zip(images, np.cumsum([0, *map(len, keypoints.values())]), strict=False))
+        edges = [np.empty((0, 2), dtype=np.int64)]
+        for pair_id, *row in connection.execute(
+            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+        ):
+            a, b = image_ids_from_pair_id(pair_id)
+            inliers = matches_from_row(database, pair_id, *row).astype(np.int64)
+            counts = [len(keypoints[i]) if i in images else 0 for i in (a, b)]
+            if (inliers >= counts).any():
+                raise DatabaseError(
+                    f"{database}: images {a} and {b} match keypoints that are not there: "
+                    "'colmap-av1 check' says what else is wrong"
+                )
+            edges.append(inliers + np.array([first[a], first[b]]))
+    return list(images.values()), sizes, list(keypoints.values()), np.concatenate(edges)

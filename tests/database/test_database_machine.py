@@ -1,0 +1,215 @@
+"""Random COLMAP databases under random damage: no trace, and no failure alters the file.
+
+COLMAP_AV1_EXAMPLES sets how many sequences of steps are tried.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from existing_database import CAMERA, LAYOUTS, make_layout, query
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from colmap_av1.database.check import check
+from colmap_av1.database.file import copy_database
+from colmap_av1.database.hloc import export_hloc
+from colmap_av1.database.reading import read_cameras, read_images
+from colmap_av1.database.writing import write_matches
+from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.evaluate import database_tracks
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.view import view_database
+
+NAMES = ["f0.png", "f1.png", "f2.png"]
+NUM_KEYPOINTS = 20
+# CPU time of one step in seconds.
+LIMIT = 2.0
+TABLES = {
+    "cameras": ("camera_id", "model", "width", "height", "params", "prior_focal_length"),
+    "images": ("image_id", "name", "camera_id"),
+    "keypoints": ("image_id", "rows", "cols", "data"),
+    "descriptors": ("image_id", "rows", "cols", "data"),
+    "matches": ("pair_id", "rows", "cols", "data"),
+    "two_view_geometries": ("pair_id", "rows", "cols", "data", "config", "F", "E", "H"),
+    "rigs": ("rig_id", "ref_sensor_id", "ref_sensor_type"),
+    "frames": ("frame_id", "rig_id"),
+    "frame_data": ("frame_id", "data_id", "sensor_id", "sensor_type"),
+}
+COLUMNS = [(table, column) for table, names in TABLES.items() for column in names]
+VALUES = (
+    st.none()
+    | st.sampled_from([0, 1, 2, 3, 4, 6, 7, 77, 2147483647, 2147483649, 1 << 40, -1, -(1 << 63)])
+    | st.integers(-(1 << 63), (1 << 63) - 1)
+    | st.floats()
+    | st.binary(max_size=80)
+    | st.sampled_from([NAMES[0], "", "../x.png", "/x.png", "a\0b", "a b.png", "\ud7ff", "1", "-1"])
+    | st.text(max_size=8)
+)
+LAYOUT_CHANGES = st.sampled_from(
+    [
+        *(f"DROP TABLE {table}" for table in TABLES),
+        *(f"ALTER TABLE {table} RENAME TO other" for table in TABLES),
+        *(f"ALTER TABLE {t} RENAME COLUMN {c} TO other" for t, c in COLUMNS),
+        *(
+            f"CREATE TRIGGER t_{t} AFTER INSERT ON {t} BEGIN DELETE FROM images; END"
+            for t in TABLES
+        ),
+        *(
+            f"CREATE VIEW {table} AS WITH RECURSIVE n({', '.join(names)}) AS (SELECT "
+            f"{', '.join('1' for _ in names)} UNION ALL SELECT {', '.join(names)} FROM n) "
+            "SELECT * FROM n"
+            for table, names in TABLES.items()
+        ),
+        "DROP INDEX index_name",
+        "CREATE INDEX more ON keypoints(rows + randomblob(9))",
+        "PRAGMA encoding = 'UTF-16'",
+        "PRAGMA user_version = -1",
+        "PRAGMA journal_mode = WAL",
+        "VACUUM",
+        "DELETE FROM images",
+        "DELETE FROM cameras",
+        "DELETE FROM keypoints",
+    ]
+)
+
+
+def new_rows(seed: int) -> dict[str, Any]:
+    """Keypoints and matches of the three images."""
+    rng = np.random.default_rng(seed)
+    keypoints = [
+        ImageKeypoints(
+            frame=frame,
+            xy=rng.uniform(0, 100, (NUM_KEYPOINTS, 2)).astype(np.float32),
+            track=np.arange(NUM_KEYPOINTS, dtype=np.int64),
+        )
+        for frame in range(len(NAMES))
+    ]
+    matches = np.repeat(np.arange(NUM_KEYPOINTS, dtype=np.uint32)[:, None], 2, axis=1)
+    geometry = TwoViewGeometry(
+        config=TwoViewConfig.CALIBRATED, inlier_matches=matches, E=rng.normal(size=(3, 3))
+    )
+    pairs = np.array([[0, 1], [0, 2], [1, 2]], dtype=np.int32)
+    return {
+        "keypoints": keypoints,
+        "pairs": pairs,
+        "matches": [matches] * len(pairs),
+        "geometries": [geometry] * len(pairs),
+    }
+
+
+class Databases(RuleBasedStateMachine):
+    """A database that is written, damaged, and read by everything that reads one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp())
+        self.path = self.folder / "a.db"
+        self.seed = 0
+
+    def teardown(self) -> None:
+        shutil.rmtree(self.folder)
+
+    def attempt(self, run: Callable[[], object], *, writes: bool = False) -> None:
+        """Run something: it works, or fails in one line and leaves the file as it was."""
+        before = self.path.read_bytes()
+        start = time.process_time()
+        message = None
+        try:
+            run()
+        except ColmapAv1Error as error:
+            message = str(error)
+        assert time.process_time() - start < LIMIT
+        assert "\n" not in (message or "")
+        if message is not None or not writes:
+            assert self.path.read_bytes() == before
+
+    @initialize(layout=st.sampled_from(LAYOUTS), fills=st.booleans())
+    def make(self, layout: str, fills: bool) -> None:
+        make_layout(self.path, layout)
+        query(self.path, "PRAGMA journal_mode = DELETE")
+        if fills:
+            write_matches(self.path, NAMES, CAMERA, **new_rows(0))
+
+    @rule(mode=st.sampled_from(["error", "append", "replace"]))
+    def write(self, mode: Any) -> None:
+        self.seed += 1
+        rows = new_rows(self.seed)
+        self.attempt(
+            lambda: write_matches(self.path, NAMES, CAMERA, **rows, on_existing=mode), writes=True
+        )
+
+    @rule(where=st.sampled_from(COLUMNS), value=VALUES, which=st.integers(0, 2))
+    def change_value(self, where: tuple[str, str], value: object, which: int) -> None:
+        table, column = where
+        key = TABLES[table][0]
+        self.execute(
+            f"UPDATE OR REPLACE {table} SET {column} = ? WHERE {key} = "
+            f"(SELECT {key} FROM {table} LIMIT 1 OFFSET ?)",
+            value,
+            which,
+        )
+
+    @rule(change=LAYOUT_CHANGES)
+    def change_layout(self, change: str) -> None:
+        self.execute(change)
+
+    def execute(self, sql: str, *values: object) -> None:
+        with (
+            suppress(sqlite3.Error, UnicodeError),
+            closing(sqlite3.connect(self.path, isolation_level=None)) as connection,
+        ):
+            connection.execute(sql, values)
+
+    @rule(
+        places=st.lists(
+            st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)),
+            min_size=1,
+            max_size=4,
+        ),
+        at_start=st.booleans(),
+    )
+    def change_bytes(self, places: list[tuple[float, int]], at_start: bool) -> None:
+        data = bytearray(self.path.read_bytes())
+        for place, value in places if data else ():
+            # Half of them where the layout is.
+            data[int(place * (min(4096, len(data)) if at_start else len(data)))] = value
+        self.path.write_bytes(data)
+
+    @rule(share=st.floats(0, 1))
+    def cut_off(self, share: float) -> None:
+        os.truncate(self.path, int(share * self.path.stat().st_size))
+
+    @invariant()
+    def everything_reads_it(self) -> None:
+        if not self.path.exists():  # before it is made
+            return
+        self.attempt(lambda: check(self.path))
+        self.attempt(lambda: read_images(self.path))
+        self.attempt(lambda: read_cameras(self.path))
+        self.attempt(lambda: export_hloc(self.path, self.folder / "hloc"))
+        self.attempt(lambda: view_database(self.path, self.folder))
+        self.attempt(lambda: database_tracks(self.path, len(NAMES)))
+        (self.folder / "copy.db").unlink(missing_ok=True)
+        self.attempt(lambda: copy_database(self.path, self.folder / "copy.db"))
+
+
+Databases.TestCase.settings = settings(
+    max_examples=int(os.environ.get("COLMAP_AV1_EXAMPLES", "60")),
+    stateful_step_count=8,
+    deadline=None,
+    print_blob=True,
+    suppress_health_check=list(HealthCheck),
+)
+TestDatabases = Databases.TestCase

@@ -1,0 +1,386 @@
+"""Databases that no COLMAP wrote: one line within a second, and the file stays as it is."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+import struct
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from existing_database import (
+    CAMERA,
+    LAYOUTS,
+    NAMES,
+    NUM_IMAGES,
+    OURS,
+    alter,
+    make_existing,
+    make_layout,
+    sift_keypoints,
+)
+
+from colmap_av1.cli import main
+from colmap_av1.database.check import check
+from colmap_av1.database.file import copy_database
+from colmap_av1.database.hloc import export_hloc
+from colmap_av1.database.reading import read_cameras, read_images
+from colmap_av1.database.writing import write_matches
+from colmap_av1.errors import ColmapAv1Error, DatabaseError
+from colmap_av1.evaluate import database_tracks
+from colmap_av1.view import view_database
+
+PAIR = 2147483647 * 3 + 4
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A small database with images, keypoints and matches, in one file."""
+    path = tmp_path_factory.mktemp("sound") / "a.db"
+    make_existing(path, "3.8", "sift")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    return path.read_bytes()
+
+
+def in_layout(path: Path, change: str) -> None:
+    """Change the text of the layout, which no command of SQL would take."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute(change)
+
+
+def never_ending_pages(path: Path) -> None:
+    """Pages of a table's tree that each refer to the next one many times: 70 ** 18 rows."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        (root,) = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'matches'"
+        ).fetchone()
+        (size,) = connection.execute("PRAGMA page_size").fetchone()
+    data = bytearray(path.read_bytes())
+    leaf = root
+
+    def page(child: int) -> bytes:
+        # 1.6 B-tree pages of SQLite's file format: an interior page of a table
+        cells = [struct.pack(">IB", child, key) for key in range(1, 70)]
+        starts = [size - 5 * (i + 1) for i in range(len(cells))]
+        head = struct.pack(">BHHHBI", 5, 0, len(cells), starts[-1], 0, child)
+        head += b"".join(struct.pack(">H", start) for start in starts)
+        return head.ljust(starts[-1], b"\0") + b"".join(reversed(cells))
+
+    count = len(data) // size
+    leaf = count + 1
+    data += data[(root - 1) * size : root * size]  # the rows, in a page of their own
+    for child in range(leaf, leaf + 16):
+        data += page(child)
+    data[(root - 1) * size : root * size] = page(leaf + 16)
+    struct.pack_into(">I", data, 28, len(data) // size)
+    path.write_bytes(data)
+
+
+ENDLESS = (
+    "CREATE VIEW {0} AS WITH RECURSIVE n({1}) AS (SELECT 1, 1, 2, X'0000000000000000' UNION ALL "
+    "SELECT {2} + 1, rows, cols, data FROM n) SELECT * FROM n"
+)
+SQL = {
+    "layout not in UTF-8": (
+        [
+            "PRAGMA writable_schema = ON",
+            "UPDATE sqlite_master SET sql = CAST(REPLACE(CAST(sql AS BLOB), 'params', X'FF6172') "
+            "AS TEXT) WHERE name = 'cameras'",
+        ],
+        "not UTF-8|layout is damaged|not a COLMAP database",
+    ),
+    "layout no SQL": (
+        [
+            "PRAGMA writable_schema = ON",
+            "UPDATE sqlite_master SET sql = CAST(X'FFFEFD' AS TEXT) WHERE name = 'cameras'",
+        ],
+        "damaged",
+    ),
+    "name not in UTF-8": (
+        ["UPDATE images SET name = CAST(X'FF2E706E67' AS TEXT) WHERE image_id = 1"],
+        "not UTF-8",
+    ),
+    "name a blob": (
+        ["UPDATE images SET name = X'612E706E67' WHERE image_id = 1"],
+        "'images' is damaged ('name' of row '1'",
+    ),
+    "name a number": (
+        [
+            "CREATE TABLE other AS SELECT * FROM images",
+            "DROP TABLE images",
+            "CREATE TABLE images (image_id INTEGER PRIMARY KEY, name, camera_id INTEGER)",
+            "INSERT INTO images SELECT image_id, image_id, camera_id FROM other",
+        ],
+        "'images' is damaged ('name'",
+    ),
+    "no key": (
+        [
+            "CREATE TABLE other AS SELECT * FROM matches",
+            "DROP TABLE matches",
+            "ALTER TABLE other RENAME TO matches",
+        ],
+        "'pair_id' is not the key of table 'matches'",
+    ),
+    "two images of a name": (
+        [
+            "CREATE TABLE other AS SELECT * FROM images",
+            "DROP TABLE images",
+            "CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)",
+            "INSERT INTO images SELECT image_id, 'a.png', camera_id FROM other",
+        ],
+        "lists two images 'a.png'",
+    ),
+    "parameters of 1 byte": (["UPDATE cameras SET params = X'00'"], "parameters of 1 bytes"),
+    "parameters as text": (["UPDATE cameras SET params = '1,2,3'"], "'cameras' is damaged"),
+    "unknown model": (["UPDATE cameras SET model = 99"], "has model 99"),
+    "size below 0": (["UPDATE cameras SET width = -5"], "'cameras' is damaged ('width'"),
+    "rows below 0": (["UPDATE keypoints SET rows = -1"], "'keypoints' is damaged ('rows'"),
+    "rows beyond any": (
+        ["UPDATE matches SET rows = 4000000000"],
+        "'matches' is damaged ('rows'",
+    ),
+    "rows in words": (["UPDATE matches SET rows = 'many'"], "'matches' is damaged ('rows'"),
+    "rows that the data do not have": (
+        [f"UPDATE {t} SET rows = rows + 1" for t in ("keypoints", "matches")]
+        + ["UPDATE two_view_geometries SET rows = rows + 1"],
+        "are damaged",
+    ),
+    "camera id below 0": (
+        ["UPDATE images SET camera_id = -1"],
+        "'images' is damaged ('camera_id'",
+    ),
+    "kind of a pair in words": (
+        ["UPDATE two_view_geometries SET config = 'calibrated'"],
+        "'two_view_geometries' is damaged ('config'",
+    ),
+    "view that never ends": (
+        [
+            "DROP TABLE keypoints",
+            ENDLESS.format("keypoints", "image_id, rows, cols, data", "image_id"),
+        ],
+        "'keypoints' is no table",
+    ),
+    "matches that never end": (
+        ["DROP TABLE matches", ENDLESS.format("Matches", "pair_id, rows, cols, data", "pair_id")],
+        "'matches' is no table",
+    ),
+    "virtual table": (
+        [
+            "DROP TABLE descriptors",
+            "CREATE VIRTUAL TABLE descriptors USING fts5(image_id, rows, cols, data)",
+        ],
+        "'descriptors' is no table|no such module",
+    ),
+    "trigger": (
+        [
+            "CREATE TRIGGER t AFTER UPDATE ON images BEGIN DELETE FROM images; END",
+            "CREATE TRIGGER u AFTER INSERT ON keypoints BEGIN DELETE FROM images; END",
+        ],
+        "has triggers",
+    ),
+}
+
+
+def opened_by_all(path: Path, folder: Path) -> list[tuple[str, Callable[[], object]]]:
+    """Everything of the package that opens a database."""
+    return [
+        ("check", lambda: check(path)),
+        ("images", lambda: read_images(path)),
+        ("cameras", lambda: read_cameras(path)),
+        ("write", lambda: write_matches(path, NAMES, CAMERA, **OURS, on_existing="append")),
+        ("replace", lambda: write_matches(path, NAMES, CAMERA, **OURS, on_existing="replace")),
+        ("export", lambda: export_hloc(path, folder / "hloc")),
+        ("view", lambda: view_database(path, folder)),
+        ("copy", lambda: copy_database(path, folder / "copy.db")),
+        ("tracks", lambda: database_tracks(path, NUM_IMAGES)),
+    ]
+
+
+def messages(path: Path, folder: Path) -> dict[str, str]:
+    """What each of them says; those that work are left out. The file must not change."""
+    found = {}
+    for name, opens in opened_by_all(path, folder):
+        before = path.read_bytes()
+        start = time.process_time()
+        try:
+            opens()
+        except ColmapAv1Error as error:
+            found[name] = str(error)
+        else:
+            before = path.read_bytes()
+        assert path.read_bytes() == before, name
+        assert not path.with_name(f"{path.name}-journal").exists()
+        assert "\n" not in found.get(name, "")
+        assert time.process_time() - start < 1, name
+    return found
+
+
+@pytest.mark.parametrize(("changes", "message"), SQL.values(), ids=SQL.keys())
+def test_refused_in_one_line(
+    tmp_path: Path, sound: bytes, changes: list[str], message: str
+) -> None:
+    path = tmp_path / "a.db"
+    path.write_bytes(sound)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for sql in changes:
+            connection.execute(sql)
+    found = messages(path, tmp_path)
+    assert "check" in found
+    assert any(part in found["check"] for part in message.split("|")), found
+    # Who reads nothing of what is damaged may do without it.
+    if any(part in message for part in ("' is damaged", "triggers", "no table")):
+        assert len(found) == len(opened_by_all(path, tmp_path)), found.keys()
+
+
+def test_pages_that_refer_to_each_other(tmp_path: Path, sound: bytes) -> None:
+    path = tmp_path / "a.db"
+    path.write_bytes(sound)
+    never_ending_pages(path)
+    found = messages(path, tmp_path)
+    assert len(found) == len(opened_by_all(path, tmp_path)), found.keys()
+    assert all("comes to no end" in text for text in found.values()), found
+
+
+def test_nothing_of_the_layout_is_run(tmp_path: Path, sound: bytes) -> None:
+    """A function with side effects in a default, which a writer would call."""
+    path = tmp_path / "a.db"
+    path.write_bytes(sound)
+    in_layout(
+        path,
+        "UPDATE sqlite_master SET sql = REPLACE(sql, 'cols INTEGER NOT NULL', "
+        "'cols INTEGER NOT NULL, more TEXT DEFAULT (LOAD_EXTENSION(''x''))') "
+        "WHERE name = 'matches'",
+    )
+    before = path.read_bytes()
+    with pytest.raises(DatabaseError):
+        write_matches(path, NAMES, CAMERA, **OURS, on_existing="append")
+    assert path.read_bytes() == before
+
+
+def not_numbers(image_id: int, num: int) -> tuple[str, bytes, int]:
+    keypoints = sift_keypoints(NUM_IMAGES - image_id).copy()
+    keypoints[:num, :2] = np.nan
+    return "UPDATE keypoints SET data = ? WHERE image_id = ?", keypoints.tobytes(), image_id
+
+
+def params(change: Callable[[float], float]) -> tuple[str, bytes]:
+    values = np.array([change(p) for p in CAMERA.params])
+    return "UPDATE cameras SET params = ?", values.tobytes()
+
+
+# What stops mappers is an error, what they work around a warning.
+FOUND = {
+    "keypoints not numbers": (not_numbers(3, 5), "error", "keypoints that are not numbers"),
+    "parameters not numbers": (params(lambda _: np.nan), "error", "parameters that are not"),
+    "focal length below 0": (params(lambda p: -p), "error", "a focal length of 0 or less"),
+    "size 0": (("UPDATE cameras SET width = 0",), "error", "a size of 0x"),
+    "absurd size": (("UPDATE cameras SET width = 1 << 40",), "error", "a size of 1099511627776x"),
+    "size of other images": (
+        ("UPDATE cameras SET width = 100, height = 100",),
+        "warning",
+        "keypoints outside",
+    ),
+    "matches past the keypoints": (
+        (
+            "UPDATE matches SET data = CAST(X'ffffff7f' || SUBSTR(data, 5) AS BLOB) "
+            "WHERE pair_id = ?",
+            PAIR,
+        ),
+        "warning",
+        "1 pairs match keypoints that are not there",
+    ),
+    "no name": (("UPDATE images SET name = '' WHERE image_id = 2",), "error", "has no name"),
+    "name with a zero": (
+        ("UPDATE images SET name = 'a' || CHAR(0) || 'b.png' WHERE image_id = 2",),
+        "error",
+        "a name outside the image folder, or none that a file",
+    ),
+    "name above": (
+        ("UPDATE images SET name = '../a.png' WHERE image_id = 2",),
+        "error",
+        "1 image (../a.png) with a name outside",
+    ),
+    "name from the root": (
+        ("UPDATE images SET name = '/etc/a.png' WHERE image_id = 2",),
+        "error",
+        "1 image (/etc/a.png) with a name outside",
+    ),
+    "pair with itself": (
+        ("UPDATE two_view_geometries SET pair_id = ? WHERE pair_id = ?", PAIR - 1, PAIR),
+        "warning",
+        "1 pairs are of an image with itself",
+    ),
+    "pair turned round": (
+        (
+            "UPDATE two_view_geometries SET pair_id = ? WHERE pair_id = ?",
+            2147483647 * 4 + 3,
+            PAIR,
+        ),
+        "warning",
+        "1 pairs are stored under the larger image id first",
+    ),
+    "images deleted under their keypoints": (
+        ("DELETE FROM images WHERE image_id < 7",),
+        "error",
+        "pairs are of images that are not listed",
+    ),
+    "no cameras": (("DELETE FROM cameras",), "error", "8 images (frame_007.png, ...) without a"),
+}
+
+
+@pytest.mark.parametrize(("change", "severity", "text"), FOUND.values(), ids=FOUND.keys())
+def test_found_by_strict_check(  # noqa: PLR0917
+    tmp_path: Path,
+    sound: bytes,
+    capsys: pytest.CaptureFixture[str],
+    change: tuple[Any, ...],
+    severity: str,
+    text: str,
+) -> None:
+    path = tmp_path / "a.db"
+    path.write_bytes(sound)
+    assert main(["check", "--database", str(path), "--strict"]) == 0
+    capsys.readouterr()
+    alter(path, *change)
+    assert main(["check", "--database", str(path), "--strict"]) == 1
+    rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    assert any(name == severity and text in value for name, value in rows), rows
+    assert rows[-1][0] == "for mapping"
+    assert rows[-1][1] != "good"
+    messages(path, tmp_path)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_is_read_and_written(tmp_path: Path, layout: str) -> None:
+    make_layout(tmp_path / "a.db", layout)
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
+    assert check(tmp_path / "a.db").mappable
+
+
+def test_large_database_is_no_endless_one(tmp_path: Path) -> None:
+    """The bound on reading grows with the file: a row for each of many pairs is no damage."""
+    path = tmp_path / "a.db"
+    make_layout(path, "3.8")
+    pairs = itertools.combinations(range(1, 301), 2)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.executemany(
+            "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, 1)",
+            ((i, f"{i}.png") for i in range(1, 301)),
+        )
+        connection.executemany(
+            "INSERT INTO matches VALUES (?, 0, 2, NULL)",
+            ((2147483647 * i + j,) for i, j in pairs),
+        )
+        connection.execute(
+            "INSERT INTO two_view_geometries (pair_id, rows, cols, config) "
+            "SELECT pair_id, 0, 2, 1 FROM matches"
+        )
+    assert check(path).num_empty_pairs == 300 * 299 // 2
+    assert len(read_images(path)) == 300
