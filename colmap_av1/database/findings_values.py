@@ -9,8 +9,8 @@ import pycolmap
 
 from colmap_av1.database.contents import Images, Pairs
 from colmap_av1.database.finding import Finding, some
-from colmap_av1.database.reading import camera_fault
 from colmap_av1.errors import ImageError
+from colmap_av1.images.camera import camera_fault
 from colmap_av1.images.names import check_name
 
 # COLMAP's mappers leave out images whose camera is beyond these: focal length in longer sides of

@@ -37,6 +37,10 @@ _SEPARATOR, _OLD_SEPARATOR = "/", "_"
 _NO_MATCH = -1
 _MARK = made_by("export")
 _PAIRS_DIGEST = "pairs_sha256"
+# HDF5's filters pack zeros to a thousandth of their size, and nothing further.
+_DENSEST = 1100
+# What h5py raises where a file is damaged.
+_HDF5_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError)
 # Writes a dataset of a file.
 _Write = Callable[..., h5py.Dataset]
 
@@ -273,10 +277,7 @@ def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str])
         if not names:
             raise HlocError(f"{features}: holds no keypoints: give the features file of hloc")
         keypoints = [_from_hloc(features, name, file[name]["keypoints"]) for name in names]
-        sizes = np.array(
-            [file[n]["image_size"][()] if "image_size" in file[n] else (0, 0) for n in names],
-            dtype=np.int64,
-        ).reshape(-1, 2)
+        sizes = np.array([_size_of(features, name, file[name]) for name in names], dtype=np.int64)
     rows: dict[tuple[int, int], tuple[NDArray[np.uint32], NDArray[np.float32]]] = {}
     with _open_hloc(matches) as file:
         index = _index_of_pair_parts(features, names)
@@ -308,8 +309,23 @@ def _open_hloc(path: Path) -> Iterator[h5py.File]:
             yield file
     except PermissionError as error:
         raise HlocError(f"{path}: no permission to read it: change that") from error
-    except OSError as error:
+    except _HDF5_ERRORS as error:
         raise HlocError(f"{path}: not an HDF5 file, or damaged: write it anew") from error
+
+
+def _values(path: Path, group: h5py.Group, name: str) -> NDArray[Any]:
+    """A dataset of a group, as an array of numbers, read where the file holds what it declares."""
+    dataset = group[name]
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
+        raise HlocError(f"{path}: '{name}' of {group.name!r} holds no numbers: write it anew")
+    # A few bytes can declare any size, or another file's content.
+    held = dataset.id.get_storage_size() * _DENSEST
+    if dataset.nbytes > held or dataset.is_virtual or dataset.external:
+        raise HlocError(
+            f"{path}: '{name}' of {group.name!r} declares {dataset.nbytes} bytes, which the file "
+            "does not hold: write it anew"
+        )
+    return np.asarray(dataset[()])
 
 
 def _groups_with(file: h5py.File, dataset: str) -> list[str]:
@@ -324,6 +340,16 @@ def _groups_with(file: h5py.File, dataset: str) -> list[str]:
     return found
 
 
+def _size_of(path: Path, name: str, group: h5py.Group) -> tuple[int, int]:
+    """Width and height of an image; 0 where the file does not say, or says nothing sensible."""
+    if "image_size" not in group:
+        return (0, 0)
+    size = _values(path, group, "image_size")
+    if size.shape != (2,) or not ((size >= 0) & (size <= np.iinfo(np.int32).max)).all():
+        raise HlocError(f"{path}: the image_size of {name!r} is no width and height: write it anew")
+    return int(size[0]), int(size[1])
+
+
 def _from_hloc(path: Path, name: str, dataset: h5py.Dataset) -> NDArray[np.float32]:
     if dataset.ndim != 2 or dataset.shape[1] < 2 or dataset.dtype.kind not in "fiu":
         raise HlocError(
@@ -331,7 +357,13 @@ def _from_hloc(path: Path, name: str, dataset: h5py.Dataset) -> NDArray[np.float
             "one row of x and y for each: give the features file of hloc"
         )
     # Half precision, as hloc stores it, is widened before anything is added.
-    return np.asarray(dataset[:, :2].astype(np.float64) + 0.5, dtype=np.float32)
+    xy = _values(path, dataset.parent, "keypoints")[:, :2].astype(np.float64) + 0.5
+    found = xy.astype(np.float32)
+    if not np.isfinite(found).all():
+        raise HlocError(
+            f"{path}: image {name!r} has keypoints that are not numbers: extract its features anew"
+        )
+    return found
 
 
 def _index_of_pair_parts(path: Path, names: Sequence[str]) -> dict[str, int]:
@@ -364,7 +396,7 @@ def _split_pair(path: Path, group: str, index: dict[str, int]) -> tuple[int, int
 def _read_pair(
     path: Path, name: str, group: h5py.Group, counts: tuple[int, int]
 ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-    matches0 = group["matches0"][()]
+    matches0 = _values(path, group, "matches0")
     if matches0.shape != (counts[0],) or matches0.dtype.kind not in "iu":
         raise HlocError(
             f"{path}: pair {name!r} has {matches0.dtype} {list(matches0.shape)} matches for "
@@ -378,5 +410,11 @@ def _read_pair(
         )
     scores = np.ones(len(first), dtype=np.float32)
     if "matching_scores0" in group:
-        scores = group["matching_scores0"][()][first].astype(np.float32)
+        stored = _values(path, group, "matching_scores0")
+        if stored.shape != matches0.shape:
+            raise HlocError(
+                f"{path}: pair {name!r} has {list(stored.shape)} scores for {len(matches0)} "
+                "matches: match it anew"
+            )
+        scores = stored[first].astype(np.float32)
     return np.stack([first, second], axis=1).astype(np.uint32), scores

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from colmap_av1.database.file import is_new, open_database
 from colmap_av1.database.layout import MAX_NUM_IMAGES
 from colmap_av1.errors import DatabaseError
+from colmap_av1.images.camera import camera_fault
 
 # A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
 # or a 2x2 affine shape.
 SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
-# Sides of an image in pixels that no camera and no image format has.
-_LONGEST_SIDE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -138,17 +137,6 @@ def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap
         camera.has_prior_focal_length = bool(prior)
         cameras[camera_id] = camera
     return cameras
-
-
-def camera_fault(camera: pycolmap.Camera) -> str | None:
-    """What makes a camera none, in words that follow "has"; None where nothing does."""
-    if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
-        return f"a size of {camera.width}x{camera.height}"
-    if not np.isfinite(camera.params).all():
-        return "parameters that are not numbers"
-    if any(camera.params[i] <= 0 for i in camera.focal_length_idxs()):
-        return "a focal length of 0 or less"
-    return None
 
 
 def keypoints_from_row(

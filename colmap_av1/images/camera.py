@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from colmap_av1.options import CameraOptions
@@ -18,6 +19,8 @@ from colmap_av1.options.camera import (
 # Models that a pinhole camera is a first guess of, and those of them without distortion.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# Sides of an image in pixels that no camera and no image format has.
+_LONGEST_SIDE = 1 << 20
 # Encoders that scale pictures round their display size: a few tenths of a percent.
 _SQUARE_TOLERANCE = 5e-3
 
@@ -63,6 +66,17 @@ def make_camera(
     if options.camera_params is not None:
         camera.params = parse_camera_params(options.camera_params, camera)
     return camera
+
+
+def camera_fault(camera: Any) -> str | None:
+    """What makes a pycolmap.Camera none, in words that follow "has"; None where nothing does."""
+    if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
+        return f"a size of {camera.width}x{camera.height}"
+    if not np.isfinite(camera.params).all():
+        return "parameters that are not numbers"
+    if any(camera.params[i] <= 0 for i in camera.focal_length_idxs()):
+        return "a focal length of 0 or less"
+    return None
 
 
 def is_undistorted(camera: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -272,7 +273,7 @@ def _read_entries(
         if not words or words[0].startswith("#"):
             continue
         if words[0].isdecimal():
-            frame = int(words[0])
+            frame = last_number(words[0]) or 0
             name = words[1].strip() if len(words) == 2 else options.image_name % frame
         else:
             name = line.strip()
@@ -285,7 +286,7 @@ def _read_entries(
         ("frame", [str(f) for _, f, _ in entries]),
         ("name", [n for _, _, n in entries]),
     ):
-        twice = next((v for v in values if values.count(v) > 1), None)
+        twice = next((v for v, count in Counter(values).items() if count > 1), None)
         if twice is not None:
             raise ImageError(f"{path}: gives the {what} {twice} twice: remove one line")
     return entries

@@ -287,7 +287,12 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     if not may_read(path):
         raise ImageError(f"{path}: no permission to read it: change that")
-    image = cv2.imread(str(path), how) if path.is_file() else None
+    try:
+        image = cv2.imread(str(path), how) if path.is_file() else None
+    except cv2.error as error:  # more pixels than OpenCV takes
+        raise ImageError(f"{path}: is too large for an image: give the folder of the images") from (
+            error
+        )
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)

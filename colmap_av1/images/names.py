@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.options.images import check_extension, check_image_pattern
 
+_MOST_DIGITS = 255
 WRITE_PARAMETERS = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
@@ -112,14 +113,20 @@ def natural_order(names: Sequence[str]) -> list[int]:
 def last_number(name: str) -> int | None:
     """The last number in an image's name, its extension left out; None where there is none."""
     digits = re.findall(r"\d+", PurePosixPath(name).stem)
-    return int(digits[-1]) if digits else None
+    return _value(digits[-1]) if digits else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key under which 'f9' comes before 'f10'; the text itself breaks ties."""
     parts = re.split(r"(\d+)", name)
-    key = [(1, int(p), p) if p.isdigit() else (0, 0, p) for p in parts]
+    # Every second part is digits.
+    key = [(1, _value(p), p) if i % 2 else (0, 0, p) for i, p in enumerate(parts)]
     return [*key, (0, 0, name)]
+
+
+def _value(digits: str) -> int:
+    """The number that digits are; no file name has more of them than Python reads as one."""
+    return int(digits[:_MOST_DIGITS])
 
 
 def pattern_regex(pattern: str) -> re.Pattern[str]:

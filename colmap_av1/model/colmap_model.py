@@ -14,7 +14,10 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ModelError
+from colmap_av1.errors import ImageError, ModelError
+from colmap_av1.images.camera import camera_fault
+from colmap_av1.images.names import check_name
+from colmap_av1.model.binary_files import are_whole
 from colmap_av1.util.files import may_read
 
 _FILES = ("cameras", "images", "points3D")
@@ -196,13 +199,17 @@ def read_model(model: str | os.PathLike[str]) -> Any:
     for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):
         if not may_read(file):
             raise ModelError(f"{file}: no permission to read it: change that")
+    is_binary = (path / "cameras.bin").is_file()
     unreadable = ModelError(
         f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
         "update pycolmap"
     )
     try:
+        # pycolmap ends the process at some of what such files can declare.
+        if is_binary and not are_whole(path):
+            raise unreadable
         reconstruction = pycolmap.Reconstruction(path)
-    except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
+    except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
         raise unreadable from error
     cameras = path / "cameras.bin"
     sizes = [_CAMERA_HEAD + 8 * len(c.params) for c in reconstruction.cameras.values()]
@@ -211,4 +218,27 @@ def read_model(model: str | os.PathLike[str]) -> Any:
         raise unreadable
     if reconstruction.num_reg_images() == 0:
         raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
+    _check_values(path, reconstruction)
     return reconstruction
+
+
+def _check_values(path: Path, reconstruction: Any) -> None:
+    """Refuse what pycolmap reads without a look: names, poses and cameras."""
+    map_again = "map again, or give another model"
+    for image_id, image in reconstruction.images.items():
+        try:
+            check_name(image.name)
+        except UnicodeDecodeError:
+            raise ModelError(f"{path}: image {image_id} has a name not in UTF-8: rename it") from (
+                None
+            )
+        except ImageError as error:
+            raise ModelError(f"{path}: {error}") from error
+        if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
+            raise ModelError(
+                f"{path}: image {image.name!r} has a pose that is not of numbers: {map_again}"
+            )
+    for camera_id, camera in reconstruction.cameras.items():
+        fault = camera_fault(camera)
+        if fault:
+            raise ModelError(f"{path}: camera {camera_id} has {fault}: {map_again}")

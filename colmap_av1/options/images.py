@@ -14,6 +14,8 @@ from colmap_av1.options.fields import Options, option
 # Formats that images are written in.
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg")
 _NUMBER_FIELD = re.compile(r"%0?\d*d")
+_LONGEST_NUMBER = 20  # digits
+_LONGEST_NAME = 255  # bytes, on all usual file systems
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,13 @@ def check_image_pattern(pattern: str) -> str:
     if len(fields) != 1 or pattern.count("%") != 1:
         raise OptionError(
             f"image_name '{pattern}' needs exactly one number field, such as frame_%06d.png"
+        )
+    # Judged before it is used: a field of many digits makes a name that fills memory.
+    too_long = int(fields[0].strip("%d") or 0) > _LONGEST_NUMBER if len(fields[0]) < 9 else True
+    if too_long or len(os.fsencode(pattern)) + _LONGEST_NUMBER > _LONGEST_NAME or "\0" in pattern:
+        raise OptionError(
+            f"image_name {pattern[:40]!r} gives names that files cannot have: give one such as "
+            "frame_%06d.png"
         )
     if Path(pattern).name != pattern or pattern.startswith("."):
         raise OptionError(

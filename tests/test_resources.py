@@ -1,0 +1,268 @@
+"""Small input that declares, or asks for, more than any memory holds: refused, and at once."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from colmap_av1.database.hloc import read_hloc
+from colmap_av1.errors import ColmapAv1Error, HlocError, ImageError, ModelError, OptionError
+from colmap_av1.images.choosing import check_frame_list
+from colmap_av1.images.files import read_image
+from colmap_av1.images.names import frames_of_images, natural_order
+from colmap_av1.model.binary_files import are_whole
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import ImageOptions
+
+resource = pytest.importorskip("resource")
+_ALLOWED = 1 << 30  # bytes more than are in use
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + _ALLOWED, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def refused(run: Callable[[], object], kind: type[ColmapAv1Error], text: str) -> None:
+    with little_memory(), pytest.raises(kind, match=text) as caught:
+        run()
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    ["%99999999999d.png", "%021d.png", f"{'x' * 250}%d.png", "a\0%d.png", f"%{'0' * 5000}9d.png"],
+)
+def test_name_that_no_file_can_have(pattern: str) -> None:
+    refused(lambda: ImageOptions(image_name=pattern), OptionError, "image_name")
+
+
+def test_list_without_an_end(tmp_path: Path) -> None:
+    refused(
+        lambda: check_frame_list(ImageOptions(frame_list="/dev/zero")),
+        ImageError,
+        "no regular file",
+    )
+    large = tmp_path / "large.txt"
+    with large.open("wb") as file:
+        file.truncate(1 << 40)
+    refused(lambda: check_frame_list(ImageOptions(frame_list=large)), ImageError, "is too large")
+
+
+def test_numbers_longer_than_python_reads(tmp_path: Path) -> None:
+    listing = tmp_path / "frames.txt"
+    listing.write_text("1" * 5000 + "\n")
+    check_frame_list(ImageOptions(frame_list=listing, image_name="%d.png"))
+    names = ["²", "9" * 5000 + ".png", "10.png", "9.png"]
+    assert natural_order(names) == [3, 2, 1, 0]
+    with pytest.raises(ImageError):
+        frames_of_images(names[1:], 7)
+
+
+def test_long_list_takes_no_square_of_its_length(tmp_path: Path) -> None:
+    listing = tmp_path / "frames.txt"
+    listing.write_text("".join(f"{i}\n" for i in range(100_000)))
+    check_frame_list(ImageOptions(frame_list=listing))
+
+
+def hloc_files(folder: Path, damage: Callable[[h5py.File, h5py.File], None]) -> list[Path]:
+    paths = [folder / "features.h5", folder / "matches.h5"]
+    with h5py.File(paths[0], "w") as features, h5py.File(paths[1], "w") as matches:
+        for name in "ab":
+            features[f"{name}/keypoints"] = np.ones((9, 2), np.float32)
+            features[f"{name}/image_size"] = np.array([64, 48])
+        matches["a/b/matches0"] = np.arange(9, dtype=np.int16)
+        matches["a/b/matching_scores0"] = np.ones(9, np.float16)
+        damage(features, matches)
+    return paths
+
+
+def declared(file: h5py.File, name: str, shape: tuple[int, ...], kind: str) -> None:
+    del file[name]
+    file.create_dataset(name, shape, kind, chunks=tuple(min(n, 64) for n in shape))
+
+
+def linked(features: h5py.File, name: str, target: object) -> None:
+    del features[name]
+    features[name] = target
+
+
+HDF5 = {
+    "keypoints": (
+        lambda f, m: declared(f, "a/keypoints", (3_000_000_000, 2), "f4"),
+        "declares 24000000000 bytes, which the file does not hold",
+    ),
+    "size": (
+        lambda f, m: declared(f, "a/image_size", (3_000_000_000,), "i8"),
+        "declares 24000000000 bytes",
+    ),
+    "matches": (
+        lambda f, m: declared(m, "a/b/matches0", (3_000_000_000,), "i4"),
+        "declares 12000000000 bytes",
+    ),
+    "scores": (
+        lambda f, m: declared(m, "a/b/matching_scores0", (3_000_000_000,), "f4"),
+        "declares 12000000000 bytes",
+    ),
+    "scores of others": (
+        lambda f, m: linked(m, "a/b/matching_scores0", np.ones(5, np.float32)),
+        r"\[5\] scores for 9 matches",
+    ),
+    "size of three": (
+        lambda f, m: linked(f, "a/image_size", np.array([1, 2, 3])),
+        "is no width and height",
+    ),
+    "size in words": (lambda f, m: linked(f, "a/image_size", "64x48"), "holds no numbers"),
+    "size not a number": (
+        lambda f, m: linked(f, "a/image_size", np.array([np.nan, 3])),
+        "is no width and height",
+    ),
+    "size that is a group": (
+        lambda f, m: linked(f, "a/image_size", h5py.SoftLink("/b")),
+        "holds no numbers",
+    ),
+    "size that is nowhere": (
+        lambda f, m: linked(f, "a/image_size", h5py.ExternalLink("none.h5", "/x")),
+        "or damaged",
+    ),
+    "no numbers": (
+        lambda f, m: linked(f, "a/keypoints", np.full((9, 2), np.nan, np.float32)),
+        "keypoints that are not numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize(("damage", "text"), HDF5.values(), ids=HDF5.keys())
+def test_hdf5_file(
+    tmp_path: Path, damage: Callable[[h5py.File, h5py.File], None], text: str
+) -> None:
+    paths = hloc_files(tmp_path, damage)
+    assert max(path.stat().st_size for path in paths) < 40_000
+    refused(lambda: read_hloc(*paths), HlocError, text)
+
+
+def test_compressed_hdf5_file_is_read(tmp_path: Path) -> None:
+    """Filters pack zeros to a thousandth: a file that declares so much holds it all the same."""
+
+    def compress(features: h5py.File, _: h5py.File) -> None:
+        del features["a/keypoints"]
+        zeros = np.zeros((9, 200_000), np.float32)
+        features.create_dataset("a/keypoints", data=zeros, compression="gzip", compression_opts=9)
+
+    assert len(read_hloc(*hloc_files(tmp_path, compress)).keypoints[0]) == 9
+
+
+def model_files(counts: dict[str, int]) -> dict[str, bytes]:
+    """A model of an image and a point, with other counts where given."""
+
+    def count(name: str, kind: str = "<Q", honest: int = 1) -> bytes:
+        return struct.pack(kind, counts.get(name, honest))
+
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0"
+    return {
+        "cameras.bin": count("cameras")
+        + struct.pack("<IiQQ4d", 1, 1, 640, 480, 500, 500, 320, 240),
+        "images.bin": count("images")
+        + image
+        + count("keypoints", honest=2)
+        + struct.pack("<2dq", 1, 2, 1) * 2,
+        "points3D.bin": count("points")
+        + struct.pack("<Q3d3Bd", 1, 0, 0, 5, 1, 2, 3, 0.5)
+        + count("track", honest=2)
+        + struct.pack("<IIII", 1, 0, 1, 1),
+        "rigs.bin": count("rigs")
+        + struct.pack("<I", 1)
+        + count("sensors", "<I")
+        + struct.pack("<iI", 0, 1),
+        "frames.bin": count("frames")
+        + struct.pack("<II7d", 1, 1, 1, 0, 0, 0, 0, 0, 0)
+        + count("data_ids", "<I")
+        + struct.pack("<iIQ", 0, 1, 1),
+    }
+
+
+@pytest.mark.parametrize("number", [1 << 31, 1 << 33, 1 << 60, (1 << 64) - 1])
+@pytest.mark.parametrize(
+    "field",
+    ["cameras", "images", "keypoints", "points", "track", "rigs", "sensors", "frames", "data_ids"],
+)
+def test_model_that_declares_more_than_it_holds(tmp_path: Path, field: str, number: int) -> None:
+    honest = model_files({})
+    for name, data in honest.items():
+        (tmp_path / name).write_bytes(data)
+    assert are_whole(tmp_path)
+    assert read_model(tmp_path).num_reg_images() == 1
+    short = field in ("sensors", "data_ids")
+    counts = {field: number & 0xFFFFFFFF or 1 << 31} if short else {field: number}
+    for name, data in model_files(counts).items():
+        (tmp_path / name).write_bytes(data)
+    refused(lambda: read_model(tmp_path), ModelError, "the model cannot be read")
+
+
+def test_model_that_is_cut_off(tmp_path: Path) -> None:
+    for name, data in model_files({}).items():
+        (tmp_path / name).write_bytes(data)
+    for name, data in model_files({}).items():
+        for length in range(len(data)):
+            (tmp_path / name).write_bytes(data[:length])
+            with pytest.raises(ModelError):
+                read_model(tmp_path)
+        (tmp_path / name).write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [(b"\xff.png", "not in UTF-8"), (b"../a.png", "outside"), (b"", "no file can have")],
+)
+def test_model_with_a_name_of_no_file(tmp_path: Path, name: bytes, text: str) -> None:
+    for file, data in model_files({}).items():
+        (tmp_path / file).write_bytes(data.replace(b"a.png", name))
+    refused(lambda: read_model(tmp_path), ModelError, text)
+
+
+def test_model_whose_numbers_are_none(tmp_path: Path) -> None:
+    # Places of the first parameter, and of the pose in both files that have it.
+    for places, text in (
+        ({"cameras.bin": 32}, "parameters that are not numbers"),
+        ({"images.bin": 44, "frames.bin": 48}, "a pose that is not of numbers"),
+    ):
+        for name, data in model_files({}).items():
+            changed = bytearray(data)
+            if name in places:
+                struct.pack_into("<d", changed, places[name], np.nan)
+            (tmp_path / name).write_bytes(changed)
+        refused(lambda: read_model(tmp_path), ModelError, text)
+
+
+@pytest.mark.parametrize("side", [60_000, 20_000])
+def test_picture_of_many_pixels(tmp_path: Path, side: int) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    path = tmp_path / "a.png"
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(bytes(1000)))
+        + chunk(b"IEND", b"")
+    )
+    with pytest.raises(ImageError, match=re.escape(str(path))) as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
