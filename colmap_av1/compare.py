@@ -28,6 +28,7 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.model.figures import model_figures
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
@@ -62,6 +63,7 @@ class _Reference:
     is_truth: bool = False
 
 
+@checks_arguments
 def compare(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],

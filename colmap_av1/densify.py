@@ -43,6 +43,7 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -85,6 +86,7 @@ class DensifyReport:
     warnings: tuple[str, ...]
 
 
+@checks_arguments
 def densify(
     model: str | os.PathLike[str],
     video: str | os.PathLike[str],

@@ -17,6 +17,7 @@ from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
 from colmap_av1.model.mapper import is_mapper_log, map_poses
 from colmap_av1.options import MapOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_files, check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -55,6 +56,7 @@ class MapReport:
         return self.output / "0"
 
 
+@checks_arguments
 def map_database(
     database: str | os.PathLike[str],
     image_path: str | os.PathLike[str],

@@ -6,7 +6,7 @@ import copy
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
-from colmap_av1.errors import DatabaseError
+from colmap_av1.errors import DatabaseError, OptionError
 from colmap_av1.images.camera import check_pixel_aspect, make_camera
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
 from colmap_av1.matching.image_matches import (
@@ -26,9 +26,10 @@ from colmap_av1.matching.image_matches import (
 )
 from colmap_av1.matching.links import LinkedImages, LinkReport, link_video
 from colmap_av1.matching.weak_gaps import may_link
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
@@ -127,6 +128,7 @@ class MatchReport:
         return with_colmap, shlex.join(ours), shlex.join(densify)
 
 
+@checks_arguments
 def match(
     database: str | os.PathLike[str],
     video: str | os.PathLike[str],
@@ -296,6 +298,8 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
             f"{database}: image '{filled.name}' already has {filled.num_keypoints} keypoints and "
             f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
         )
+    if listed:
+        _check_no_camera(database, options.camera)
     if database.exists() and database.stat().st_size:
         # Nothing is written, but the write lock is taken.
         write_matches(database, (), (), (), pairs=_NO_PAIRS, matches=(), geometries=())
@@ -304,6 +308,21 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
             f"{database}: no permission to write a database there: give another path"
         )
     return listed
+
+
+def _check_no_camera(database: Path, options: CameraOptions) -> None:
+    """Refuse options of new cameras where the images have theirs."""
+    default = CameraOptions()
+    changed = [
+        field.name
+        for field in fields(options)
+        if getattr(options, field.name) != getattr(default, field.name)
+    ]
+    if changed:
+        raise OptionError(
+            f"{database}: its images have cameras, so {changed[0]} would change nothing: leave it "
+            "out, or import the images with that camera"
+        )
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.tracks.tracks import cut_tracks, join_tracks
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -99,6 +100,7 @@ class ReconstructReport:
     warnings: tuple[str, ...]
 
 
+@checks_arguments
 def reconstruct(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],

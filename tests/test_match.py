@@ -149,6 +149,26 @@ def test_images_of_a_database_get_the_rows(clip: Path, tmp_path: Path) -> None:
     assert len(listed["two_view_geometries"]) == len(new["two_view_geometries"])
 
 
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CameraOptions(camera_model="PINHOLE"),
+        CameraOptions(camera_params="200,96,64,0"),
+        CameraOptions(single_camera=False),
+    ],
+)
+def test_cameras_of_listed_images_stay(clip: Path, tmp_path: Path, camera: CameraOptions) -> None:
+    """An option that would change nothing is refused before any work."""
+    database = tmp_path / "a.db"
+    folder = tmp_path / "cut"
+    write_images(clip, folder, [f"{i:04d}.png" for i in range(16)], range(16))
+    listing_database(folder, database)
+    before = database.read_bytes()
+    with pytest.raises(OptionError, match=r"its images have cameras, so .* would change nothing"):
+        match(database, clip, options=MatchOptions(camera=camera))
+    assert database.read_bytes() == before
+
+
 def test_tracks_match_the_pictures(clip: Path, tmp_path: Path) -> None:
     """The layers move by 2 and 4 px a frame: matches do so."""
     match(tmp_path / "a.db", clip)

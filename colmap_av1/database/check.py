@@ -30,6 +30,7 @@ from colmap_av1.database.findings_values import value_findings
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.two_view_geometry import config_name
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.graphs import connected_components
 
 
@@ -93,6 +94,7 @@ class CheckReport:
         return any(finding.damage for finding in self.findings)
 
 
+@checks_arguments
 def check(database: str | os.PathLike[str]) -> CheckReport:
     """Read a COLMAP database of any version and say what the mappers will make of it.
 

@@ -24,6 +24,7 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
 from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
 from colmap_av1.options import ExportOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import mark_of, new_hdf5
 from colmap_av1.util.outputs import check_files, made_by
@@ -67,6 +68,7 @@ class HlocMatches:
     scores: list[NDArray[np.float32]]
 
 
+@checks_arguments
 def export_hloc(
     database: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -257,6 +259,7 @@ def _write_pairs(
     return len(pair_ids)
 
 
+@checks_arguments
 def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str]) -> HlocMatches:
     """Read features and matches from files that hloc, or a program like it, wrote.
 

@@ -17,6 +17,7 @@ from colmap_av1.errors import OptionError, VideoError, cannot_write
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import mark_of, new_hdf5
 from colmap_av1.util.outputs import check_files, made_by
@@ -26,6 +27,7 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 _MARK = made_by("motion")
 
 
+@checks_arguments
 def export_motion(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 import warnings
@@ -17,8 +18,9 @@ from colmap_av1 import _core
 from colmap_av1.errors import BitstreamError, LimitError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import ReadOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import threads_or_cpus
-from colmap_av1.video.container import open_stream
+from colmap_av1.video.container import check_process, open_stream
 
 # Bytes of block data that threads may read ahead of their use, all together.
 _READ_AHEAD = 1 << 28
@@ -54,6 +56,7 @@ class _Index:
     num_units: int
 
 
+@checks_arguments
 def read_motion(
     video: str | PathLike[str], options: ReadOptions | None = None
 ) -> Iterator[FrameMotion]:
@@ -204,12 +207,14 @@ def _read_events(
         finally:
             items.close()
 
+    process = os.getpid()
     readers = [threading.Thread(target=work, args=(i,), daemon=True) for i in range(num_readers)]
     for thread in readers:
         thread.start()
     try:
         for group in range(len(index.groups)):
             while True:
+                check_process(video, process)
                 number, item = ahead[group % num_readers].get()
                 if number != group:
                     try:

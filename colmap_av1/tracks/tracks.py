@@ -14,6 +14,7 @@ from colmap_av1 import _core
 from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.video.display import Display, shown_points, shown_size
 
 # Width in pixels of the squares that motion is coded for.
@@ -51,6 +52,7 @@ class Tracks:
     confirmed: NDArray[np.bool_]
 
 
+@checks_arguments
 def build_tracks(
     motion: Iterable[FrameMotion],
     options: TrackOptions | None = None,
@@ -88,6 +90,10 @@ def build_tracks(
     options = options if options is not None else TrackOptions()
     builder = _core.TrackBuilder(_core_options(options))
     for count, frame in enumerate(motion, start=1):
+        if not isinstance(frame, FrameMotion):
+            raise TypeError(
+                f"build_tracks: motion gives {type(frame).__name__}: give frames of read_motion"
+            )
         builder.add(frame)
         if progress is not None:
             progress(count)

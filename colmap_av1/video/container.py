@@ -144,6 +144,7 @@ class VideoStream:
 
     def __init__(self, video: str | os.PathLike[str]) -> None:
         path, state = Path(video), file_state(video)
+        self._process = os.getpid()
         self._opened = ExitStack()
         self._container = self._opened.enter_context(open_container(path))
         try:
@@ -176,12 +177,13 @@ class VideoStream:
         Raises:
             BitstreamError: the file is damaged or cut off; every packet before the damage
                 has been given.
-            VideoError: there is no packet at all.
+            VideoError: there is no packet at all, or this process was forked meanwhile.
         """
         index = 0
         last: Any = None
         demuxed = self._container.demux(self._stream)
         while True:
+            check_process(self.file, self._process)
             try:
                 packet = next(demuxed, None)
             except (av.error.FFmpegError, OSError) as error:
@@ -229,6 +231,20 @@ class VideoStream:
             if end_time + 1.5 * step < file.duration:
                 return f"cut off: {end_time:.2f} of {file.duration:.2f} seconds are there"
         return None
+
+
+def check_process(video: str | os.PathLike[str], process: int) -> None:
+    """Refuse to go on with a file in a process forked from the one that opened it.
+
+    The two would take packets from each other, and threads that read stay with the first.
+
+    Raises:
+        VideoError: this is not that process.
+    """
+    if os.getpid() != process:
+        raise VideoError(
+            f"{os.fspath(video)}: was being read when this process was forked: read it anew here"
+        )
 
 
 def open_stream(video: str | os.PathLike[str]) -> VideoStream:
@@ -338,14 +354,18 @@ def _find_av1_stream(container: Any, path: Path) -> Any:
 
 
 def find_video_stream(container: Any, path: Path) -> Any:
-    """The AV1 stream, in a file without one the first that is no cover picture."""
+    """The AV1 stream, in a file without one the first that is no cover picture.
+
+    A picture beside a track, as animated AVIF and HEIF files have one, is no video.
+    """
     streams = container.streams.video
     if not streams:
         kinds = sorted({stream.type for stream in container.streams})
         found = f"only {', '.join(kinds)}" if kinds else "nothing"
         raise VideoError(f"{path}: holds no video stream, {found}: give a video")
     moving = [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
-    return next((s for s in moving if _codec_name(s) == "av1"), moving[0])
+    coded = [s for s in moving if _codec_name(s) == "av1"] or moving
+    return next((s for s in coded if s.frames != 1), coded[0])
 
 
 def find_decodable_stream(container: Any, path: Path) -> Any:

@@ -24,6 +24,7 @@ from colmap_av1.errors import (
     cannot_write,
 )
 from colmap_av1.options import EncodeOptions
+from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.outputs import check_files
 from colmap_av1.util.processes import bound
@@ -67,6 +68,7 @@ class EncodeReport:
     reused: bool = False
 
 
+@checks_arguments
 def encode(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],

@@ -392,8 +392,9 @@ def test_tile_that_goes_on_after_its_symbols_is_damaged() -> None:
         if wrong:
             with pytest.raises(_core.BitstreamError, match="does not end with the bits"):
                 _core.Parser(strict=True).parse(start + frame + obu(4, tile))
-    with pytest.raises(_core.BitstreamError, match="goes on after its last symbol"):
-        _core.Parser().parse(start + frame + obu(4, b"\x07\x80\0\1"))
+    for end in (b"\x80\0\1", b"\x80\x80\x80", b"\0\0\0"):
+        with pytest.raises(_core.BitstreamError, match="goes on after its last symbol"):
+            _core.Parser().parse(start + frame + obu(4, b"\x07" + end))
 
 
 # --- any damage to a small stream -------------------------------------------------------------

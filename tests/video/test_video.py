@@ -314,3 +314,16 @@ def test_ivf_without_a_frame_rate_is_read(
     with pytest.raises((BitstreamError, VideoError)):
         list(packets(path))
     gc.collect()  # a file left open would warn now
+
+
+def test_animated_avif_is_its_track(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """Such a file holds a still picture, too, which comes first."""
+    clip = encode(make_frames(6), tmp_path / "clip.mp4", *AV1)
+    moving = ffmpeg("-i", clip, "-c", "copy", tmp_path / "moving.avif")
+    still = ffmpeg("-i", clip, "-frames:v", "1", "-c", "copy", tmp_path / "still.avif")
+    with av.open(str(moving)) as container:
+        assert len(container.streams.video) == 2
+    assert [bytes(p.data) for p in packets(moving)] == [bytes(p.data) for p in packets(clip)]
+    assert read_video(moving).num_packets == 6
+    assert len(list(decode_frames(moving))) == 6
+    assert len(list(packets(still))) == 1

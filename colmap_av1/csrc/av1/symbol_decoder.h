@@ -134,9 +134,10 @@ class SymbolDecoder {
     const unsigned mask = 0xFFU >> (position & 7);
     const std::uint8_t* last = end_;  // behind the last byte that is not 0
     while (last > first + 1 && last[-1] == 0) --last;
-    if (last == first + 1) {
-      return (*first & mask) == ((mask + 1) >> 1) ? TrailingBits::kValid : TrailingBits::kOther;
-    }
+    const bool is_first = last == first + 1;
+    if (is_first && (*first & mask) == ((mask + 1) >> 1)) return TrailingBits::kValid;
+    // Zeros alone pad nothing: a hole in a file looks so.
+    if (is_first && (*first & mask) == 0) last = end_;
     constexpr std::int64_t kOtherBytes = 2;
     return last - first <= kOtherBytes ? TrailingBits::kOther : TrailingBits::kData;
   }

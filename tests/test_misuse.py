@@ -1,0 +1,179 @@
+"""What programs get wrong that call the package: told by the argument's name, and nothing hangs."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import os
+import signal
+import struct
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import PROJECT
+
+import colmap_av1
+from colmap_av1 import (
+    ReadOptions,
+    TrackOptions,
+    build_tracks,
+    check,
+    densify,
+    encode,
+    export_hloc,
+    export_motion,
+    inspect,
+    map_database,
+    match,
+    read_hloc,
+    read_motion,
+    reconstruct,
+)
+from colmap_av1.compare import compare as compare_videos
+from colmap_av1.errors import BitstreamError, OptionError, VideoError
+from colmap_av1.motion import reading
+from colmap_av1.video.container import open_stream
+
+VIDEO = PROJECT / "tests" / "data" / "conformance" / "svt4_p6.ivf"
+NO_PATHS = [None, 5, 1 << 40, -1, 3.5, b"bytes", [], object(), float("nan")]
+# The functions, each with an argument that is a path, and where the others go.
+CALLS: dict[str, tuple[str, Callable[..., object], dict[str, Any]]] = {
+    "match database": ("database", match, {"video": VIDEO}),
+    "match video": ("video", match, {"database": "a.db"}),
+    "check": ("database", check, {}),
+    "map": ("database", map_database, {"image_path": "i", "output": "o"}),
+    "densify": ("model", densify, {"video": VIDEO, "output": "o"}),
+    "reconstruct": ("video", reconstruct, {"output": "o"}),
+    "encode": ("video", encode, {"output": "o.mp4"}),
+    "export": ("database", export_hloc, {"output": "o"}),
+    "hloc": ("features", read_hloc, {"matches": "m"}),
+    "inspect": ("video", inspect, {}),
+    "motion": ("video", export_motion, {"output": "m.npz"}),
+    "read": ("video", read_motion, {}),
+    "compare": ("video", compare_videos, {"output": "o"}),
+}
+WITH_OPTIONS = [name for name in CALLS if name not in ("check", "hloc")]
+
+
+@pytest.mark.parametrize(("name", "call", "others"), CALLS.values(), ids=CALLS.keys())
+def test_what_is_no_path(
+    name: str,
+    call: Callable[..., object],
+    others: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for value in NO_PATHS:
+        with pytest.raises(TypeError, match=f"{name} is of type {type(value).__name__}"):
+            call(**{name: value}, **others)
+    with pytest.raises(OptionError, match=f"{name} 'a.x00b' is no path"):
+        call(**{name: "a\0b"}, **others)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("which", WITH_OPTIONS)
+@pytest.mark.parametrize("value", [5, "text", {}, TrackOptions(), ReadOptions])
+def test_what_are_no_options(which: str, value: Any) -> None:
+    name, call, others = CALLS[which]
+    with pytest.raises(TypeError, match="options is of type"):
+        call(**{name: VIDEO}, **others, options=value)
+
+
+def test_every_public_function_checks_its_arguments() -> None:
+    functions = {
+        name
+        for name in colmap_av1.__all__
+        if callable(getattr(colmap_av1, name)) and not isinstance(getattr(colmap_av1, name), type)
+    }
+    assert functions == {call.__name__ for _, call, _ in CALLS.values()} - {"compare"} | {
+        "build_tracks"
+    }
+
+
+def test_motion_that_is_none() -> None:
+    for value in ("text", b"bytes", [1]):
+        with pytest.raises(TypeError, match="motion gives"):
+            build_tracks(value)
+    with pytest.raises(TypeError, match="options is of type int"):
+        build_tracks([], 5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("number", [1 << 31, 1 << 40, 1 << 80, -(1 << 31) - 1])
+def test_integers_past_32_bits(number: int) -> None:
+    with pytest.raises(OptionError, match="operating_point"):
+        ReadOptions(operating_point=number)
+    with pytest.raises(OptionError, match="num_threads"):
+        ReadOptions(num_threads=number)
+    with pytest.raises(OptionError, match="min_length"):
+        TrackOptions(min_length=number)
+    frame = next(iter(read_motion(VIDEO)))
+    for field in ("decode_index", "display_index", "width", "height"):
+        with pytest.raises(TypeError, match=f"{field} is not an integer of 32 bits"):
+            build_tracks([dataclasses.replace(frame, **{field: number})])
+
+
+def test_arrays_of_other_shapes() -> None:
+    frame = next(iter(read_motion(VIDEO)))
+    for field in ("mv", "ref_frame", "mi_size", "warp_index", "ref_size"):
+        values = getattr(frame, field)
+        for wrong in (values[..., :0], values[None], None, "text", 5):
+            with pytest.raises((TypeError, ValueError), match=field):
+                build_tracks([dataclasses.replace(frame, **{field: wrong})])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the processes of a Unix")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+@pytest.mark.parametrize("num_threads", [1, 4])
+def test_fork_while_a_video_is_read(num_threads: int) -> None:
+    """The new process is told, and the old one goes on as if nothing were."""
+    wanted = [frame.decode_index for frame in read_motion(VIDEO)]
+    frames = read_motion(VIDEO, ReadOptions(num_threads=num_threads))
+    found = [next(frames).decode_index]
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)
+        status = 1
+        try:
+            list(frames)
+        except VideoError as error:
+            status = 0 if "forked" in str(error) else 2
+        finally:
+            del frames
+            gc.collect()
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert found + [frame.decode_index for frame in frames] == wanted
+
+
+@pytest.mark.parametrize("num_threads", [1, 4])
+def test_memory_goes_with_the_error(
+    num_threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the garbage collector: nothing of a failed reader refers to itself."""
+    data = bytearray(VIDEO.read_bytes())
+    (size,) = struct.unpack_from("<I", data, 32)
+    data[44 + size // 2 : 44 + size] = bytes(size - size // 2)  # a hole
+    (tmp_path / "a.ivf").write_bytes(data)
+    alive: list[weakref.ref[object]] = []
+
+    def opened(video: Any) -> Any:
+        stream = open_stream(video)
+        alive.append(weakref.ref(stream))
+        return stream
+
+    monkeypatch.setattr(reading, "open_stream", opened)
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(2):
+            with pytest.raises(BitstreamError) as caught:
+                list(read_motion(tmp_path / "a.ivf", ReadOptions(num_threads=num_threads)))
+            del caught
+        assert len(alive) >= 4
+        assert [reference() for reference in alive] == [None] * len(alive)
+    finally:
+        gc.enable()
