@@ -32,6 +32,7 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.view import view_database
 
+EXAMPLES = os.environ.get("COLMAP_AV1_EXAMPLES")
 NAMES = ["f0.png", "f1.png", "f2.png"]
 NUM_KEYPOINTS = 20
 # CPU time of one step in seconds.
@@ -206,7 +207,8 @@ class Databases(RuleBasedStateMachine):
 
 
 Databases.TestCase.settings = settings(
-    max_examples=int(os.environ.get("COLMAP_AV1_EXAMPLES", "60")),
+    max_examples=int(EXAMPLES or "40"),
+    derandomize=EXAMPLES is None,
     stateful_step_count=8,
     deadline=None,
     print_blob=True,

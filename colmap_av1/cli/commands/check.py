@@ -38,8 +38,8 @@ def add_check(commands: Any) -> None:
     command.add_argument(
         "--strict",
         action="store_true",
-        help="exit with status 1 if the mappers cannot use the database, it is damaged, or the model "
-        "bends",
+        help="exit with status 1 if the mappers cannot use the database, it is damaged, or the "
+        "model bends",
     )
     add_quiet(command)
 

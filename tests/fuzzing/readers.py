@@ -1,0 +1,108 @@
+"""Targets that feed any bytes to the readers of files: containers, HDF5, models, databases.
+
+    python tests/fuzzing/readers.py TARGET CORPUS... [options of libFuzzer]
+
+runs a target under atheris, which must be installed; the tests run all of them on damaged seeds.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from colmap_av1.database.check import check
+from colmap_av1.database.hloc import read_hloc
+from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
+
+_MODEL = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
+
+
+def container(data: bytes, folder: Path) -> None:
+    """Any bytes as a video file, whatever FFmpeg takes them for."""
+    path = folder / "video"
+    path.write_bytes(data)
+    options = ReadOptions(num_threads=1, max_frame_size=256 * 256)
+    for _ in read_motion(path, options):
+        pass
+
+
+def hdf5(data: bytes, folder: Path) -> None:
+    """Any bytes as a file of features, and those after it as one of matches."""
+    paths = [folder / "features.h5", folder / "matches.h5"]
+    for path, part in zip(paths, split(data, 2), strict=True):
+        path.write_bytes(part)
+    read_hloc(*paths)
+
+
+def model(data: bytes, folder: Path) -> None:
+    """Any bytes as the five files of a model."""
+    for name, part in zip(_MODEL, split(data, len(_MODEL)), strict=True):
+        (folder / name).write_bytes(part)
+    read_model(folder)
+
+
+def database(data: bytes, folder: Path) -> None:
+    """Any bytes as a database."""
+    path = folder / "a.db"
+    path.write_bytes(data)
+    check(path)
+    assert path.read_bytes() == data
+
+
+TARGETS: dict[str, Callable[[bytes, Path], None]] = {
+    "container": container,
+    "hdf5": hdf5,
+    "model": model,
+    "database": database,
+}
+
+
+def joined(parts: list[bytes]) -> bytes:
+    """An input of several files: each with its length in four bytes before it."""
+    return b"".join(struct.pack("<I", len(part)) + part for part in parts)
+
+
+def split(data: bytes, count: int) -> list[bytes]:
+    """The files of an input; a length beyond the end means what is left."""
+    parts = []
+    for _ in range(count):
+        (length,) = struct.unpack("<I", data[:4].ljust(4, b"\0"))
+        parts.append(data[4 : 4 + length])
+        data = data[4 + length :]
+    return parts
+
+
+def run(target: str, data: bytes) -> str | None:
+    """What a target says of an input, in one line; None where it takes it."""
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            TARGETS[target](data, Path(folder))
+        except ColmapAv1Error as error:
+            message = str(error)
+        else:
+            return None
+    assert "\n" not in message
+    return message
+
+
+def main() -> None:
+    """Run a target under atheris."""
+    import atheris  # noqa: PLC0415 - only where it is installed
+
+    target = sys.argv.pop(1)
+    # What reads is compiled, but for the package: that is what coverage is counted of.
+    atheris.instrument_all()
+    atheris.Setup(sys.argv, lambda data: run(target, data))
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
