@@ -1,14 +1,11 @@
 """Targets that feed any bytes to the readers of files: containers, HDF5, models, databases.
 
-    python tests/fuzzing/readers.py TARGET CORPUS... [options of libFuzzer]
-
-runs a target under atheris, which must be installed; the tests run all of them on damaged seeds.
+`with_atheris` runs them guided by coverage; the tests run all of them on damaged seeds.
 """
 
 from __future__ import annotations
 
 import struct
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -91,18 +88,3 @@ def run(target: str, data: bytes) -> str | None:
             return None
     assert "\n" not in message
     return message
-
-
-def main() -> None:
-    """Run a target under atheris."""
-    import atheris  # noqa: PLC0415 - only where it is installed
-
-    target = sys.argv.pop(1)
-    # What reads is compiled, but for the package: that is what coverage is counted of.
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, lambda data: run(target, data))
-    atheris.Fuzz()
-
-
-if __name__ == "__main__":
-    main()
