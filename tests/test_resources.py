@@ -18,8 +18,7 @@ from colmap_av1.errors import ColmapAv1Error, HlocError, ImageError, ModelError,
 from colmap_av1.images.choosing import check_frame_list
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import frames_of_images, natural_order
-from colmap_av1.model.binary_files import are_whole
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.colmap_model import are_whole, read_model
 from colmap_av1.options import ImageOptions
 
 resource = pytest.importorskip("resource")

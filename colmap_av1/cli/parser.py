@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
     def refuse_unknown(self, words: Sequence[str]) -> None:
         """Exit on an unknown option, and name the one nearest to it, or on a value like one."""
         known = self._option_string_actions
-        for word, following in zip(words, [*words[1:], ""], strict=True):
+        for word, following in zip(words, [*words, ""][1:], strict=True):
             name = word.partition("=")[0]
             takes_one = word in known and known[word].nargs is None
             if takes_one and _like_an_option(following) and following not in known:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, ModelError
 from colmap_av1.images.camera import camera_fault
 from colmap_av1.images.names import check_name
-from colmap_av1.model.binary_files import are_whole
 from colmap_av1.util.files import may_read
 
 _FILES = ("cameras", "images", "points3D")
@@ -31,6 +31,13 @@ _POINT = np.dtype(
 )
 _CAMERA_HEAD = 24
 _ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
+# What stands between the counts of these files, in bytes.
+_COUNT = struct.Struct("<Q")
+_SHORT_COUNT = struct.Struct("<I")
+_SMALLEST_CAMERA = _CAMERA_HEAD + 3 * 8  # of SIMPLE_PINHOLE
+_IMAGE_HEAD, _POINT_HEAD = 64, 43
+_RIG_HEAD, _SENSOR, _POSE = 8, 8, 56
+_FRAME_HEAD, _DATA_ID = 8 + _POSE, 16
 # Points written at a time; bounds memory.
 _CHUNK = 20_000
 
@@ -242,3 +249,95 @@ def _check_values(path: Path, reconstruction: Any) -> None:
         fault = camera_fault(camera)
         if fault:
             raise ModelError(f"{path}: camera {camera_id} has {fault}: {map_again}")
+
+
+def are_whole(model: Path) -> bool:
+    """Whether every count in a model's binary files is of records that are there.
+
+    Args:
+        model: folder with cameras.bin, images.bin and points3D.bin; rigs.bin and frames.bin of
+            COLMAP 3.12 and later are looked at where they are.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    files: dict[str, Callable[[mmap.mmap], bool]] = {
+        "cameras.bin": _cameras,
+        "images.bin": _images,
+        "points3D.bin": _points,
+        "rigs.bin": _rigs,
+        "frames.bin": _frames,
+    }
+    return all(
+        _is_whole(model / name, holds) for name, holds in files.items() if (model / name).exists()
+    )
+
+
+def _is_whole(path: Path, holds: Callable[[mmap.mmap], bool]) -> bool:
+    with path.open("rb") as file:
+        if path.stat().st_size < _COUNT.size:
+            return False
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            try:
+                return holds(data)
+            except struct.error:  # a count lies behind the end
+                return False
+
+
+def _cameras(data: mmap.mmap) -> bool:
+    # Their lengths depend on their models, which pycolmap checks.
+    (count,) = _COUNT.unpack_from(data)
+    return bool(_COUNT.size + count * _SMALLEST_CAMERA <= len(data))
+
+
+def _images(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        end_of_name = data.find(b"\0", position + _IMAGE_HEAD)
+        if end_of_name < 0:
+            return False
+        (num_points,) = _COUNT.unpack_from(data, end_of_name + 1)
+        position = end_of_name + 1 + _COUNT.size + num_points * _OBSERVATION.itemsize
+        if position > len(data):
+            return False
+    return True
+
+
+def _points(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position, end, each = _COUNT.size, len(data), _ELEMENT.itemsize
+    unpack = _COUNT.unpack_from  # there may be millions
+    for _ in range(count):
+        (length,) = unpack(data, position + _POINT_HEAD)
+        position += _POINT_HEAD + _COUNT.size + length * each
+        if position > end:
+            return False
+    return True
+
+
+def _rigs(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        (num_sensors,) = _SHORT_COUNT.unpack_from(data, position + _RIG_HEAD - _SHORT_COUNT.size)
+        position += _RIG_HEAD + (_SENSOR if num_sensors else 0)
+        if position + (num_sensors - 1) * (_SENSOR + 1) > len(data):
+            return False
+        for _ in range(num_sensors - 1):
+            has_pose = data[position + _SENSOR : position + _SENSOR + 1] != b"\0"
+            position += _SENSOR + 1 + (_POSE if has_pose else 0)
+        if position > len(data):
+            return False
+    return True
+
+
+def _frames(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        (num_ids,) = _SHORT_COUNT.unpack_from(data, position + _FRAME_HEAD)
+        position += _FRAME_HEAD + _SHORT_COUNT.size + num_ids * _DATA_ID
+        if position > len(data):
+            return False
+    return True
