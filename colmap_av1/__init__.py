@@ -6,6 +6,8 @@ if start.is_program():
     start.import_pycolmap()
 
 # isort: split
+from colmap_av1.batch.page import write_page
+from colmap_av1.batch.run import BatchReport, run_batch
 from colmap_av1.database.check import CheckReport, check
 from colmap_av1.database.hloc import HlocMatches, export_hloc, read_hloc
 from colmap_av1.densify import DensifyReport, densify
@@ -30,6 +32,7 @@ from colmap_av1.motion.info import StreamReport, inspect
 from colmap_av1.motion.motion_file import export_motion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import (
+    BatchOptions,
     CameraOptions,
     CompareOptions,
     DensifyOptions,
@@ -57,6 +60,8 @@ from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.video.encode import EncodeReport, encode
 
 __all__ = [
+    "BatchOptions",
+    "BatchReport",
     "BitstreamError",
     "CameraOptions",
     "CheckReport",
@@ -112,4 +117,6 @@ __all__ = [
     "read_hloc",
     "read_motion",
     "reconstruct",
+    "run_batch",
+    "write_page",
 ]

@@ -10,10 +10,14 @@ from functools import partial
 from typing import Any, TypeVar
 
 from colmap_av1.cli.parser import Parser
+from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, declared_of, field_types, is_path, members_of
 
 _Options = TypeVar("_Options", bound=Options)
 _Number = TypeVar("_Number", int, float)
+
+# Starts the names, in a namespace, of options that several dataclasses share.
+_ANY = "any."
 
 
 def add_options(command: Parser, *kinds: type[Options]) -> None:
@@ -43,6 +47,50 @@ def given(namespace: argparse.Namespace, kind: type[_Options]) -> _Options:
         OptionError: a value cannot work.
     """
     return _with_given(kind(), kind.__name__, vars(namespace))
+
+
+def add_options_of_any(command: Parser, *kinds: type[Options]) -> None:
+    """Add the options of several dataclasses of which one is used; what they share once.
+
+    See `given_of_any`.
+
+    Args:
+        command: the subcommand.
+        kinds: the dataclasses.
+    """
+    added: set[str] = set()
+    for kind in kinds:
+        for options, path in _parts(kind(), kind.__name__, frozenset()):
+            fields = [field for field in path.fields if field.name not in added]
+            if fields:
+                group = command.add_argument_group(options.title)
+            for field in fields:
+                _add_option(command, group, options, field, f"{_ANY}{field.name}")
+                added.add(field.name)
+
+
+def given_of_any(namespace: argparse.Namespace, kind: type[_Options], what: str) -> _Options:
+    """The same as `given`, of options that `add_options_of_any` has added.
+
+    Args:
+        namespace: the parsed words.
+        kind: the dataclass that is used.
+        what: what it is for, for messages.
+
+    Raises:
+        OptionError: a value cannot work, or an option is of another dataclass.
+    """
+    options = kind()
+    left = {k.removeprefix(_ANY): v for k, v in vars(namespace).items() if k.startswith(_ANY)}
+    values = {
+        f"{path.name}.{field.name}": left.pop(field.name)
+        for _, path in _parts(options, kind.__name__, frozenset())
+        for field in path.fields
+        if field.name in left
+    }
+    if left:
+        raise OptionError(f"{next(iter(left))} is no option of {what}: leave it out")
+    return _with_given(options, kind.__name__, values)
 
 
 def underscored(word: str) -> str:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
+from colmap_av1.cli.commands.batch import add_batch
 from colmap_av1.cli.commands.check import add_check
 from colmap_av1.cli.commands.compare import add_compare
 from colmap_av1.cli.commands.densify import add_densify
@@ -46,8 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; None: those of this process.
 
     Returns:
-        Exit status: 0, 1 where a check fails, 2 for bad input and output that cannot be written,
-        130 when interrupted, 141 where nobody reads the output to its end.
+        Exit status: 0, 1 where a check or a video of a batch fails, 2 for bad input and output that
+        cannot be written, 130 when interrupted, 141 where nobody reads the output to its end.
 
     Raises:
         SystemExit: a signal ends the process.
@@ -109,8 +110,8 @@ def _make_parser() -> tuple[Parser, Mapping[str, Parser]]:
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for add in (
-        *(add_match, add_map, add_reconstruct, add_densify, add_compare, add_encode),
-        *(add_info, add_check, add_motion, add_export, add_view),
+        *(add_match, add_map, add_reconstruct, add_densify, add_batch, add_compare),
+        *(add_encode, add_info, add_check, add_motion, add_export, add_view),
     ):
         add(commands)
     return parser, commands.choices

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from colmap_av1.batch.run import BatchReport
 from colmap_av1.database.check import CheckReport
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
@@ -151,6 +152,25 @@ def densify_rows(report: DensifyReport) -> Rows:
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *_seconds_rows(report.seconds),
     ]
+
+
+def batch_rows(report: BatchReport) -> Rows:
+    """What became of the videos of a batch."""
+    kept = f", {report.num_kept} of them before" if report.num_kept else ""
+    rows = [
+        ("output", report.output),
+        ("videos", str(report.num_videos)),
+        ("done", f"{report.num_done}{kept}"),
+        ("failed", ", ".join(f"{n} {reason}" for reason, n in report.failed.items()) or "0"),
+        ("tried again", str(report.num_retried)),
+        ("seconds", f"{report.seconds:.2f}"),
+        ("CPU seconds", f"{report.cpu_seconds:.2f}"),
+    ]
+    if report.video_seconds > 0:
+        minutes = report.video_seconds / 60
+        hours = report.cpu_seconds / 3600 / minutes * 1000
+        rows.append(("cost", f"{hours:.1f} CPU hours for 1,000 minutes of video"))
+    return rows
 
 
 def compare_rows(report: CompareReport) -> Rows:

@@ -1,5 +1,6 @@
 """Options of every stage: frozen dataclasses that check their values."""
 
+from colmap_av1.options.batch import BatchOptions
 from colmap_av1.options.camera import CameraOptions
 from colmap_av1.options.commands import (
     DensifyOptions,
@@ -23,6 +24,7 @@ from colmap_av1.options.video import EncodeOptions, ReadOptions
 from colmap_av1.options.view import ViewOptions
 
 __all__ = [
+    "BatchOptions",
     "CameraOptions",
     "CompareOptions",
     "DensifyOptions",

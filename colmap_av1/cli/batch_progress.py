@@ -1,0 +1,102 @@
+"""Progress of a batch: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from colmap_av1.batch.jobs import Row
+from colmap_av1.batch.run import Counts, Watch
+from colmap_av1.cli.terminal import PROGRAM, print_warning
+
+_LINE_EVERY = 30.0  # seconds
+# Further failures are counted; batch.csv has them all.
+_MOST_LINES = 20
+
+
+@contextmanager
+def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]:
+    """What `run_batch` tells how far it is; failures are warnings, quiet or not."""
+    if quiet or not sys.stderr.isatty():
+        lines = _Lines(quiet)
+        yield lines.hear, lines.watch
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[failed]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task("videos", total=None, rate="", failed="")
+        failures = _Failures(lambda text: progress.console.print(Text(f"{PROGRAM}: {text}")))
+
+        def watch(counts: Counts, row: Row | None) -> None:
+            failures.show(row)
+            speed = progress.tasks[bar].speed
+            progress.update(
+                bar,
+                total=counts.total,
+                completed=counts.ended,
+                rate=f"{speed:.1f}/s" if speed else "",
+                failed=_failed(counts),
+            )
+
+        yield (lambda about: progress.console.print(Text(about))), watch
+
+
+class _Failures:
+    """Prints the first failures."""
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self._show = show
+        self._num_shown = 0
+
+    def show(self, row: Row | None) -> None:
+        if row is None or row.state == "done" or self._num_shown > _MOST_LINES:
+            return
+        self._num_shown += 1
+        if self._num_shown > _MOST_LINES:
+            self._show("warning: further failures are in batch.csv")
+            return
+        self._show(f"warning: {row.name}: {row.reason}: {row.error}".replace("\n", "\\n"))
+
+
+class _Lines:
+    """Prints lines, as logs of queues keep them."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
+        self._failures = _Failures(lambda text: print_warning(text.removeprefix("warning: ")))
+        self._start = self._last = time.monotonic()
+
+    def hear(self, about: str) -> None:
+        if not self._quiet:
+            print(f"{PROGRAM}: {about}", file=sys.stderr)
+
+    def watch(self, counts: Counts, row: Row | None) -> None:
+        self._failures.show(row)
+        now = time.monotonic()
+        if self._quiet or now - self._last < _LINE_EVERY:
+            return
+        self._last = now
+        words = f"{counts.ended} of {counts.total} videos"
+        rate = counts.ended / (now - self._start)
+        if rate > 0:
+            minutes = (counts.total - counts.ended) / rate / 60
+            words += f", {rate:.2g} a second, {minutes:.0f} minutes left"
+        failed = _failed(counts)
+        print(f"{PROGRAM}: {words}{failed and f', {failed}'}", file=sys.stderr)
+
+
+def _failed(counts: Counts) -> str:
+    number = counts.failed.total()
+    return f"{number} failed" if number else ""

@@ -1,0 +1,49 @@
+"""Memory that this process may use, and that processes use."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_UNKNOWN = 8 << 30
+
+
+def usable_memory() -> int:
+    """Bytes of memory that this process and those it starts may use together.
+
+    Containers and queues of clusters give less than the machine has.
+    """
+    limits = [_machine_memory()]
+    with suppress(OSError):
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            group = _CGROUPS / (controllers and "memory") / path.lstrip("/")
+            name = "memory.limit_in_bytes" if controllers else "memory.max"
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            for folder in (group, *group.parents):
+                if folder.is_relative_to(_CGROUPS):
+                    with suppress(OSError, ValueError):
+                        limits.append(int((folder / name).read_text()))
+    return min(limits)
+
+
+def _machine_memory() -> int:
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # not on Windows
+        return _UNKNOWN
+
+
+def resident_memory(process: int) -> int:
+    """Bytes of memory that a process and those it has started hold; 0 where that is not known."""
+    total = 0
+    with suppress(OSError, ValueError, IndexError):
+        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+        total = pages * os.sysconf("SC_PAGE_SIZE")
+        for task in Path(f"/proc/{process}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                total += resident_memory(int(child))
+    return total
