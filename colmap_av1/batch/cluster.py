@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -19,6 +20,7 @@ EXTRA = "colmap-av1[cluster]"
 _AHEAD = 3
 _LEAST_AHEAD = 16
 _LOOK = 10.0  # seconds between looks at the size of the cluster
+_ANSWERS = 10.0  # seconds in which something must answer at an address
 
 _worker: Worker | None = None
 
@@ -37,7 +39,9 @@ class RayEngine:
             raise OptionError(f"engine ray needs the package ray: pip install '{EXTRA}'") from error
         self._ray: Any = ray
         how: dict[str, Any] = {"address": address}
-        if address is None:
+        if address is not None:
+            _check_answers(address)
+        else:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             how = {"num_cpus": threads_or_cpus(None), "address": "local"}
         # Functions and options of this package are sent by name: nodes have it installed.
@@ -118,6 +122,23 @@ class RayEngine:
         self._seen = time.monotonic()
         self._cores: float = sum(node["CPU"] for node in nodes)
         self._largest = {what: max(n.get(what, 0) for n in nodes) for what in ("CPU", "memory")}
+
+
+def _check_answers(address: str) -> None:
+    """Refuse an address where nothing answers, to which Ray would try to connect for long.
+
+    Raises:
+        OptionError: nothing answers.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdecimal():  # such as 'auto'
+        return
+    try:
+        socket.create_connection((host, int(port)), _ANSWERS).close()
+    except (OSError, OverflowError) as error:
+        raise OptionError(
+            f"no Ray at {address}: {error}: give the address that 'ray start' has printed"
+        ) from error
 
 
 def attempt_here(work: Work, job: Job) -> Outcome:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import glob
 import os
+import posixpath
 import tarfile
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from colmap_av1.batch.files import filesystem, is_url, open_to_read, unless_stalled
@@ -90,35 +91,38 @@ def _named(addresses: Sequence[str] | Iterator[str], root: str, stall: float) ->
 def _name_below(address: str, root: str) -> str:
     """The path without suffix below a folder; the file's name alone where it is elsewhere."""
     prefix = root if root.endswith("/") or not root else f"{root}/"
-    below = address.removeprefix(prefix) if address.startswith(prefix) else ""
-    path = PurePosixPath(below.partition("?")[0] if is_url(address) else below)
-    if not below or path.is_absolute() or ".." in path.parts or is_url(below):
-        path = PurePosixPath(PurePosixPath(address.partition("?")[0]).name)
-    return str(path.with_suffix("")) if path.name else str(path)
+    below = address[len(prefix) :] if address.startswith(prefix) else ""
+    if is_url(address):
+        below, address = below.partition("?")[0], address.partition("?")[0]
+    if not below or below.startswith("/") or is_url(below) or ".." in below.split("/"):
+        below = address.rpartition("/")[2]
+    return posixpath.splitext(posixpath.normpath(below))[0]
 
 
 def _suffix_of(address: str) -> str:
     path = address.partition("?")[0] if is_url(address) else address
-    return PurePosixPath(path).suffix.lower()
+    return posixpath.splitext(path)[1].lower()
 
 
 def _members(address: str, name: str, stall: float) -> Iterator[Named]:
     """The videos in a tar file, as WebDataset lays them out."""
 
-    def read(_: Any) -> list[Named]:
+    def read(beat: Callable[[], None]) -> list[Named]:
         found = []
-        with open_to_read(address) as file, tarfile.open(fileobj=file, mode="r:") as tar:
-            for member in tar:
-                if member.isfile() and _suffix_of(member.name) in VIDEO_SUFFIXES:
-                    stem = _name_below(f"./{member.name.lstrip('./')}", ".")
-                    part = Source(address, member.name, member.offset_data, member.size)
-                    found.append((f"{name}/{stem}", part))
+        try:
+            with open_to_read(address) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+                for member in tar:
+                    beat()
+                    if member.isfile() and _suffix_of(member.name) in VIDEO_SUFFIXES:
+                        stem = _name_below(member.name.lstrip("./"), "")
+                        part = Source(address, member.name, member.offset_data, member.size)
+                        found.append((f"{name}/{stem}", part))
+        except tarfile.TarError as error:
+            what = f"{address}: no tar file, or damaged: {error}: give another"
+            raise OptionError(what) from error
         return found
 
-    try:
-        yield from unless_stalled(read, address, stall)
-    except tarfile.TarError as error:
-        raise OptionError(f"{address}: no tar file, or damaged: {error}: give another") from error
+    yield from unless_stalled(read, address, stall)
 
 
 def _of_list(word: str, stall: float) -> Iterator[Named]:

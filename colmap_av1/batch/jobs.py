@@ -1,9 +1,10 @@
-"""What a batch hands to its engines, and what it gets back."""
+"""What a batch hands to its engines, what it gets back, and what an engine is."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 from colmap_av1.options.fields import Options
 
@@ -161,3 +162,29 @@ class TooSmall:
 
 
 Outcome = Ended | TooSmall
+
+
+class Engine(Protocol):
+    """Runs attempts at videos, several at a time.
+
+    Attributes:
+        about: what it runs on, a line for the user.
+    """
+
+    about: str
+
+    def has_room(self, job: Job) -> bool:
+        """Whether to submit a video now, not to wait for others first."""
+        ...
+
+    def submit(self, job: Job) -> None:
+        """Attempt a video as soon as there is what it needs."""
+        ...
+
+    def wait(self, seconds: float) -> Sequence[tuple[Job, Outcome]]:
+        """The attempts that have ended since, at least one unless none does in that time."""
+        ...
+
+    def close(self) -> None:
+        """Stop all attempts at once."""
+        ...

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any, cast
 
 from colmap_av1.batch.cluster import RayEngine
-from colmap_av1.batch.engine import Engine
 from colmap_av1.batch.files import absolute
 from colmap_av1.batch.index import Index
 from colmap_av1.batch.inputs import list_videos
-from colmap_av1.batch.jobs import Ended, Job, Needs, Outcome, Row, TooSmall, Work
+from colmap_av1.batch.jobs import Ended, Engine, Job, Needs, Outcome, Row, TooSmall, Work
 from colmap_av1.batch.local import LocalEngine
 from colmap_av1.batch.needs import least_needs
 from colmap_av1.batch.outputs import (

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av.error
 import cv2
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
@@ -99,7 +100,8 @@ def write_thumbnail(video: Path, folder: Path) -> None:
         data = np.fromfile(images[len(images) // 2], dtype=np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
     else:
-        with suppress(ColmapAv1Error):
+        # Of some formats of pixels FFmpeg makes no picture.
+        with suppress(ColmapAv1Error, av.error.FFmpegError):
             frames = decode_frames(video, num_threads=1)
             picture = next((frame for _, frame in frames), None)
             frames.close()

@@ -1,0 +1,187 @@
+"""Batches on this machine: what is there afterwards, and what a second run does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from batch_output import files_of, rows_of
+
+from colmap_av1 import (
+    BatchOptions,
+    DensifyOptions,
+    ImageOptions,
+    MatchOptions,
+    OptionError,
+    ReadOptions,
+    ReconstructOptions,
+    RunOptions,
+    run_batch,
+)
+from colmap_av1.batch.run import Counts
+from colmap_av1.cli import main
+
+# One process for all videos: it starts slower than it does most of them.
+ALONE = BatchOptions(cores=1000, retries=0)
+SMALL = MatchOptions(images=ImageOptions(image_name="%03d.jpg"))
+
+
+def test_every_video_ends_done_or_named(clips: Path, tmp_path: Path) -> None:
+    seen: list[Counts] = []
+    out = tmp_path / "out"
+    report = run_batch(clips, out, SMALL, watch=lambda c, _: seen.append(replace(c)))
+    assert (report.num_videos, report.num_done, report.num_kept) == (40, 36, 0)
+    assert report.failed == {"damaged": 2, "unreadable": 2}
+    assert len(seen) == 41
+    assert all(counts.total == 40 for counts in seen)
+    rows = rows_of(out)
+    paths = sorted(p.relative_to(clips).as_posix() for p in clips.rglob("*.mp4"))
+    assert [f"{row['name']}.mp4" for row in rows] == paths
+    assert [row["state"] for row in rows if "clip" not in row["name"]] == ["failed"] * 4
+    for row in rows:
+        files = sorted(p.name for p in (out / row["name"]).glob("*"))
+        if row["state"] == "failed":
+            assert not files
+            assert row["error"].startswith(f"{clips / row['name']}.mp4: ")
+        else:
+            assert files == ["database.db", "images", "report.json", "thumbnail.jpg"]
+            with sqlite3.connect(out / row["name"] / "database.db") as database:
+                assert database.execute("SELECT COUNT(*) FROM images").fetchone() == (
+                    int(row["images"]),
+                )
+    report_text = (out / "a" / "clip00" / "report.json").read_text()
+    assert '"database": "a/clip00/database.db"' in report_text
+    assert sorted(p.name for p in (out / ".batch").iterdir()) == ["batch.lock"]
+
+
+def test_a_second_run_does_what_has_changed(clips: Path, tmp_path: Path) -> None:
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    for name in ("clip00", "clip02", "clip04", "damaged0"):
+        shutil.copy2(clips / "a" / f"{name}.mp4", videos)
+    out = tmp_path / "out"
+    task = ReadOptions()
+    assert run_batch(videos, out, task, options=ALONE).num_done == 3
+    before, first = files_of(out), (out / "clip00" / "report.json").stat()
+    threads = ReadOptions(num_threads=2)  # has no effect on the result
+    again = run_batch(videos, out, threads, options=ALONE)
+    assert (again.num_done, again.num_kept, again.failed) == (3, 3, {"damaged": 1})
+    assert files_of(out) == before
+    assert (out / "clip00" / "report.json").stat() == first
+
+    shutil.copyfile(clips / "a" / "clip04.mp4", videos / "clip02.mp4")
+    (out / "clip04" / "report.json").write_text('{"key": ')
+    (out / "clip04" / "report.json").unlink()
+    (out / "clip04" / "thumbnail.jpg").unlink()
+    changed = run_batch(videos, out, task, options=ALONE)
+    assert (changed.num_done, changed.num_kept) == (3, 1)
+    assert rows_of(out)[1]["frames"] == "7"
+    assert run_batch(videos, out, ReadOptions(strict=True), options=ALONE).num_kept == 0
+
+
+def test_shards_share_an_output(clips: Path, tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    run_batch(clips / "a", whole, ReadOptions(), options=ALONE)
+    for i in (1, 2):
+        run_batch(clips / "a", parts, ReadOptions(), options=replace(ALONE, shard=f"{i}/2"))
+    assert files_of(parts) == files_of(whole)
+    rows = [rows_of(parts, f"batch-{i}-of-2.csv") for i in (1, 2)]
+    assert [rows[i % 2][i // 2] for i in range(20)] == rows_of(whole)
+
+
+def test_folders_of_others_stay(clips: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    mine = out / "clip00" / "mine.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("kept")
+    (out / "clip02").write_text("kept")
+    videos = [clips / "a" / f"clip{i:02}.mp4" for i in (0, 2, 4)]
+    report = run_batch(videos, out, ReadOptions(), options=ALONE)
+    assert report.failed == {"unfit": 2}
+    assert "is there and not of a batch" in rows_of(out)[0]["error"]
+    assert mine.read_text() == "kept"
+    assert (out / "clip02").read_text() == "kept"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_no_permission_in_the_middle(clips: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "a").mkdir(parents=True, mode=0o555)
+    report = run_batch(clips, out, ReadOptions())
+    assert report.failed["reading or writing"] == 18
+    assert report.num_done == 18
+
+
+def test_a_place_that_cannot_be_written(clips: Path, tmp_path: Path) -> None:
+    """One folder of the output cannot be made: the others are."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a").write_text("a file")
+    report = run_batch(clips, out, ReadOptions(), options=ALONE)
+    assert report.failed == {"damaged": 2, "reading or writing": 18, "unreadable": 2}
+    assert report.num_done == 18
+    with pytest.raises(OptionError, match="cannot be written"):
+        run_batch(clips, out / "a", ReadOptions())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")
+def test_names_that_are_no_text(clips: Path, tmp_path: Path) -> None:
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    name = os.fsdecode(b"caf\xe9, \xc3\xa9.mp4")
+    shutil.copyfile(clips / "a" / "clip00.mp4", videos / name)
+    out = tmp_path / "out"
+    assert run_batch(videos, out, ReadOptions(), options=ALONE).num_done == 1
+    assert rows_of(out)[0]["name"] == name.removesuffix(".mp4")
+    assert run_batch(videos, out, ReadOptions(), options=ALONE).num_kept == 1
+    assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
+
+
+def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(OptionError, match="keep_stream"):
+        run_batch(clips, out, MatchOptions(keep_stream="x.mp4"))
+    with pytest.raises(OptionError, match="models is missing"):
+        run_batch(clips, out, DensifyOptions())
+    with pytest.raises(OptionError, match="models is for"):
+        run_batch(clips, out, ReconstructOptions(), models=tmp_path)
+    with pytest.raises(OptionError, match="no options of a batch"):
+        run_batch(clips, out, RunOptions())
+    with pytest.raises(OptionError, match="give engine ray"):
+        BatchOptions(address="auto")
+    assert not out.exists()
+
+
+def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "out")
+    one = ["batch", "--inputs", str(clips / "a" / "clip00.mp4"), "--output", out]
+    all_of_them = ["batch", "--inputs", str(clips), "--output", out, "--cores", "99"]
+    assert main([*one, "--task", "match", "--image-name", "%03d.jpg", "--write_images", "0"]) == 0
+    printed = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
+    assert (printed["videos"], printed["done"], printed["failed"]) == ("1", "1", "0")
+    assert not (tmp_path / "out" / "clip00" / "images").exists()
+    assert main([*all_of_them, "--task", "info"]) == 1
+    assert capsys.readouterr().err.count("warning: ") == 4
+    assert main([*one, "--task", "info", "--num_images", "5"]) == 2
+    assert "num_images is no option of the task info" in capsys.readouterr().err
+    assert main(one) == 2
+    assert main(["batch", "--task", "info", "--output", out]) == 2
+
+
+def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    tried = []
+
+    def try_another(counts: Counts, _: object) -> None:
+        if counts.ended == 1:
+            with pytest.raises(OptionError, match="another batch is at work"):
+                run_batch(clips, out, ReadOptions())
+            tried.append(True)
+
+    run_batch(*(clips / "a" / "clip00.mp4", out, ReadOptions()), options=ALONE, watch=try_another)
+    assert tried == [True]

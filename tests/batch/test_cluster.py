@@ -1,0 +1,78 @@
+"""Batches by Ray: the same rows and bytes as on one machine, and a node that is lost."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batch_output import files_of, rows_of, workers_of
+from conftest import PROJECT
+
+from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
+from colmap_av1.batch.run import Counts
+
+ray: Any = pytest.importorskip("ray", reason="needs ray: pip install '.[cluster]'")
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A Ray of two nodes on this machine, of one core each."""
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 - where there is a Ray
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(PROJECT), prepend=os.pathsep)
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        store = {"object_store_memory": 80 << 20, "include_dashboard": False}
+        started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, **store})
+        started.add_node(num_cpus=1, **store)
+        yield started
+        started.shutdown()
+
+
+def ray_workers() -> list[int]:
+    """Processes in which Ray runs tasks."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if (folder / "cmdline").read_bytes().startswith(b"ray::video"):
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_a_cluster_that_loses_processes_and_a_node(
+    cluster: Any, clips: Path, tmp_path: Path
+) -> None:
+    local, out = tmp_path / "local", tmp_path / "out"
+    run_batch(clips, local, ReadOptions())
+    options = BatchOptions(engine="ray", address=cluster.address, retries=99)
+    rng = random.Random(0)
+
+    def harm(counts: Counts, _: object) -> None:
+        if counts.ended in {5, 12, 30}:
+            for process in ray_workers()[:1]:
+                os.kill(process, signal.SIGKILL)
+        if counts.ended in {8, 25}:
+            processes = workers_of(*ray_workers())
+            if processes:
+                os.kill(rng.choice(processes), signal.SIGKILL)
+        if counts.ended == 18 and len(cluster.worker_nodes) == 1:
+            cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+
+    report = run_batch(clips, out, ReadOptions(), options=options, watch=harm)
+    assert (report.num_done, report.failed) == (36, {"damaged": 2, "unreadable": 2})
+    assert rows_of(out) == rows_of(local)
+    assert files_of(out) == files_of(local)
+    assert len(cluster.worker_nodes) == 0
+
+
+def test_no_cluster(clips: Path, tmp_path: Path) -> None:
+    options = BatchOptions(engine="ray", address="127.0.0.1:1")
+    with pytest.raises(OptionError, match="no Ray at 127"):
+        run_batch(clips, tmp_path / "out", ReadOptions(), options=options)

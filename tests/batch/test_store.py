@@ -1,0 +1,98 @@
+"""Inputs and outputs in an object store: S3 as moto has it, on the loopback."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batch_output import files_of, rows_of
+
+from colmap_av1 import BatchOptions, ReadOptions, run_batch, write_page
+from colmap_av1.cli import main
+
+moto: Any = pytest.importorskip("moto.server", reason="needs moto: pip install '.[dev]'")
+s3fs: Any = pytest.importorskip("s3fs", reason="needs s3fs: pip install '.[remote]'")
+
+ALONE = BatchOptions(cores=1000, retries=0)
+
+
+@pytest.fixture
+def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The file system of a store with a bucket 'bucket'."""
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    for name, value in (
+        ("AWS_ENDPOINT_URL", f"http://{host}:{port}"),
+        ("AWS_ACCESS_KEY_ID", "any"),
+        ("AWS_SECRET_ACCESS_KEY", "any"),
+        ("AWS_DEFAULT_REGION", "us-east-1"),
+    ):
+        monkeypatch.setenv(name, value)
+    system = s3fs.S3FileSystem(use_listings_cache=False, skip_instance_cache=True)
+    system.mkdir("bucket")
+    yield system
+    s3fs.S3FileSystem.clear_instance_cache()
+    server.stop()
+
+
+def test_a_batch_in_a_store(store: Any, clips: Path, tmp_path: Path) -> None:
+    videos = ["a/clip00", "a/clip02", "b/clip01", "b/text0"]
+    for name in videos:
+        store.put_file(str(clips / f"{name}.mp4"), f"bucket/in/{name}.mp4")
+    with tarfile.open(tmp_path / "shard.tar", "w") as tar:
+        tar.add(clips / "a" / "clip04.mp4", "clip04.mp4")
+        about = tarfile.TarInfo("clip04.json")
+        tar.addfile(about, io.BytesIO())
+    store.put_file(str(tmp_path / "shard.tar"), "bucket/in/shard.tar")
+
+    inputs, output = "s3://bucket/in", "s3://bucket/out"
+    report = run_batch(inputs, output, ReadOptions(), options=ALONE)
+    assert (report.num_done, report.failed) == (4, {"unreadable": 1})
+    assert run_batch(inputs, output, ReadOptions(), options=ALONE).num_kept == 4
+    copy = tmp_path / "copy"
+    store.get("bucket/out/", str(copy), recursive=True)
+    rows = rows_of(copy)
+    assert [r["name"] for r in rows] == [*videos, "shard/clip04"]
+    assert rows[0]["input"] == "s3://bucket/in/a/clip00.mp4"
+    assert rows[3]["error"].startswith("s3://bucket/in/b/text0.mp4: not a video")
+    assert json.loads((copy / "a/clip00/report.json").read_text())["input"]["ETag"]
+    assert sorted(files_of(copy)) == [
+        f"{name}/{file}"
+        for name in sorted({*videos, "shard/clip04"} - {"b/text0"})
+        for file in ("report.json", "thumbnail.jpg")
+    ]
+    assert write_page(output) == f"{output}/report.html"
+    assert store.exists("bucket/out/report.html")
+
+
+def test_folders_are_whole_or_unmarked(store: Any, clips: Path, tmp_path: Path) -> None:
+    """A changed video takes the place of an earlier one; what others have made stays."""
+    list_of = tmp_path / "list"
+    list_of.write_text("s3://bucket/in/x.mp4\ns3://bucket/in/y.mp4\n")
+    for name in ("x", "y"):
+        store.put_file(str(clips / "a" / "clip00.mp4"), f"bucket/in/{name}.mp4")
+    store.pipe_file("bucket/out/y/mine", b"mine")
+    words = ["batch", "--inputs", str(list_of), "--output", "s3://bucket/out", "--task", "info"]
+    assert main([*words, "--quiet", "--cores", "99"]) == 1
+    assert store.find("bucket/out/y") == ["bucket/out/y/mine"]
+    first = store.cat_file("bucket/out/x/report.json")
+
+    # As an upload that was cut off leaves it.
+    store.rm_file("bucket/out/x/report.json")
+    store.pipe_file("bucket/out/x/.unfinished", b"")
+    store.pipe_file("bucket/out/x/images/stale.png", b"")
+    store.put_file(str(clips / "a" / "clip02.mp4"), "bucket/in/x.mp4")
+    run_batch("s3://bucket/in/x.mp4", "s3://bucket/out", ReadOptions(), options=ALONE)
+    assert [p.rpartition("/")[2] for p in store.find("bucket/out/x")] == [
+        "report.json",
+        "thumbnail.jpg",
+    ]
+    assert store.cat_file("bucket/out/x/report.json") != first
+    shutil.rmtree(tmp_path)

@@ -1,0 +1,51 @@
+"""What batches leave, but for the times that they took, and the processes that they run."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+# Left out where runs are compared.
+TIMES = ("seconds", "cpu_seconds")
+
+
+def rows_of(output: Path, name: str = "batch.csv") -> list[dict[str, str]]:
+    """The rows of a batch without the times."""
+    with (output / name).open(newline="", errors="surrogateescape") as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in rows]
+
+
+def files_of(output: Path) -> dict[str, bytes]:
+    """The files of the videos; reports without the times."""
+    found = {}
+    for path in sorted(output.rglob("*")):
+        relative = path.relative_to(output)
+        if path.is_file() and len(relative.parts) > 1 and relative.parts[0] != ".batch":
+            content = path.read_bytes()
+            if path.name == "report.json":
+                content = json.dumps(_timeless(json.loads(content))).encode()
+            found[relative.as_posix()] = content
+    return found
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _timeless(v) for k, v in value.items() if k not in TIMES}
+    return value
+
+
+def workers_of(*drivers: int) -> list[int]:
+    """The processes that attempt videos for some processes."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (folder / "cmdline").read_bytes()
+        except OSError:  # it has ended
+            continue
+        if parent in drivers and b"colmap_av1.batch.worker" in command:
+            found.append(int(folder.name))
+    return sorted(found)
