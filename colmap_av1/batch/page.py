@@ -58,6 +58,7 @@ td.text, th.text { text-align: left; white-space: normal; overflow-wrap: anywher
   min-width: 8em; max-width: 24em; }
 th:first-child, td:first-child { padding-left: 0; }
 #videos { width: 100%; }
+#failures td.text { max-width: 60em; }
 #videos th { position: sticky; top: 0; background: #fff; cursor: pointer; }
 #videos th[data-order=up]::after { content: " \\25b2"; }
 #videos th[data-order=down]::after { content: " \\25bc"; }

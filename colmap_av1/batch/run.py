@@ -77,8 +77,8 @@ class BatchReport:
         failed: numbers of failed videos by reason.
         num_retried: attempts beyond the first.
         seconds: wall time.
-        cpu_seconds: CPU time of the last attempts at the videos, but for those kept and lost.
-        video_seconds: length of the videos that these attempts were done with.
+        cpu_seconds: CPU time of the attempts by which this run has done videos.
+        video_seconds: length of these videos.
         warnings: what the user should know.
     """
 
@@ -158,7 +158,7 @@ def run_batch(
         try:
             for job, ended in _drive(jobs, engine, options.retries, counts):
                 index.record(job.position, ended.row)
-                if not ended.kept:
+                if not ended.kept and ended.row.state == "done":
                     totals[0] += ended.row.cpu_seconds or 0.0
                     totals[1] += ended.row.video_seconds or 0.0
                 watch(counts, ended.row)

@@ -38,6 +38,7 @@ def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     system = s3fs.S3FileSystem(use_listings_cache=False, skip_instance_cache=True)
     system.mkdir("bucket")
     yield system
+    system.rm("bucket", recursive=True)
     s3fs.S3FileSystem.clear_instance_cache()
     server.stop()
 
