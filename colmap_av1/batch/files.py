@@ -70,8 +70,9 @@ def state_of(source: Source, stall: float) -> dict[str, Any]:
             raise _missing(source.address) from error
         return {"bytes": status.st_size, "mtime_ns": status.st_mtime_ns, **part}
 
+    system, path = filesystem(source.address)
+
     def ask(_: Callable[[], None]) -> dict[str, Any]:
-        system, path = filesystem(source.address)
         info = system.info(path)
         tags = {tag: str(info[tag]) for tag in _TAGS if info.get(tag) is not None}
         return {"bytes": info.get("size"), **tags, **part}

@@ -62,7 +62,7 @@ def read_json(lines: Iterable[str]) -> Iterator[Row]:
 
 def row_facts(row: Row) -> dict[str, Any]:
     """A row as JSON holds it."""
-    facts: dict[str, Any] = plain(dataclasses.asdict(row))
+    facts: dict[str, Any] = plain(vars(row))
     return facts
 
 

@@ -33,8 +33,8 @@ from colmap_av1.options import BatchOptions, DensifyOptions
 from colmap_av1.options.fields import Options
 from colmap_av1.util.digests import package_version
 
-# Rows are written at most so often, and for at most this share of the time: of a million videos
-# that takes seconds.
+# Rows are written at most so often, and for at most this share of the time: those of a million
+# videos take half a minute.
 _WRITE_EVERY = 5.0
 _WRITE_SHARE = 0.05
 _WAIT = 1.0

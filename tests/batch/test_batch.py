@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from batch_output import files_of, rows_of
+from conftest import PROJECT
 
 from colmap_av1 import (
     BatchOptions,
@@ -23,11 +24,15 @@ from colmap_av1 import (
     RunOptions,
     run_batch,
 )
+from colmap_av1.batch.attempt import attempt
+from colmap_av1.batch.jobs import Ended, Job, Needs, Source, Work
 from colmap_av1.batch.run import Counts
+from colmap_av1.batch.tasks import TASKS, Made, Task
 from colmap_av1.cli import main
 
 # One process for all videos: it starts slower than it does most of them.
 ALONE = BatchOptions(cores=1000, retries=0)
+FILES_OF_MODEL = ("cameras", "images", "points3D")
 SMALL = MatchOptions(images=ImageOptions(image_name="%03d.jpg"))
 
 
@@ -185,3 +190,53 @@ def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
 
     run_batch(*(clips / "a" / "clip00.mp4", out, ReadOptions()), options=ALONE, watch=try_another)
     assert tried == [True]
+
+
+def test_models_of_one_batch_are_made_dense_by_another(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each video is given the model of its name; a changed model counts as a changed video."""
+    models = tmp_path / "models"
+    files = [models / "clip00" / "sparse" / "0" / f"{n}.bin" for n in FILES_OF_MODEL]
+    files[0].parent.mkdir(parents=True)
+    for file in files:
+        file.write_bytes(b"")
+    job = Job(0, "clip00", Source(str(clips / "a" / "clip00.mp4")), Needs(9, 1 << 40))
+    work = Work(
+        *("densify", DensifyOptions(), str(tmp_path / "out"), str(models), str(tmp_path)),
+        *(None, 5.0, True, None, None, "1"),
+    )
+    given = []
+
+    def run(_: Path, folder: Path, __: Work, model: Path | None, ___: int) -> Made:
+        given.append(model)
+        return Made(ReadOptions(), {"points": len(given)}, ())
+
+    monkeypatch.setitem(TASKS, "densify", Task(DensifyOptions, run))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    for change in (False, False, True):
+        if change:
+            files[0].write_bytes(b"changed")
+        ended = attempt(work, job, scratch)
+        assert isinstance(ended, Ended)
+        assert ended.row.state == "done"
+    assert given == [files[0].parent] * 2
+    ended = attempt(work, replace(job, name="clip02"), scratch)
+    assert isinstance(ended, Ended)
+    assert ended.row.error.startswith(f"{models}: has no model of 'clip02'")
+
+
+@pytest.mark.slow
+def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
+    """The models that one batch makes are made dense by another."""
+    video = PROJECT / "examples" / "scene.mp4"
+    scenes, dense = tmp_path / "scenes", tmp_path / "dense"
+    options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=5)))
+    assert run_batch(video, scenes, options, options=ALONE).num_done == 1
+    made = sorted(p.name for p in (scenes / "scene").iterdir())
+    assert made == ["database.db", "images", "report.json", "sparse", "thumbnail.jpg"]
+    report = run_batch(video, dense, DensifyOptions(), models=scenes, options=ALONE)
+    assert report.num_done == 1
+    (row,) = rows_of(dense)
+    assert (row["images"], int(row["points"]) > 10_000) == ("12", True)

@@ -180,9 +180,9 @@ def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
     videos.write_text(f"{server}/hangs.mp4\n{server}/none.mp4\n")
-    options = BatchOptions(stall=1, retries=0, cores=99)
+    options = BatchOptions(stall=2, retries=0, cores=99)
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()
-    assert "hangs.mp4: nothing comes for 1 seconds" in text
+    assert "hangs.mp4: nothing comes for 2 seconds" in text
     assert "none.mp4: no such file" in text

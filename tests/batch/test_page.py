@@ -1,0 +1,128 @@
+"""The page of a batch: one file that needs no other, with all failures and numbers."""
+
+from __future__ import annotations
+
+import html.parser
+import re
+from pathlib import Path
+
+import pytest
+
+from colmap_av1 import OptionError, write_page
+from colmap_av1.batch.jobs import Row
+from colmap_av1.batch.rows import write_json
+from colmap_av1.cli import main
+
+JPEG = b"\xff\xd8\xff\xe0 a small picture"
+
+
+class Cells(html.parser.HTMLParser):
+    """The cells of a page's tables, and the addresses it refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tables: dict[str, list[list[str]]] = {}
+        self.keys: list[list[str | None]] = []
+        self.links: list[str] = []
+        self._table = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if tag == "table":
+            self._table = given["id"] or ""
+            self.tables[self._table] = []
+        if tag == "tr":
+            self.tables[self._table].append([])
+            self.keys.append([])
+        if tag in ("td", "th"):
+            self.tables[self._table][-1].append("")
+            self.keys[-1].append(given.get("data-key"))
+        self.links += [given[n] or "" for n in ("src", "href") if n in given]
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "table":
+            self._table = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._table and self.tables[self._table] and self.tables[self._table][-1]:
+            self.tables[self._table][-1][-1] += data.strip()
+
+
+def write_rows(out: Path, rows: list[Row], name: str = "batch.json") -> None:
+    out.mkdir(exist_ok=True)
+    write_json(rows, out / name, {"task": "reconstruct"})
+
+
+def test_a_page(tmp_path: Path) -> None:
+    done = [
+        Row(
+            *(f"v{i}", f"/in/v{i}.mp4", "done"),
+            seconds=i + 0.5,
+            cpu_seconds=2.0 * i,
+            video_seconds=60.0,
+            points=1000 * i,
+            coverage=i / 10,
+        )
+        for i in range(1, 6)
+    ]
+    bad = Row("<b>&", "/in/b.mp4", "failed", "damaged", error="<script>alert(1)</script>")
+    lost = Row("c", "/in/c.mp4", "failed", "killed", error="its process was ended by SIGKILL")
+    out = tmp_path / "out"
+    write_rows(out, [*done[:3], bad], "batch-1-of-2.json")
+    write_rows(out, [*done[3:], lost], "batch-2-of-2.json")
+    (out / "v2").mkdir()
+    (out / "v2" / "thumbnail.jpg").write_bytes(JPEG)
+    assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
+    text = (out / "report.html").read_text()
+    page = Cells(text)
+    assert "<script>alert" not in text
+    assert [link.partition(",")[0] for link in page.links] == ["data:image/jpeg;base64"]
+    assert not re.search(r"https?:|url\(|@import", text)
+    assert "5 done, 2 failed" in text
+    assert "at 1.7 CPU hours for 1,000 of them" in text  # 30 s for 5 minutes
+    assert page.tables["failures"][1:] == [
+        ["damaged", "1", "<script>alert(1)</script>"],
+        ["killed", "1", "its process was ended by SIGKILL"],
+    ]
+    quantiles = {row[0]: row[1:-1] for row in page.tables["quantiles"][1:]}
+    assert quantiles["points"][3] == "3,000"
+    assert quantiles["coverage"][::3] == ["10.0%", "30.0%", "50.0%"]
+    assert quantiles["seconds"][-1] == "5.50"
+    heads, *rows = page.tables["videos"]
+    assert [row[1] for row in rows] == ["<b>&", "c", "v1", "v2", "v3", "v4", "v5"]
+    points = heads.index("points")
+    assert [row[points] for row in rows] == ["", "", *(f"{i},000" for i in range(1, 6))]
+    assert page.keys[-1][points] == "5000"  # what is sorted by
+
+
+def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
+    rows = [Row(f"v{i:03}", f"/v{i}", "done", points=i) for i in range(300)]
+    rows[250] = Row("v250", "/v250", "failed", "damaged", error="x")
+    write_rows(tmp_path, rows)
+    write_page(tmp_path, most_rows=10)
+    page = Cells((tmp_path / "report.html").read_text())
+    assert [row[1] for row in page.tables["videos"][1:]] == [
+        "v250",
+        *(f"v{i:03}" for i in range(9)),
+    ]
+    assert {row[0]: row[-2] for row in page.tables["quantiles"]}["points"] == "299"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "holds no batch.json"),
+        ('{"rows": [\n  {"name": "x"', "damaged"),
+        ('{"rows": [\n  {"name": "x"}]\n}', "damaged"),
+    ],
+)
+def test_no_page(
+    content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / "batch.json").write_text(content)
+    with pytest.raises(OptionError, match=message):
+        write_page(tmp_path)
+    assert main(["batch", "report", "--output", str(tmp_path / "none")]) == 2
+    assert "holds no batch.json" in capsys.readouterr().err
