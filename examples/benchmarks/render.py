@@ -444,6 +444,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "large_pictures": plain,
     "read_memory": plain,
     "long_video": plain,
+    "batch": plain,
     "image_pairs": plain,
     "appended": plain,
     "camera_model": plain,
