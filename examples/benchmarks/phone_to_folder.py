@@ -11,6 +11,7 @@ its own. What is measured stays in the cache, so a run that was stopped is resum
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -160,9 +161,10 @@ def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
         row_of(clip, "conversion", converted),
         row_of(clip, "reconstruct from AV1", made),
     ]
-    with pycolmap.Database.open(output / "database.db") as database:
-        names = sorted(str(image.name) for image in database.read_all_images())
-    figures = figures_of(clip, output / "sparse" / "0", output / "images", len(names))
+    # What has no pose is not written; SIFT is given what is.
+    names = sorted(path.name for path in (output / "images").iterdir())
+    num_images = json.loads((output / "report.json").read_text())["num_images"]
+    figures = figures_of(clip, output / "sparse" / "0", output / "images", num_images)
     ours.append(replace(sum_of("reconstruct", ours), **figures))
     console.print(f"{clip.name}: SIFT on {len(names)} images", markup=False)
     steps, model, images = sift_of(clip, folder / "sift", names)
