@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import os
 import re
@@ -53,19 +54,27 @@ def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         partial.mkdir(parents=True)
         yield partial
-        if path.exists() and overwrite:
-            path.replace(before)
-        elif path.exists():
-            path.rmdir()
-        try:
+        if not path.exists():
             partial.replace(path)
+            return
+        # The folder stays: it may be where a disk is mounted, or where the user is.
+        if any(path.iterdir()) and not overwrite:
+            raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY), str(path))
+        before.mkdir()
+        _move_entries(path, before)
+        try:
+            _move_entries(partial, path)
         except OSError:
-            if before.exists():
-                before.replace(path)
+            _move_entries(before, path)
             raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(before, ignore_errors=True)
+
+
+def _move_entries(source: Path, target: Path) -> None:
+    for entry in source.iterdir():
+        entry.replace(target / entry.name)
 
 
 @contextmanager

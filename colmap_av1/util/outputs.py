@@ -65,7 +65,9 @@ def check_folder(output: Path, inputs: Iterable[_Path | None]) -> None:
         OptionError: it is an input, or holds one.
     """
     for path in (Path(given) for given in inputs if given is not None):
-        places = [p for place in (path.absolute(), path.resolve()) for p in (place, *place.parents)]
+        # Where a link lies, and where it leads.
+        ends = (path.parent.resolve() / path.name, path.resolve())
+        places = [place for end in ends for place in (end, *end.parents)]
         if output.resolve() in places or any(_is_same(output, place) for place in places):
             raise OptionError(f"{output}: is or holds the input {path}: give another folder")
 

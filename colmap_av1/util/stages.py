@@ -123,7 +123,7 @@ def run_stage(
         _remove(partial)
         partial.mkdir()
         facts = make(partial)
-        record.unlink(missing_ok=True)
+        _remove(record)
         for product in products:
             _remove(into / product)
             (partial / product).replace(into / product)

@@ -32,6 +32,23 @@ def test_a_folder_appears_when_whole(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
 
 
+def test_a_folder_that_is_there_gets_the_content(tmp_path: Path) -> None:
+    output = tmp_path / "model"
+    output.mkdir()
+    (tmp_path / "link").symlink_to("model")
+    number = output.stat().st_ino
+    for content in ("1", "2"):
+        with whole_folder(tmp_path / "link", overwrite=content == "2") as partial:
+            (partial / f"points{content}").write_text(content)
+            (partial / "0").mkdir()
+        assert sorted(p.name for p in output.iterdir()) == ["0", f"points{content}"]
+    assert output.stat().st_ino == number
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "model"]
+    with pytest.raises(KeyError), whole_folder(output, overwrite=True) as partial:
+        {}[(partial / "points3").write_text("3")]
+    assert (output / "points2").read_text() == "2"
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="leftovers stay there")
 def test_what_the_killed_left_is_removed(tmp_path: Path) -> None:
     killed = tmp_path / f".model.{dead_process()}.partial"

@@ -77,6 +77,7 @@ def test_folders_that_are_or_hold_an_input(folder: Path) -> None:
     (folder / "here").symlink_to(".", target_is_directory=True)
     check_folder(Path("new"), ["video.mp4", "images", None])
     check_folder(Path("images/far/new"), ["video.mp4", "images"])
+    check_folder(Path("images/far"), ["images/far/../a.png", "images/far/../../video.mp4"])
     for output in ("images", ".", "here", "images/..", folder):
         with pytest.raises(OptionError, match="is or holds the input images"):
             check_folder(Path(output), ["images"])

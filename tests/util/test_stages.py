@@ -189,6 +189,9 @@ def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[
     check_made_again(stage)
     stage.record.write_bytes(b"\xff\xfe" + stage.record.read_bytes())
     check_made_again(stage)
+    stage.record.unlink()
+    (stage.record / "folder").mkdir(parents=True)
+    check_made_again(stage)
 
 
 def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
