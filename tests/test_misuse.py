@@ -31,6 +31,8 @@ from colmap_av1 import (
     read_hloc,
     read_motion,
     reconstruct,
+    run_batch,
+    write_page,
 )
 from colmap_av1.compare import compare as compare_videos
 from colmap_av1.errors import BitstreamError, OptionError, VideoError
@@ -54,8 +56,10 @@ CALLS: dict[str, tuple[str, Callable[..., object], dict[str, Any]]] = {
     "motion": ("video", export_motion, {"output": "m.npz"}),
     "read": ("video", read_motion, {}),
     "compare": ("video", compare_videos, {"output": "o"}),
+    "batch": ("output", run_batch, {"inputs": ["v.mp4"], "task": ReadOptions()}),
+    "page": ("output", write_page, {}),
 }
-WITH_OPTIONS = [name for name in CALLS if name not in ("check", "hloc")]
+WITH_OPTIONS = [name for name in CALLS if name not in ("check", "hloc", "page")]
 
 
 @pytest.mark.parametrize(("name", "call", "others"), CALLS.values(), ids=CALLS.keys())

@@ -49,10 +49,11 @@ def _members(hint: Any) -> tuple[Any, ...]:
 def _check(function: str, name: str, value: Any, kinds: tuple[Any, ...]) -> None:
     if value is None and type(None) in kinds:
         return
-    if any(typing.get_origin(kind) is os.PathLike for kind in kinds):
+    origins = {typing.get_origin(kind) for kind in kinds} - {None}
+    if os.PathLike in origins and (len(origins) == 1 or isinstance(value, str | os.PathLike)):
         _check_path(function, name, value)
         return
-    if any(typing.get_origin(kind) is not None for kind in kinds):
+    if origins:
         return  # functions, sequences and the like
     plain = tuple(kind for kind in kinds if isinstance(kind, type) and kind is not type(None))
     if plain and not isinstance(value, tuple(_NUMBERS.get(kind, kind) for kind in plain)):
