@@ -23,10 +23,14 @@ from colmap_av1.model.colmap_model import (
     write_model,
 )
 from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model
+from colmap_av1.model.gaussians import (
+    check_gaussians_path,
+    initial_gaussians,
+    write_gaussians,
+)
 from colmap_av1.model.track_points import (
     LEAST_AGREEING,
     Colours,
-    MedianColours,
     chaining_for_points,
     cloud_of,
     mean_error,
@@ -67,6 +71,7 @@ class DensifyReport:
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
         model_coverage: that of the given model's points.
         mean_error: mean reprojection error of the points in pixels.
+        gaussians: file of initial Gaussians, where one was wanted.
         seconds: wall time of each stage.
         warnings: what the user should know.
     """
@@ -82,6 +87,7 @@ class DensifyReport:
     coverage: float
     model_coverage: float
     mean_error: float
+    gaussians: Path | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -93,6 +99,7 @@ def densify(
     output: str | os.PathLike[str],
     *,
     image_path: str | os.PathLike[str] | None = None,
+    gaussians: str | os.PathLike[str] | None = None,
     options: DensifyOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
@@ -107,6 +114,7 @@ def densify(
         output: new or empty folder for the dense model.
         image_path: folder of the model's images, to recognise by their content which frames
             they are where their names leave doubt.
+        gaussians: file, .ply, for initial Gaussians of the points, replaced where it exists.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
         overwrite: replace an output that holds a model and nothing else.
@@ -117,7 +125,8 @@ def densify(
         VideoError: the video cannot be read, or changes meanwhile.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: the model's images do not say which frames they are.
-        OptionError: an option does not go with the images, or the folder is not empty.
+        OptionError: an option does not go with the images, the folder is not empty, or the file
+            for Gaussians cannot be made.
     """
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress
@@ -126,6 +135,7 @@ def densify(
     clock = Clock()
     check_new_folder(output, MODEL_FILES, overwrite=overwrite)
     check_folder(output, [model, video, folder, options.match.images.frame_list])
+    check_gaussians_path(gaussians, [video, folder, model], overwrite=overwrite)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
@@ -155,15 +165,13 @@ def densify(
             xy = seen.xy[points.observation].astype(np.float64)
             cloud = cloud_of(points, view, xy, views, options.triangulate)
         with clock.measure("colours"):
-            colours: Colours | MedianColours = MedianColours(cloud, size, len(images))
-            if options.triangulate.points == "survey":
-                colours = Colours(seen, view, points, len(images))
             pictures = decoded_pictures(source, options.match)
-            _add_pictures(colours, pictures, chosen.frames, seen.num_frames, progress)
+            cloud = _coloured(cloud, size, pictures, chosen.frames, progress)
     with clock.measure("coverage"):
         covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
-        _write(output, cameras, images, replace(cloud, rgb=colours.rgb()), overwrite)
+        _write(output, cameras, images, cloud, overwrite)
+    wanted = _write_gaussians(gaussians, cloud, views, clock)
     return DensifyReport(
         output=output,
         model=model,
@@ -176,6 +184,7 @@ def densify(
         coverage=covered,
         model_coverage=coverage_of_model(reconstruction),
         mean_error=mean_error(cloud),
+        gaussians=wanted,
         seconds=clock.seconds,
         warnings=tracked.warnings,
     )
@@ -204,21 +213,24 @@ def _choose(
     )
 
 
-def _add_pictures(
-    colours: Colours | MedianColours,
+def _coloured(
+    cloud: ModelPoints,
+    size: tuple[int, int],
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     frames: NDArray[np.int32],
-    num_frames: int,
     progress: Progress,
-) -> None:
-    """Look at the pictures of the images, whose frames ascend."""
+) -> ModelPoints:
+    """The points in the colours of the images of a size, whose frames ascend."""
+    colours = Colours(cloud, size, len(frames))
     image_of_frame = {int(frame): i for i, frame in enumerate(frames)}
+    last = int(frames[-1])
     for frame, picture in pictures:
-        progress("colours", frame + 1, num_frames)
+        progress("colours", frame + 1, last + 1)
         if frame in image_of_frame:
             colours.add(image_of_frame[frame], picture)
-        if frame >= frames[-1]:
+        if frame >= last:
             break
+    return replace(cloud, rgb=colours.rgb())
 
 
 def _write(
@@ -233,6 +245,20 @@ def _write(
             write_model(partial, cameras, images, points)
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
+
+
+def _write_gaussians(
+    path: str | os.PathLike[str] | None,
+    points: ModelPoints,
+    views: Sequence[PosedCamera],
+    clock: Clock,
+) -> Path | None:
+    """Write initial Gaussians where they are wanted; where they are."""
+    if path is None:
+        return None
+    with clock.measure("gaussians"):
+        write_gaussians(Path(path), initial_gaussians(points, views))
+    return Path(path)
 
 
 def _agreement(model: Path, points: TriangulatedPoints) -> float:

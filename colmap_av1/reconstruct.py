@@ -5,12 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.preparing import check_fit
+from colmap_av1.model.colmap_model import model_points, posed_images, read_model
+from colmap_av1.model.coverage import PosedCamera
+from colmap_av1.model.gaussians import (
+    check_gaussians_path,
+    initial_gaussians,
+    write_gaussians,
+)
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -69,6 +76,7 @@ class ReconstructReport:
         mapper: which of COLMAP's mappers found the poses.
         forward_motion: the camera moves along its axis, see `MatchReport`.
         links: what connects images where motion does not, see `LinkReport`.
+        gaussians: file of initial Gaussians, where one was wanted.
         resumed: stages that an earlier run had finished.
         seconds: wall time of each stage of this run.
         warnings: what the user should know.
@@ -95,6 +103,7 @@ class ReconstructReport:
     mapper: str
     forward_motion: bool
     links: dict[str, Any]
+    gaussians: Path | None
     resumed: tuple[str, ...]
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -105,6 +114,7 @@ def reconstruct(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
     *,
+    gaussians: str | os.PathLike[str] | None = None,
     options: ReconstructOptions | None = None,
     progress: Progress | None = None,
 ) -> ReconstructReport:
@@ -120,6 +130,7 @@ def reconstruct(
         video: a video; one that is not AV1 is converted first, to a stream that a
             resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
+        gaussians: file, .ply, for initial Gaussians of the points, replaced where it exists.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 
@@ -128,7 +139,8 @@ def reconstruct(
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: images cannot be chosen or written.
         ModelError: no poses are found, or the output cannot be written.
-        OptionError: an option does not fit the video, or the folder holds other things.
+        OptionError: an option does not fit the video, the folder holds other things, or the file
+            for Gaussians cannot be made.
     """
     options = options if options is not None else ReconstructOptions()
     progress = progress if progress is not None else no_progress
@@ -137,6 +149,7 @@ def reconstruct(
     check_folder(output, [video, options.match.images.frame_list])
     video = read_video(video, options.match.read.operating_point)
     # What can be refused is refused before the long work.
+    check_gaussians_path(gaussians)
     check_fit(options.match, video.picture_size, video.display.pixel_aspect)
     with open_stages(output, "reconstruct") as stages:
         matching = with_stream_kept(options.match, stages)
@@ -146,6 +159,10 @@ def reconstruct(
             except ColmapAv1Error:  # which may come of a change
                 check_unchanged(*source.files)
                 raise
+        if gaussians is not None:
+            with clock.measure("gaussians"):
+                _write_gaussians(output / "sparse" / "0", Path(gaussians))
+            report = replace(report, gaussians=Path(gaussians), seconds=clock.seconds)
         _write_report(report)
     return report
 
@@ -175,6 +192,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         video=run.source.pictures.path,
         conversion=run.source.conversion,
         database=run.output / "database.db",
+        gaussians=None,
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
         seconds=run.clock.seconds,
         warnings=tuple(notes),
@@ -206,6 +224,15 @@ def _notes(facts: dict[str, Any]) -> list[str]:
             "try the other --mapper, or give --camera_params"
         )
     return notes
+
+
+def _write_gaussians(model: Path, path: Path) -> None:
+    """Write initial Gaussians of the points of a model."""
+    reconstruction = read_model(model)
+    posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.image_id)
+    cameras = reconstruction.cameras
+    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in posed]
+    write_gaussians(path, initial_gaussians(model_points(reconstruction, posed), views))
 
 
 def _write_report(report: ReconstructReport) -> None:

@@ -196,6 +196,7 @@ def test_brush(made: ReconstructReport) -> None:
     """The only cameras.bin below the folder is the model's, with its images in `images`."""
     (cameras,) = [p for p in made.output.glob("**/cameras.bin") if ".stages" not in p.parts]
     assert cameras.parent == made.output / "sparse" / "0"
+    assert not [*made.output.glob("**/*.ply")]
     assert all(0 <= camera.model_id <= 10 for camera in raw_model(cameras.parent)[0].values())
 
 
@@ -329,7 +330,7 @@ def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> No
 def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -> None:
     """An interrupt and a full disk leave the old output whole, and the run is resumed."""
     before = {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")}
-    other = replace(OPTIONS, triangulate=TriangulateOptions(min_angle=2.0))
+    other = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=4))
 
     def interrupt(stage: str, done: int, total: int | None) -> None:
         if stage == "images" and done > 3:
@@ -503,8 +504,9 @@ def test_command_line(
 ) -> None:
     words = ["reconstruct", "--video", str(SCENE), "--output", str(made.output)]
     words += ["--every", str(EVERY), "--pose_tracks_per_image", "300", "--pose-spacing", "24"]
-    words += ["--points", "survey"]
+    words += ["--points", "survey", "--gaussians", str(tmp_path / "init.ply")]
     assert main(words) == 0
+    assert f"element vertex {made.num_points}\n".encode() in (tmp_path / "init.ply").read_bytes()
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
     assert f"finished before\t{', '.join(STAGES)}" in told.out
@@ -514,7 +516,11 @@ def test_command_line(
         "".join(f"{f} frame_{f:06d}.png\n" for f in range(0, 60, EVERY))
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
-    assert main(words) == 0
+    assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2
+    assert "give a name that ends so" in capsys.readouterr().err
+    # Brush takes the last .ply of a folder, or init.ply: there is one only where it is wanted.
+    assert main([*words, "--gaussians", str(tmp_path / "dense" / "init.ply")]) == 0
+    assert [p.name for p in tmp_path.glob("dense/*.ply")] == ["init.ply"]
     told = capsys.readouterr()
     assert "agree with the poses" in told.out
     covered = re.search(r"coverage\t(\S+)% of the images, the model had (\S+)%", told.out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_av1.batch.run import BatchReport
@@ -90,6 +91,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         *far_view_rows(report.far_views, report.far_views_largest),
         ("focal length", f"{report.focal_length:.2f} px"),
         *_link_rows(**report.links),
+        *_gaussians_rows(report.gaussians),
     ]
     if report.resumed:
         rows.append(("finished before", ", ".join(report.resumed)))
@@ -150,6 +152,7 @@ def densify_rows(report: DensifyReport) -> Rows:
             f"{report.coverage:.1%} of the images, the model had {report.model_coverage:.1%}",
         ),
         ("reprojection error", f"{report.mean_error:.3f} px"),
+        *_gaussians_rows(report.gaussians),
         *_seconds_rows(report.seconds),
     ]
 
@@ -264,6 +267,10 @@ def check_rows(report: CheckReport) -> Rows:
     ready = "usable, but for the warnings" if warned else "good"
     rows.append(("for mapping", ready if report.mappable else "not ready"))
     return rows
+
+
+def _gaussians_rows(path: Path | None) -> Rows:
+    return [("gaussians", str(path))] if path is not None else []
 
 
 def _seconds_rows(seconds: dict[str, float]) -> Rows:

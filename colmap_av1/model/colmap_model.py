@@ -80,6 +80,23 @@ class ModelPoints:
     xy: NDArray[np.float64]
 
 
+def take_rows(
+    offsets: NDArray[np.int64], rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Some rows of data in compressed sparse row form.
+
+    Args:
+        offsets: int64 [num_rows + 1] where the elements of each row begin.
+        rows: int64 [n] those wanted, in this order.
+
+    Returns:
+        int64 [n + 1] their offsets, and int64 [offsets[-1]] the indices of their elements.
+    """
+    lengths = np.diff(offsets)[rows]
+    taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
+
+
 def no_points() -> ModelPoints:
     """The points of a model of poses alone: none."""
     return ModelPoints(
@@ -113,6 +130,33 @@ def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
         for image in reconstruction.images.values()
         if image.has_pose
     }
+
+
+def model_points(reconstruction: Any, images: Sequence[ModelImage]) -> ModelPoints:
+    """All points of a pycolmap.Reconstruction, by their ids, with the observations of some images.
+
+    Args:
+        reconstruction: the model.
+        images: those whose observations are kept, in the order of the points' images.
+    """
+    index = {image.image_id: k for k, image in enumerate(images)}
+    xy = {
+        i: np.array([p.xy for p in reconstruction.images[i].points2D], dtype=np.float64)
+        for i in index
+    }
+    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
+    own = [[e for e in p.track.elements if int(e.image_id) in index] for p in points]
+    seen = [element for elements in own for element in elements]
+    return ModelPoints(
+        xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+        error=np.array([p.error for p in points], dtype=np.float64),
+        offsets=np.cumsum([0, *map(len, own)], dtype=np.int64),
+        image=np.array([index[int(e.image_id)] for e in seen], dtype=np.int64),
+        xy=np.array([xy[int(e.image_id)][e.point2D_idx] for e in seen], dtype=np.float64).reshape(
+            -1, 2
+        ),
+    )
 
 
 def write_model(

@@ -77,6 +77,11 @@ class PosedCamera:
         return index, xy, depth
 
 
+def evenly_spread(count: int, most: int) -> list[int]:
+    """Indices from 0 to before `count`, evenly spread, `most` at most."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
+
+
 def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     """Share of the images' cells of 16x16 pixels that a visible point projects into.
 
@@ -90,9 +95,8 @@ def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     Returns:
         From 0 to 1; 0 without images.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(_MOST_IMAGES, len(views))).astype(int))
     filled = total = 0
-    for view in (views[i] for i in chosen):
+    for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
         depth = visible_depth(view, xyz)
         filled += int(np.isfinite(depth).sum())
         total += depth.size

@@ -18,7 +18,6 @@ from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, t
 from colmap_av1.model.reconstruct_stages import Run
 from colmap_av1.model.track_points import (
     Colours,
-    MedianColours,
     cloud_of,
     mean_error,
     seen_in,
@@ -60,29 +59,24 @@ def _dense_cloud(
 
 
 def _write_images(
-    run: Run,
-    folder: Path,
-    placed: PosedImages,
-    camera: Any,
-    *,
-    cloud: ModelPoints,
-    colours: Colours | MedianColours,
-) -> FarViews:
+    run: Run, folder: Path, placed: PosedImages, camera: Any, cloud: ModelPoints
+) -> tuple[FarViews, ModelPoints]:
     """Write the images, undistorted; look at their colours and at views from far apart on the way.
 
     Returns:
-        How far views from far apart disagree; the colours have all pictures added.
+        How far views from far apart disagree; and the points in colours.
     """
     options, progress = run.options, run.progress
     undistort = undistortion(placed.camera, camera)
     far = FarViewCheck(placed.images, {_CAMERA_ID: camera}, lambda image: points_seen(cloud, image))
+    colours = Colours(cloud, (int(camera.width), int(camera.height)), len(placed.images))
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
     def change(frame: int, picture: _Image) -> _Image:
         index = index_of_frame[frame]
         shown = undistort(picture) if undistort is not None else picture
-        colours.add(index, picture if isinstance(colours, Colours) else shown)
+        colours.add(index, shown)
         far.add(index, shown)
         return shown
 
@@ -98,7 +92,7 @@ def _write_images(
             progress=lambda done: progress("images", done, len(names)),
         )
     with run.clock.measure("far views"):
-        return far.result()
+        return far.result(), replace(cloud, rgb=colours.rgb())
 
 
 def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
@@ -113,20 +107,12 @@ def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> 
         seen, view = seen_in(tracks, placed.frames)
         dense = _dense_cloud(run, placed, camera, seen, view)
         points, cloud = dense.points, dense.cloud
-        size = int(camera.width), int(camera.height)
-        colours: Colours | MedianColours = MedianColours(cloud, size, len(placed.images))
-        if options.triangulate.points == "survey":
-            colours = Colours(seen, view, points, len(placed.images))
-        far_views = _write_images(
-            run, partial / "images", placed, camera, cloud=cloud, colours=colours
-        )
+        far_views, cloud = _write_images(run, partial / "images", placed, camera, cloud)
         check_unchanged(*source.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
-            write_model(
-                folder, {_CAMERA_ID: camera}, placed.images, replace(cloud, rgb=colours.rgb())
-            )
+            write_model(folder, {_CAMERA_ID: camera}, placed.images, cloud)
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),

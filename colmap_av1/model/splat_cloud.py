@@ -9,8 +9,8 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import ModelPoints
-from colmap_av1.model.coverage import CELL, PosedCamera, visible_depth
+from colmap_av1.model.colmap_model import ModelPoints, take_rows
+from colmap_av1.model.coverage import CELL, PosedCamera, evenly_spread, visible_depth
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -62,9 +62,9 @@ def splat_cloud(
         Those of `points` that stay, in their order, then those that are added, in black.
     """
     fewest, most, step = _EVEN_IMAGES
-    even = _spread(len(images), min(max(len(images) // step, fewest), most))
+    even = evenly_spread(len(images), min(max(len(images) // step, fewest), most))
     stage = _stages(points, [images[i] for i in even])
-    keys = _spread(len(images), _WHOLE_IMAGES)
+    keys = evenly_spread(len(images), _WHOLE_IMAGES)
     # Without an order within a stage its last ones would be of the last part of the video.
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
@@ -79,16 +79,9 @@ def splat_cloud(
     return _joined(kept, filled)
 
 
-def _spread(count: int, most: int) -> list[int]:
-    """Indices from 0 to before `count`, evenly spread."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
-
-
 def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
     """Some of the points, in the order of `rows`."""
-    lengths = np.diff(points.offsets)[rows]
-    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    seen = np.arange(offsets[-1]) + np.repeat(points.offsets[rows] - offsets[:-1], lengths)
+    offsets, seen = take_rows(points.offsets, rows)
     return ModelPoints(
         *(points.xyz[rows], points.rgb[rows], points.error[rows], offsets),
         *(points.image[seen], points.xy[seen]),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import camera_centres
+from colmap_av1.model.colmap_model import camera_centres, take_rows
 from colmap_av1.model.triangulate import (
     ERROR_TO_SIGMA,
     SIGMA_FLOOR,
@@ -67,20 +67,21 @@ class _Points:
 
     def parts(self) -> Iterator[_Points]:
         """The points in order, some at a time; none where there are none."""
-        last = len(self.xyz)
-        chunk = np.searchsorted(self.offsets, np.arange(0, self.offsets[-1] + _CHUNK, _CHUNK))
-        for low, high in itertools.pairwise(np.unique(np.minimum(chunk, last))):
+        for low, high in _chunks(self.offsets):
             seen = slice(self.offsets[low], self.offsets[high])
             offsets = self.offsets[low : high + 1] - self.offsets[low]
             yield _Points(self.xyz[low:high], self.error[low:high], offsets, self.observation[seen])
 
     def take(self, rows: _Ints) -> _Points:
         """Some of the points, in the order of `rows`."""
-        lengths = np.diff(self.offsets)[rows]
-        offsets = np.concatenate([[0], np.cumsum(lengths)])
-        shift = np.repeat(self.offsets[rows] - offsets[:-1], lengths)
-        observation = self.observation[np.arange(offsets[-1]) + shift]
-        return _Points(self.xyz[rows], self.error[rows], offsets, observation)
+        offsets, seen = take_rows(self.offsets, rows)
+        return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
+
+
+def _chunks(offsets: _Ints) -> Iterator[tuple[int, int]]:
+    """First and last but one row of parts of what `offsets` divide, in order."""
+    chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK))
+    yield from itertools.pairwise(np.unique(np.minimum(chunk, len(offsets) - 1)).tolist())
 
 
 @dataclass(frozen=True)
@@ -141,11 +142,18 @@ def splat_points(
     Raises:
         OptionError: an option has a value that cannot work.
     """
-    anywhere = replace(options, min_angle=0.0, max_depth_error=None)
+    anywhere = replace(
+        options, points="survey", max_points=None, min_angle=0.0, max_depth_error=None
+    )
     found = triangulate(observations, views, anywhere, num_threads=num_threads, progress=progress)
     seen = _Seen(observations, views, camera_centres(views.cam_from_world))
     points = _Points(found.xyz, found.error, found.offsets, found.observation)
-    unsure = _distance_uncertainty(points, seen)
+    unsure = distance_uncertainty(
+        *(points.xyz, points.error, points.offsets),
+        centres=seen.centres,
+        view=observations.view[points.observation],
+        focal=views.focal.mean(axis=1),
+    )
     far = _far_distance(points, unsure, seen)
     points = _at_honest_distance(points, unsure, far, seen)
     far_away = _points_far_away(points, far, seen, options)
@@ -155,23 +163,41 @@ def splat_points(
     return replace(found, num_agreeing=num_agreeing, **vars(points))
 
 
-def _distance_uncertainty(points: _Points, seen: _Seen) -> _Floats:
-    """Expected error of each point's distance from the cameras, as a share of it."""
-    return np.concatenate([np.empty(0), *(_uncertainty(part, seen) for part in points.parts())])
+def distance_uncertainty(
+    xyz: _Floats,
+    error: _Floats,
+    offsets: _Ints,
+    *,
+    centres: _Floats,
+    view: _Ints,
+    focal: _Floats,
+) -> _Floats:
+    """Expected error of each point's distance from the cameras, as a share of it.
 
-
-def _uncertainty(points: _Points, seen: _Seen) -> _Floats:
-    owner = points.owner
-    ray = points.xyz[owner] - seen.origins(points.observation)
-    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), _TINY)
-    starts = points.offsets[:-1]
-    narrowest = np.ones(len(points.xyz))
-    for end in (starts, points.offsets[1:] - 1):
-        cosine = np.einsum("ni,ni->n", ray, ray[end][owner])
-        narrowest = np.minimum(narrowest, np.minimum.reduceat(cosine, starts))
-    angle = np.maximum(np.arccos(np.clip(narrowest, -1.0, 1.0)), _TINY)
-    focal = seen.views.focal[seen.observations.view[points.middle]].mean(axis=1)
-    return np.asarray(np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * points.error) / (focal * angle))
+    Args:
+        xyz: float64 [n, 3] the points.
+        error: float64 [n] their mean reprojection errors in pixels.
+        offsets: int64 [n + 1] the observations of each, one at least.
+        centres: float64 [num_views, 3] places of the cameras.
+        view: int64 [num_observations] view of each observation.
+        focal: float64 [num_views] focal lengths in pixels.
+    """
+    parts = [np.empty(0)]
+    for low, high in _chunks(offsets):
+        own = view[offsets[low] : offsets[high]]
+        starts = offsets[low : high + 1] - offsets[low]
+        owner = np.repeat(np.arange(high - low), np.diff(starts))
+        ray = xyz[low:high][owner] - centres[own]
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), _TINY)
+        narrowest = np.ones(high - low)
+        for end in (starts[:-1], starts[1:] - 1):
+            cosine = np.einsum("ni,ni->n", ray, ray[end][owner])
+            narrowest = np.minimum(narrowest, np.minimum.reduceat(cosine, starts[:-1]))
+        angle = np.maximum(np.arccos(np.clip(narrowest, -1.0, 1.0)), _TINY)
+        middle = own[(starts[:-1] + starts[1:]) // 2]
+        sigma = np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * error[low:high])
+        parts.append(sigma / (focal[middle] * angle))
+    return np.concatenate(parts)
 
 
 def _distance(points: _Points, seen: _Seen) -> _Floats:

@@ -84,37 +84,6 @@ def triangulate_tracks(
 
 
 class Colours:
-    """Mean colour of points over the pictures that see them, picture by picture."""
-
-    def __init__(
-        self, tracks: Tracks, view: NDArray[np.int64], points: TriangulatedPoints, num_images: int
-    ) -> None:
-        self._size = np.array([tracks.width, tracks.height])
-        self._sum = np.zeros((len(points.xyz), 3))
-        self._count = np.zeros(len(points.xyz))
-        image = view[points.observation]
-        point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
-        order = np.argsort(image, kind="stable")
-        self._bounds = np.searchsorted(image[order], np.arange(num_images + 1))
-        self._point = point[order]
-        self._xy = tracks.xy[points.observation[order]]
-
-    def add(self, image: int, picture: _Image) -> None:
-        """Look at the picture (BGR, of any scale) of an image."""
-        own = slice(self._bounds[image], self._bounds[image + 1])
-        size = np.array(picture.shape[1::-1])
-        x, y = np.clip((self._xy[own] * size / self._size).astype(np.int64), 0, size - 1).T
-        # A point is seen in an image once, or twice where two of its tracks' parts meet.
-        np.add.at(self._sum, self._point[own], picture[y, x, ::-1])
-        np.add.at(self._count, self._point[own], 1.0)
-
-    def rgb(self) -> _Image:
-        """Colours uint8 [num_points, 3], red first."""
-        mean = self._sum / np.maximum(self._count, 1.0)[:, None]
-        return np.round(mean).astype(np.uint8)
-
-
-class MedianColours:
     """Colours of points as the middle one of the pictures shows them, picture by picture.
 
     A blurred, bright or hidden view among several does not change them.

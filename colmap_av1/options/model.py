@@ -26,7 +26,8 @@ class TriangulateOptions(Options):
     )
     min_angle: float = option(
         1.5,
-        "smallest triangulation angle of a point, between its two widest rays, in degrees",
+        "smallest triangulation angle of a point of a survey, between its two widest rays, in "
+        "degrees",
         least=0,
         below=90,
         unit="degrees",
@@ -34,8 +35,8 @@ class TriangulateOptions(Options):
     )
     max_depth_error: float | None = option(
         0.07,
-        "largest expected error of a point's depth, as a fraction of it, from the triangulation "
-        "angle and the reprojection error; None: any",
+        "largest expected error of the depth of a point of a survey, as a fraction of it, from the "
+        "triangulation angle and the reprojection error; None: any",
         above=0,
         unit="a fraction",
     )
@@ -59,6 +60,14 @@ class TriangulateOptions(Options):
         super().__post_init__()
         if self.max_points is not None and self.points == "survey":
             raise OptionError("max_points bounds splats: leave it out, or give --points splats")
+        if self.points == "survey":
+            return
+        for name in ("min_angle", "max_depth_error"):
+            if getattr(self, name) != getattr(TriangulateOptions, name):
+                raise OptionError(
+                    f"{name} says which points a survey has, splats have those of any depth: "
+                    "leave it out, or give --points survey"
+                )
 
 
 @dataclass(frozen=True)

@@ -194,7 +194,7 @@ def test_options_that_hold_others_are_built_from_words() -> None:
     assert options.reading == ReadOptions(strict=True, num_threads=3)
     assert options.images.fps == 2
     assert parse("", CompareOptions) == CompareOptions()
-    made = parse("--mapper global --min_angle 3 --cell 2", ReconstructOptions)
+    made = parse("--mapper global --points survey --min_angle 3 --cell 2", ReconstructOptions)
     assert isinstance(made, ReconstructOptions)
     assert (made.mapping.mapper, made.triangulate.min_angle) == ("global", 3)
     assert made.match.tracks.cell == 2

@@ -226,6 +226,10 @@ def test_options_that_cannot_work() -> None:
         TriangulateOptions(max_points=99)
     with pytest.raises(OptionError, match="max_points bounds splats: leave it out"):
         TriangulateOptions(points="survey", max_points=500)
+    for given in ({"min_angle": 2.0}, {"max_depth_error": None}):
+        with pytest.raises(OptionError, match="leave it out, or give --points survey"):
+            TriangulateOptions(**given)
+        TriangulateOptions(points="survey", **given)
 
 
 def test_centres_are_where_cameras_are() -> None:

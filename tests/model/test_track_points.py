@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_av1.model.colmap_model import ModelPoints
 from colmap_av1.model.track_points import (
     Colours,
     chaining_for_points,
@@ -110,24 +111,26 @@ def test_images_of_several_cameras_see_one_scene() -> None:
     assert 0.005 < np.median(found(wide, noisy).error) < 0.05
 
 
-def test_colours_are_means_of_the_pictures_that_see_a_point() -> None:
-    """Observations: 0 to 2 of a track, 3 to 5 of one in the corner, 6 to 8 of a third."""
-    xy = np.array([[[100, 50]] * 3, [[WIDTH, HEIGHT]] * 3, [[320, 240]] * 3], dtype=float)
-    tracks = make_tracks(xy)
-    _, view = seen_in(tracks, np.arange(3, dtype=np.int32))
-    points = make_points([[0, 2], [3, 4, 5], [7], [0, 6]])
-    colours = Colours(tracks, view, points, 3)
-    blue, red = np.zeros((2, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    blue[..., 0], red[..., 2] = 200, 100
+def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
+    """A point in the middle, one in the corner, one of a single image, one twice in an image."""
+    image = np.array([0, 1, 2, 0, 1, 2, 1, 0, 0, 2])
+    xy = np.tile([[320.0, 240.0]], (10, 1))
+    xy[3:6] = WIDTH, HEIGHT
+    offsets = np.array([0, 3, 6, 7, 10])
+    none = np.zeros((4, 3), np.uint8)
+    points = ModelPoints(np.zeros((4, 3)), none, np.zeros(4), offsets, image, xy)
+    colours = Colours(points, (WIDTH, HEIGHT), 3)
+    blue, red, white = np.zeros((3, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    blue[..., 0], red[..., 2], white[...] = 200, 100, 255
     half = np.ascontiguousarray(red[::2, ::2])
-    half[-1, -1] = [0, 40, 0]
-    colours.add(0, blue)
-    colours.add(2, half)  # the picture in the middle is not there
+    half[-1, -1] = [0, 240, 0]
+    for i, picture in enumerate((blue, white, half)):
+        colours.add(i, picture)
     assert colours.rgb().tolist() == [
-        [50, 0, 100],
-        [0, 20, 100],  # beyond the last pixel is the last pixel
-        [0, 0, 0],
-        [0, 0, 200],  # two of its observations are in the first picture
+        [100, 0, 0],  # brighter than blue, and white hides it in one picture
+        [0, 240, 0],  # beyond the last pixel is the last pixel
+        [255, 255, 255],
+        [0, 0, 200],
     ]
 
 

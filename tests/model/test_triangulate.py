@@ -120,9 +120,10 @@ def test_unsure_distances_are_no_points(scene: tuple[np.ndarray, Views]) -> None
     rays = rays_of(xyz, seen_by)
     # Wrong alike in a part of the views, as tracks that drift are.
     rays[:, 5:, 0] += (noise * rng.choice([-1, 1], 4000))[:, None] / FOCAL
-    every = TriangulateOptions(max_depth_error=None)
+    every = TriangulateOptions(points="survey", max_depth_error=None)
     all_points = triangulate(observations(rays), seen_by, every)
-    sure = triangulate(observations(rays), seen_by, TriangulateOptions(max_depth_error=0.015))
+    options = TriangulateOptions(points="survey", max_depth_error=0.015)
+    sure = triangulate(observations(rays), seen_by, options)
 
     def off(points: TriangulatedPoints) -> np.ndarray:
         return np.abs(points.xyz[:, 2] / xyz[owners(points, 9), 2] - 1)

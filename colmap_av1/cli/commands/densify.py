@@ -8,6 +8,7 @@ from typing import Any
 from colmap_av1.cli.commands.shared import (
     ONLY_MODELS,
     add_command,
+    add_gaussians,
     add_images,
     add_output,
     add_overwrite,
@@ -39,6 +40,7 @@ def add_densify(commands: Any) -> None:
     add_output(command, "new folder for the model")
     add_overwrite(command, ONLY_MODELS)
     add_images(command, "folder of its images, where their names do not determine the frames")
+    add_gaussians(command)
     add_options(command, DensifyOptions)
     add_quiet(command)
 
@@ -51,6 +53,7 @@ def _run(namespace: argparse.Namespace) -> None:
             namespace.video,
             namespace.output,
             image_path=namespace.image_path,
+            gaussians=namespace.gaussians,
             options=options,
             progress=report,
             overwrite=namespace.overwrite,

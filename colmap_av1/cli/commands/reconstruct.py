@@ -8,6 +8,7 @@ from typing import Any
 from colmap_av1.cli.commands.shared import (
     ANY_VIDEO,
     add_command,
+    add_gaussians,
     add_output,
     add_quiet,
     add_video,
@@ -32,6 +33,7 @@ def add_reconstruct(commands: Any) -> None:
     )
     add_video(command, ANY_VIDEO)
     add_output(command, "folder for images/ and sparse/0/; that of an earlier run is resumed")
+    add_gaussians(command)
     add_options(command, ReconstructOptions)
     add_quiet(command)
 
@@ -39,5 +41,10 @@ def add_reconstruct(commands: Any) -> None:
 def _run(namespace: argparse.Namespace) -> None:
     options = given(namespace, ReconstructOptions)
     with progress_bars(namespace.quiet) as report:
-        result = reconstruct(namespace.video, namespace.output, options=options, progress=report)
+        result = reconstruct(
+            *(namespace.video, namespace.output),
+            gaussians=namespace.gaussians,
+            options=options,
+            progress=report,
+        )
     print_result(namespace, reconstruct_rows(result), result.warnings)

@@ -75,6 +75,15 @@ def add_overwrite(command: Parser, what: str = "replace an output that exists") 
     command.add_argument("--overwrite", action="store_true", help=what)
 
 
+def add_gaussians(command: Parser) -> None:
+    """Add --gaussians."""
+    command.add_argument(
+        "--gaussians",
+        metavar="PATH",
+        help="also write initial Gaussians to this .ply, for trainers that start from them",
+    )
+
+
 def add_quiet(command: Parser) -> None:
     """Add --quiet."""
     command.add_argument("--quiet", action="store_true", help="no progress and no summary")

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import EvaluationError
 from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
-from colmap_av1.model.colmap_model import ModelPoints, posed_images, read_model, write_model
+from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
@@ -274,25 +273,5 @@ def _write_part(model: Path, output: Path, names: Collection[str]) -> None:
     whole = read_model(model)
     posed = posed_images(whole)
     images = [posed[name] for name in sorted(posed) if name in names]
-    index = {image.image_id: k for k, image in enumerate(images)}
-    xy = {i: np.array([p.xy for p in whole.images[i].points2D], dtype=np.float64) for i in index}
-    points = [whole.points3D[i] for i in sorted(whole.points3D)]
-    seen: list[tuple[int, NDArray[np.float64]]] = []
-    counts = np.zeros(len(points) + 1, dtype=np.int64)
-    for k, point in enumerate(points):
-        own = [e for e in point.track.elements if int(e.image_id) in index]
-        seen += [(index[int(e.image_id)], xy[int(e.image_id)][e.point2D_idx]) for e in own]
-        counts[k + 1] = len(own)
-    write_model(
-        output,
-        {image.camera_id: whole.cameras[image.camera_id] for image in images},
-        images,
-        ModelPoints(
-            xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
-            rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
-            error=np.array([p.error for p in points], dtype=np.float64),
-            offsets=np.cumsum(counts),
-            image=np.array([image for image, _ in seen], dtype=np.int64),
-            xy=np.array([at for _, at in seen], dtype=np.float64).reshape(-1, 2),
-        ),
-    )
+    cameras = {image.camera_id: whole.cameras[image.camera_id] for image in images}
+    write_model(output, cameras, images, model_points(whole, images))
