@@ -97,7 +97,7 @@ def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     """
     filled = total = 0
     for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
-        depth = visible_depth(view, xyz)
+        depth = without_gaps(nearest_depth(view, xyz))
         filled += int(np.isfinite(depth).sum())
         total += depth.size
     return filled / max(total, 1)
@@ -112,35 +112,27 @@ def coverage_of_model(reconstruction: Any) -> float:
     return coverage(views, xyz.reshape(-1, 3))
 
 
-def visible_depth(view: PosedCamera, xyz: _Floats, cell: int = CELL) -> _Floats:
-    """Depth of the nearest visible point in each cell of an image.
+def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
+    """Depth of the nearest point in each cell of an image, seen through a gap or not.
 
     Args:
         view: the image.
         xyz: float64 [n, 3] the points.
-        cell: width of a cell in pixels.
 
     Returns:
         float64 [rows, columns]; inf where there is none.
     """
     _, xy, depth = view.project(xyz)
-    grid = nearest_depth(view.size, xy, depth, cell)
-    grid[seen_through_gap(grid)] = np.inf
-    return grid
-
-
-def nearest_depth(size: tuple[int, int], xy: _Floats, depth: _Floats, cell: int) -> _Floats:
-    """Float64 [rows, columns] least depth of the points in each cell, inf without any."""
-    width, height = size
-    columns, rows = -(-width // cell), -(-height // cell)
+    width, height = view.size
+    columns, rows = -(-width // CELL), -(-height // CELL)
     grid = np.full(rows * columns, np.inf)
-    column, row = (xy // cell).astype(np.int64).T
+    column, row = (xy // CELL).astype(np.int64).T
     np.minimum.at(grid, row * columns + column, depth)
     return grid.reshape(rows, columns)
 
 
-def seen_through_gap(grid: _Floats) -> NDArray[np.bool_]:
-    """Cells whose points lie well behind those of nearly all cells around them."""
+def without_gaps(grid: _Floats) -> _Floats:
+    """Nearest depths without those that lie well behind nearly all around them: inf there."""
     rows, columns = grid.shape
     padded = np.pad(grid, 1, constant_values=np.inf)
     limit = grid / _NEARER
@@ -148,7 +140,7 @@ def seen_through_gap(grid: _Floats) -> NDArray[np.bool_]:
     for row in range(3):
         for column in range(3):
             nearer += padded[row : row + rows, column : column + columns] < limit
-    return np.asarray(np.isfinite(grid) & (nearer >= _AROUND - 1))
+    return np.where(nearer >= _AROUND - 1, np.inf, grid)
 
 
 def _seen_rays(camera: Any) -> tuple[_Floats, _Floats]:

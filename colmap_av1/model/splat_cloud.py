@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.model.colmap_model import ModelPoints, take_rows
-from colmap_av1.model.coverage import CELL, PosedCamera, evenly_spread, visible_depth
+from colmap_av1.model.coverage import CELL, PosedCamera, evenly_spread, nearest_depth, without_gaps
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -30,6 +30,8 @@ _MOST_STEPS = 64
 _FOR_SURFACES = 0.75
 # Width in pixels of the squares that get a point each where a cell of the coverage is empty.
 _FILLING = 8
+# Points before what an image shows through a gap hide it: looking at all images again finds that.
+_ROUNDS = 2
 # Of the depths at the edge of a hole, those that are nearer than this quantile of them by more than
 # a factor are not what it shows; and how many of the others each of its cells follows.
 _FARTHER = 0.75
@@ -121,14 +123,15 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
 
 def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) -> ModelPoints:
     """Points in the holes that the kept ones leave in the key images, first one in each cell."""
-    surfaces = [visible_depth(images[key], kept.xyz) for key in keys]
+    nearest = [nearest_depth(images[key], kept.xyz) for key in keys]
+    surfaces = [without_gaps(grid) for grid in nearest]
     usual = _usual_depth(surfaces)
     filled: list[ModelPoints] = [take_points(kept, np.empty(0, np.int64))]
     is_first = [np.empty(0, np.bool_)]
     added = np.empty((0, 3))
-    for place in _spread_order(len(keys)):
+    for place in _spread_order(len(keys)) * _ROUNDS:
         own = images[keys[place]]
-        grid = np.minimum(surfaces[place], visible_depth(own, added))
+        grid = without_gaps(np.minimum(nearest[place], nearest_depth(own, added)))
         rows, columns = np.nonzero(np.isinf(grid))
         if len(rows) == 0:
             continue

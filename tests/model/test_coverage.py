@@ -67,6 +67,6 @@ def test_pixels_and_depths() -> None:
     assert index.tolist() == [0, 3]
     assert depth.tolist() == [2.0, 5.0]
     assert np.allclose(xy[1], (80, 48))
-    grid = nearest_depth(SIZE, xy, depth, CELL)
+    grid = nearest_depth(view, points)
     assert grid.shape == (6, 10)
     assert np.sort(grid.ravel())[:3].tolist() == [2.0, 5.0, np.inf]
