@@ -11,13 +11,7 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.model.colmap_model import model_points, posed_images, read_model
-from colmap_av1.model.coverage import PosedCamera
-from colmap_av1.model.gaussians import (
-    check_gaussians_path,
-    initial_gaussians,
-    write_gaussians,
-)
+from colmap_av1.model.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -161,7 +155,7 @@ def reconstruct(
                 raise
         if gaussians is not None:
             with clock.measure("gaussians"):
-                _write_gaussians(output / "sparse" / "0", Path(gaussians))
+                write_model_gaussians(Path(gaussians), output / "sparse" / "0")
             report = replace(report, gaussians=Path(gaussians), seconds=clock.seconds)
         _write_report(report)
     return report
@@ -224,15 +218,6 @@ def _notes(facts: dict[str, Any]) -> list[str]:
             "try the other --mapper, or give --camera_params"
         )
     return notes
-
-
-def _write_gaussians(model: Path, path: Path) -> None:
-    """Write initial Gaussians of the points of a model."""
-    reconstruction = read_model(model)
-    posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.image_id)
-    cameras = reconstruction.cameras
-    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in posed]
-    write_gaussians(path, initial_gaussians(model_points(reconstruction, posed), views))
 
 
 def _write_report(report: ReconstructReport) -> None:

@@ -255,9 +255,10 @@ def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeyp
 def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     output = tmp_path / "report"
     shutil.copytree(compared, output)
-    copy = "import shutil, sys; shutil.copytree(*sys.argv[1:], dirs_exist_ok=True)"
-    line = f'cd "$1" && {sys.executable} -c "{copy}" "$2"/images "$3" && echo "$4"'
-    command = f"sh -c '{line}' sh {{data}} {{test}} {{renders}} {{iterations}}"
+    copy = "shutil.copytree(*sys.argv[1:3], dirs_exist_ok=True)"
+    copy = f"import pathlib, shutil, sys; {copy}; print(pathlib.Path(sys.argv[3]).read_bytes()[:3])"
+    line = f'cd "$1" && {sys.executable} -c "{copy}" "$2"/images "$3" "$5" && echo "$4"'
+    command = f"sh -c '{line}' sh {{data}} {{test}} {{renders}} {{iterations}} {{gaussians}}"
     options = CompareOptions(
         match=OPTIONS, frontends=("av1",), all_tracks=False, trainer=command, iterations=7
     )
@@ -267,7 +268,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     assert training.names == [f"frame_{i:06d}.png" for i in (6, 18, 30, 42)]
     assert training.metrics.psnr_y.tolist() == [60] * 4
     log = output / "splats" / "av1" / "training" / "log.txt"
-    assert log.read_text() == "7\n"
+    assert log.read_text() == "b'ply'\n7\n"
     train = output / "splats" / "av1" / "split" / "train"
     model = pycolmap.Reconstruction(train / "sparse" / "0")
     names = [f"frame_{i:06d}.png" for i in (0, 12, 24, 36)]

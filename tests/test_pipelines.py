@@ -116,6 +116,17 @@ def test_colmap_with_sift(tmp_path: Path, tools: Path, video: Path) -> None:
     assert 50 < sum(of_sift) < len(of_sift) - 500
 
 
+def test_colmap_dense(tmp_path: Path, tools: Path, video: Path) -> None:
+    """The poses are the mapper's, and the points many more."""
+    run("colmap_dense.sh", tools, video, tmp_path / "my work", "--preset", "sparse")
+    sparse = largest_model(tmp_path / "my work/sparse")
+    dense = pycolmap.Reconstruction(tmp_path / "my work/dense")
+    check_model(dense, tmp_path / "my work/images", 3 * sparse.num_points3D())
+    poses = {i.name: i.cam_from_world().matrix() for i in sparse.images.values()}
+    for image in dense.images.values():
+        assert np.allclose(image.cam_from_world().matrix(), poses[image.name], atol=1e-6)
+
+
 # What convert.py does when told to skip the matching: undistort, and move the model.
 CONVERT = """
     import argparse, pathlib, subprocess

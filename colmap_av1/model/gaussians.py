@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError, OptionError, cannot_write
-from colmap_av1.model.colmap_model import ModelPoints, camera_centres, take_rows
+from colmap_av1.model.colmap_model import (
+    ModelPoints,
+    camera_centres,
+    model_points,
+    posed_images,
+    read_model,
+    take_rows,
+)
 from colmap_av1.model.coverage import PosedCamera, evenly_spread
 from colmap_av1.model.splat_points import distance_uncertainty
 from colmap_av1.util.files import whole_file
@@ -191,6 +198,23 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
                 file.write(_records(gaussians, slice(first, first + _CHUNK)).tobytes())
     except OSError as error:
         raise ModelError(cannot_write(path, error)) from error
+
+
+def write_model_gaussians(path: Path, model: Path) -> None:
+    """Write initial Gaussians of the points of a COLMAP model.
+
+    Args:
+        path: the file, see `write_gaussians`.
+        model: folder of the model.
+
+    Raises:
+        ModelError: the model cannot be read, or the file not written.
+    """
+    reconstruction = read_model(model)
+    posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
+    cameras = reconstruction.cameras
+    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in posed]
+    write_gaussians(path, initial_gaussians(model_points(reconstruction, posed), views))
 
 
 def _records(gaussians: Gaussians, own: slice) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ from colmap_av1.options.model import TriangulateOptions
 
 # The trainer that is built in; others are commands with these placeholders.
 GSPLAT = "gsplat"
-PLACEHOLDERS = ("data", "test", "output", "renders", "iterations", "name")
+PLACEHOLDERS = ("data", "test", "gaussians", "output", "renders", "iterations", "name")
 # Programs that run the word after -c.
 _SHELL = re.compile(r"(.*/)?((ba|da|k|z)?sh|python[0-9.]*)")
 # Words that only a shell understands.
@@ -75,8 +75,9 @@ class CompareOptions(Options):
         None,
         "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a "
         "command with {data}, the folder of that half, and as needed {test}, that of the other "
-        "half, {output}, {renders}, which receives the renderings of the test images, {iterations} "
-        "and {name}; a shell reads it only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
+        "half, {gaussians}, a .ply of initial Gaussians of the points, {output}, {renders}, which "
+        "receives the renderings of the test images, {iterations} and {name}; a shell reads it only "
+        "where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
         common=True,
     )
     iterations: int = option(30_000, "iterations of the training", least=1)

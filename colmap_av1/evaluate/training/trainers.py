@@ -20,6 +20,7 @@ from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_m
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
+from colmap_av1.model.gaussians import write_model_gaussians
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
@@ -139,8 +140,9 @@ def train(
 
     Args:
         trainer: "gsplat", or a command, see `words_of_trainer`: `{data}` and `{test}` are the
-            halves, `{output}` an empty folder, `{renders}` the one that gets the renderings of
-            the test images, `{iterations}` and `{name}` what they say.
+            halves, `{gaussians}` a file of initial Gaussians of the points as the first half sees
+            them, `{output}` an empty folder, `{renders}` the one that gets the renderings of the
+            test images, `{iterations}` and `{name}` what they say.
         split: the data.
         folder: gets `output/`, `renders/`, `log.txt` and the figures.
         name: the column.
@@ -164,9 +166,13 @@ def train(
     def make() -> dict[str, Any]:
         for path in (folder / "output", renders):
             path.mkdir()
+        gaussians = folder / "init.ply"
+        if "{gaussians}" in trainer:
+            write_model_gaussians(gaussians, split.train / "sparse" / "0")
         values = {
             "data": split.train.resolve(),
             "test": split.test.resolve(),
+            "gaussians": gaussians.resolve(),
             "output": (folder / "output").resolve(),
             "renders": renders.resolve(),
             "iterations": iterations,
