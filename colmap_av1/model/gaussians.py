@@ -34,8 +34,9 @@ _PER_DEPTH = 100.0
 # Standard deviation across the surface as a share of the spacing: what lies between points is
 # covered, and detail is not blurred.
 _ACROSS = 0.5
-# That along the normal is the error of the depth, within these shares of the one across.
-_THICKNESS = (0.2, 1.0)
+# That along the normal is the error of the depth, within these shares of the one across: training
+# starts better from discs than from balls, even where depth is not known.
+_THICKNESS = (0.2, 0.5)
 # Spacings of points that nearly coincide, in pixels, are not below this.
 _LEAST_SPACING = 0.25
 # Nearest points in space whose plane gives the normal.
@@ -75,8 +76,8 @@ def initial_gaussians(points: ModelPoints, images: Sequence[PosedCamera]) -> Gau
     """A Gaussian for each point, as wide as its neighbours in the images leave room for.
 
     Trainers that get points alone take the distance to others in space for the size, which noise
-    of the depth and other surfaces nearby make wrong. Here a Gaussian is a disc on its surface, as
-    thick as the point's depth is uncertain, and round where it is not known.
+    of the depth and other surfaces nearby make wrong. Here a Gaussian is a disc on its surface, the
+    thicker the less its depth is known.
 
     Args:
         points: the points, with colours.
@@ -84,8 +85,7 @@ def initial_gaussians(points: ModelPoints, images: Sequence[PosedCamera]) -> Gau
     """
     across = _ACROSS * _spacing(points.xyz, images)
     rotation, normal = _on_surfaces(points.xyz)
-    thin, round_ = _THICKNESS
-    thickness = np.clip(_depth_error(points, images) / across, thin, round_) * across
+    thickness = np.clip(_depth_error(points, images) / across, *_THICKNESS) * across
     return Gaussians(
         points.xyz,
         normal,
