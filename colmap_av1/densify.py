@@ -23,7 +23,7 @@ from colmap_av1.model.colmap_model import (
     write_model,
 )
 from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model
-from colmap_av1.model.gaussians import (
+from colmap_av1.model.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
     write_gaussians,
@@ -114,7 +114,7 @@ def densify(
         output: new or empty folder for the dense model.
         image_path: folder of the model's images, to recognise by their content which frames
             they are where their names leave doubt.
-        gaussians: file, .ply, for initial Gaussians of the points, replaced where it exists.
+        gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
         overwrite: replace an output that holds a model and nothing else.
@@ -133,9 +133,8 @@ def densify(
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
-    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
-    check_folder(output, [model, video, folder, options.match.images.frame_list])
-    check_gaussians_path(gaussians, [video, folder, model], overwrite=overwrite)
+    inputs = [model, video, folder, options.match.images.frame_list]
+    _check_outputs(output, gaussians, inputs, overwrite=overwrite)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
@@ -271,6 +270,19 @@ def _agreement(model: Path, points: TriangulatedPoints) -> float:
             "and see that their names count its frames (--first_number, --frame_list)"
         )
     return agreeing
+
+
+def _check_outputs(
+    output: Path,
+    gaussians: str | os.PathLike[str] | None,
+    inputs: Sequence[str | os.PathLike[str] | None],
+    *,
+    overwrite: bool,
+) -> None:
+    """Refuse what must not or cannot be written, before the long work."""
+    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
+    check_folder(output, inputs)
+    check_gaussians_path(gaussians, inputs, overwrite=overwrite)
 
 
 def _check_input(

@@ -11,7 +11,6 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.model.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -27,6 +26,7 @@ from colmap_av1.model.reconstruct_stages import (
     some_images,
     track_stage,
 )
+from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.tracks.tracks import cut_tracks, join_tracks
@@ -124,7 +124,7 @@ def reconstruct(
         video: a video; one that is not AV1 is converted first, to a stream that a
             resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
-        gaussians: file, .ply, for initial Gaussians of the points, replaced where it exists.
+        gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 
@@ -143,7 +143,7 @@ def reconstruct(
     check_folder(output, [video, options.match.images.frame_list])
     video = read_video(video, options.match.read.operating_point)
     # What can be refused is refused before the long work.
-    check_gaussians_path(gaussians)
+    check_gaussians_path(gaussians, [video.path, options.match.images.frame_list])
     check_fit(options.match, video.picture_size, video.display.pixel_aspect)
     with open_stages(output, "reconstruct") as stages:
         matching = with_stream_kept(options.match, stages)

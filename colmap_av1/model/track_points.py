@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.model.colmap_model import ModelPoints
 from colmap_av1.model.coverage import PosedCamera
-from colmap_av1.model.splat_cloud import splat_cloud
-from colmap_av1.model.splat_points import splat_points
+from colmap_av1.model.splats.cloud import splat_cloud
+from colmap_av1.model.splats.points import splat_points
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames

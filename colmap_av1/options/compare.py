@@ -76,8 +76,8 @@ class CompareOptions(Options):
         "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a "
         "command with {data}, the folder of that half, and as needed {test}, that of the other "
         "half, {gaussians}, a .ply of initial Gaussians of the points, {output}, {renders}, which "
-        "receives the renderings of the test images, {iterations} and {name}; a shell reads it only "
-        "where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
+        "receives the renderings of the test images, {iterations} and {name}; a shell reads it "
+        "only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
         common=True,
     )
     iterations: int = option(30_000, "iterations of the training", least=1)

@@ -9,7 +9,7 @@ import pytest
 from colmap_av1.errors import ModelError, OptionError
 from colmap_av1.model.colmap_model import ModelPoints
 from colmap_av1.model.coverage import PosedCamera
-from colmap_av1.model.gaussians import (
+from colmap_av1.model.splats.gaussians import (
     Gaussians,
     check_gaussians_path,
     initial_gaussians,
@@ -103,11 +103,11 @@ def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["init.ply"]
     header, body = path.read_bytes().split(b"end_header\n", 1)
     lines = header.decode().split("\n")
-    assert lines[:3] == [
-        *("ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"),
-    ]
-    names = [line.split()[2] for line in lines[3:] if line]
-    assert all(line.startswith("property float ") for line in lines[3:] if line)
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[2].startswith("comment ")
+    assert lines[3] == f"element vertex {len(xyz)}"
+    names = [line.split()[2] for line in lines[4:] if line]
+    assert all(line.startswith("property float ") for line in lines[4:] if line)
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     # The reference implementation refuses any other number.
     rest = [name for name in names if name.startswith("f_rest_")]
@@ -126,14 +126,23 @@ def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
 
 def test_files_that_cannot_be_made(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"init\.txt: .* give a name that ends so"):
-        check_gaussians_path(tmp_path / "init.txt")
+        check_gaussians_path(tmp_path / "init.txt", [])
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(OptionError, match="cannot be written: give another file"):
-        check_gaussians_path(tmp_path / "folder.ply")
+    with pytest.raises(OptionError, match="exists and is no file"):
+        check_gaussians_path(tmp_path / "folder.ply", [])
     (tmp_path / "file").touch()
     with pytest.raises(OptionError, match="cannot be written: give another file"):
-        check_gaussians_path(tmp_path / "file" / "init.ply")
+        check_gaussians_path(tmp_path / "file" / "init.ply", [])
     empty = Gaussians(*(np.empty((0, k)) for k in (3, 3, 3, 4)), np.empty(0), np.empty((0, 3)))
     with pytest.raises(ModelError, match="cannot be written"):
         write_gaussians(tmp_path / "file" / "init.ply", empty)
     assert {p.name for p in tmp_path.iterdir()} == {"folder.ply", "file"}
+    mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
+    write_gaussians(mine, empty)
+    other.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
+    check_gaussians_path(mine, [])
+    check_gaussians_path(other, [], overwrite=True)
+    with pytest.raises(OptionError, match=r"other\.ply: exists"):
+        check_gaussians_path(other, [])
+    with pytest.raises(OptionError, match=r"mine\.ply: is the input itself"):
+        check_gaussians_path(mine, [mine], overwrite=True)

@@ -11,8 +11,8 @@ import pytest
 from colmap_av1.errors import OptionError
 from colmap_av1.model.colmap_model import ModelPoints, camera_centres
 from colmap_av1.model.coverage import PosedCamera, coverage
-from colmap_av1.model.splat_cloud import splat_cloud, take_points
-from colmap_av1.model.splat_points import splat_points
+from colmap_av1.model.splats.cloud import splat_cloud, take_points
+from colmap_av1.model.splats.points import splat_points
 from colmap_av1.model.triangulate import (
     Observations,
     TriangulatedPoints,
@@ -245,7 +245,7 @@ def test_many_points_are_looked_at_some_at_a_time(monkeypatch: pytest.MonkeyPatc
     truth = np.concatenate([scattered(2000, 8.0), [[-0.2, 0.1, 2.0]], scattered(100, 900.0)])
     seen = see(truth, poses, 0.2)
     at_once = splat_points(seen, views_of(poses), SPLATS)
-    monkeypatch.setattr("colmap_av1.model.splat_points._CHUNK", 500)
+    monkeypatch.setattr("colmap_av1.model.splats.points._CHUNK", 500)
     in_parts = splat_points(seen, views_of(poses), SPLATS)
     assert len(at_once.xyz) > 2000
     for name in ("xyz", "error", "offsets", "observation"):

@@ -20,7 +20,7 @@ from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_m
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
 from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
-from colmap_av1.model.gaussians import write_model_gaussians
+from colmap_av1.model.splats.gaussians import write_model_gaussians
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +20,9 @@ from colmap_av1.model.colmap_model import (
     take_rows,
 )
 from colmap_av1.model.coverage import PosedCamera, evenly_spread
-from colmap_av1.model.splat_points import distance_uncertainty
+from colmap_av1.model.splats.points import distance_uncertainty
 from colmap_av1.util.files import whole_file
+from colmap_av1.util.outputs import check_files, made_by
 
 _Floats = NDArray[np.float64]
 
@@ -47,6 +48,8 @@ _OPACITY = 0.5
 _SH0 = 0.28209479177387814
 # Further coefficients, of degrees 1 to 3: readers of the reference implementation insist on them.
 _REST = 45
+# By this comment at the head of a file it is known again.
+_MADE_BY, _HEAD = made_by("--gaussians"), 200
 # Points worked on at a time; bounds memory.
 _CHUNK = 100_000
 
@@ -156,20 +159,38 @@ def _depth_error(points: ModelPoints, images: Sequence[PosedCamera]) -> _Floats:
     return error
 
 
-def check_gaussians_path(given: str | os.PathLike[str] | None) -> None:
-    """Refuse a file, where one is given, that `write_gaussians` could not write.
+def check_gaussians_path(
+    given: str | os.PathLike[str] | None,
+    inputs: Iterable[str | os.PathLike[str] | None],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Refuse a file, where one is given, that `write_gaussians` must not or could not write.
+
+    Args:
+        given: the file.
+        inputs: files and folders that are read; None: not given.
+        overwrite: replace a file that exists, if it was not written here either.
 
     Raises:
-        OptionError: its name does not end in .ply, or nothing can be made there.
+        OptionError: its name does not end in .ply, it is an input or exists, or nothing can be made
+            there.
     """
     if given is None:
         return
     path = Path(given)
     if path.suffix.lower() != ".ply":
         raise OptionError(f"{path}: trainers know Gaussians by .ply: give a name that ends so")
+    check_files([path], inputs, is_own=_is_own, overwrite=overwrite)
     above = next(p for p in path.absolute().parents if p.exists())
-    if path.is_dir() or not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise OptionError(f"{path}: cannot be written: give another file")
+
+
+def _is_own(path: Path) -> bool:
+    """Whether `write_gaussians` wrote a file."""
+    with path.open("rb") as file:
+        return f"\ncomment {_MADE_BY}\n".encode() in file.read(_HEAD)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
@@ -188,7 +209,8 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(_REST)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians.xyz)}"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {_MADE_BY}"]
+    header += [f"element vertex {len(gaussians.xyz)}"]
     header += [*(f"property float {name}" for name in names), "end_header"]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,1 @@
+"""Points and Gaussians that trainers of Gaussian splats start well from."""
