@@ -179,6 +179,18 @@ def test_points_become_even_and_holes_are_filled() -> None:
     )
 
 
+def test_what_is_seen_through_a_hole_that_is_filled_is_no_hole() -> None:
+    """A far point amid a hole of a near wall is hidden once there are points around it."""
+    views = posed(moving(0.0, 1))
+    x, y = np.meshgrid(np.arange(4.0, WIDTH, 8), np.arange(4.0, HEIGHT, 8))
+    hole = (np.abs(x // 16 - 10) <= 1) & (np.abs(y // 16 - 7) <= 1)
+    rays = (np.column_stack([x[~hole], y[~hole]]) - (WIDTH / 2, HEIGHT / 2)) / FOCAL
+    wall = 5.0 * np.column_stack([rays, np.ones(len(rays))])
+    beyond = np.array([[0.0, 0.0, 50.0]])
+    made = splat_cloud(cloud(np.concatenate([wall, beyond]), views), views, None)
+    assert coverage(views, made.xyz) == 1.0
+
+
 @pytest.mark.parametrize("max_points", [100, 500, 1000])
 def test_a_bound_on_the_number_keeps_the_coverage(max_points: int) -> None:
     views = posed(moving(0.1))
