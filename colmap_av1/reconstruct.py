@@ -109,6 +109,7 @@ def reconstruct(
     output: str | os.PathLike[str],
     *,
     gaussians: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
     options: ReconstructOptions | None = None,
     progress: Progress | None = None,
 ) -> ReconstructReport:
@@ -125,6 +126,7 @@ def reconstruct(
             resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
         gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
+        overwrite: replace a file of Gaussians that was not written here, too.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 
@@ -143,7 +145,8 @@ def reconstruct(
     check_folder(output, [video, options.match.images.frame_list])
     video = read_video(video, options.match.read.operating_point)
     # What can be refused is refused before the long work.
-    check_gaussians_path(gaussians, [video.path, options.match.images.frame_list])
+    inputs = [video.path, options.match.images.frame_list]
+    check_gaussians_path(gaussians, inputs, overwrite=overwrite)
     check_fit(options.match, video.picture_size, video.display.pixel_aspect)
     with open_stages(output, "reconstruct") as stages:
         matching = with_stream_kept(options.match, stages)

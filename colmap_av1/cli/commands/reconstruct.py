@@ -10,6 +10,7 @@ from colmap_av1.cli.commands.shared import (
     add_command,
     add_gaussians,
     add_output,
+    add_overwrite,
     add_quiet,
     add_video,
     print_result,
@@ -34,6 +35,7 @@ def add_reconstruct(commands: Any) -> None:
     add_video(command, ANY_VIDEO)
     add_output(command, "folder for images/ and sparse/0/; that of an earlier run is resumed")
     add_gaussians(command)
+    add_overwrite(command, "replace a file of --gaussians that exists")
     add_options(command, ReconstructOptions)
     add_quiet(command)
 
@@ -44,6 +46,7 @@ def _run(namespace: argparse.Namespace) -> None:
         result = reconstruct(
             *(namespace.video, namespace.output),
             gaussians=namespace.gaussians,
+            overwrite=namespace.overwrite,
             options=options,
             progress=report,
         )
