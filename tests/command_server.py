@@ -17,8 +17,6 @@ from colmap_av1.cli import main
 from colmap_av1.util.start import ENDING, end_at_once
 
 def run(task, said):
-    for number in ENDING:
-        signal.signal(number, end_at_once)  # as a program that has just started
     os.chdir(task["folder"])
     os.setpgid(0, 0)
     os.dup2(said, 1)
@@ -34,6 +32,8 @@ def run(task, said):
     sys.stderr.flush()
     os._exit(status)
 
+for number in ENDING:  # before the copies are made, which are programs that have just started
+    signal.signal(number, end_at_once)
 for line in sys.stdin:
     task = json.loads(line)
     said = os.memfd_create("said")
