@@ -25,8 +25,10 @@ from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import (
+    ImageOptions,
     MatchOptions,
     ReadOptions,
+    ReconstructOptions,
     RunOptions,
     TrackOptions,
     TriangulateOptions,
@@ -238,6 +240,26 @@ def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
             written.append((np.diff(file["offsets"]).min(), tmp_path / name / "database.db"))
     assert [shortest for shortest, _ in written] == [3, 4]
     assert written[0][1].read_bytes() == written[1][1].read_bytes()
+
+
+def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
+    """Of 60 frames about as many as asked for become images, unless an option says which."""
+
+    def stop(stage: str, *_: object) -> None:
+        if stage == "pairs":
+            raise KeyboardInterrupt
+
+    chosen = []
+    for name, images in (("few", ImageOptions()), ("all", ImageOptions(every=1))):
+        options = ReconstructOptions(match=MatchOptions(images=images), max_images=25)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+        with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
+            chosen.append(file["frames"])
+            np.testing.assert_array_equal(np.unique(file["frame"]), chosen[-1])
+            assert file["names"][1] == f"frame_{chosen[-1][1]:06d}.png"
+    assert 25 <= len(chosen[0]) <= 30
+    assert (chosen[0][0], chosen[0][-1], len(chosen[1])) == (0, 59, 60)
 
 
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:

@@ -81,7 +81,11 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
     rows = [
         ("output", str(report.output)),
         *_conversion_row(report.conversion),
-        ("images", f"{report.num_registered} of {report.num_images} with a pose"),
+        (
+            "images",
+            f"{report.num_registered} of {report.num_images} with a pose, {report.num_frames} "
+            "frames in the video",
+        ),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),

@@ -40,6 +40,8 @@ _REACH = 0.25
 # matters is where pictures change by more than a rotation, which depends on it but little.
 _FOCAL_LENGTH = 1.2
 _IRLS_ITERATIONS = 10
+# Tracks, spread over the picture, that the rotation is fitted to at most.
+_MOST_STEPS = 1000
 # Share of plain motion that counts as parallax: rotation explains away much of the motion
 # of a scene that is flat.
 _MOTION_SHARE = 0.1
@@ -169,6 +171,7 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
         steps = order[bounds[frame] : bounds[frame + 1]]
         if len(steps) < 3:
             continue
+        steps = steps[:: -(-len(steps) // _MOST_STEPS)]
         motion = (tracks.xy[steps + 1] - tracks.xy[steps]).astype(np.float64)
         remains = motion - _rotation_field(tracks.xy[steps] - centre, motion, focal)
         plain = np.median(np.hypot(motion[:, 0], motion[:, 1]))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.choosing import choose_frames
+from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 # Share of its cells with tracks that a key image has in common with the next one: of three in a row
@@ -53,6 +55,26 @@ def key_images(
             following += 1
         key.append(following)
     return np.array(key, dtype=np.int64)
+
+
+def spread_images(tracks: Tracks, num_images: int, key: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Choose images of a long video: its key images, and between them evenly in parallax.
+
+    Args:
+        tracks: tracks of the whole video.
+        num_images: images to choose.
+        key: int64 key images, as frames, ascending.
+
+    Returns:
+        int32 frames, ascending: `num_images` of them, or more where key images are close together.
+    """
+    evenly = ImageOptions(num_images=num_images, select="parallax")
+    spread = choose_frames(tracks, evenly).astype(np.int64)
+    # A key image takes the place of the one nearest to it.
+    after = np.clip(np.searchsorted(spread, key), 1, len(spread) - 1)
+    is_before = key - spread[after - 1] <= spread[after] - key
+    replaced = np.unique(np.where(is_before, after - 1, after))
+    return np.union1d(np.delete(spread, replaced), key).astype(np.int32)
 
 
 class _TracksByImage:

@@ -18,7 +18,8 @@ from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.images.choosing import ChosenImages, choose_images
-from colmap_av1.images.key_images import key_images
+from colmap_av1.images.key_images import key_images, spread_images
+from colmap_av1.images.names import image_names
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     pair_images,
@@ -79,18 +80,23 @@ def track_stage(run: Run) -> Kept:
         tracked = track_video(source, options, one_size=True, clock=clock, progress=progress)
         tracks = tracked.tracks
         with clock.measure("choice"):
-            chosen = choose_images(
-                pose_tracks(run, tracks),
-                options.images,
-                existing=(),
-                folder=partial,
-                times=lambda: times_of_frames(source, tracks.num_frames),
-                decode=lambda: decoded_pictures(source, options),
-            )
+            is_long = not options.images.ways and tracks.num_frames > run.options.max_images
+            if is_long:
+                chosen = _images_of_long_video(run, tracks, tracked.inter_share)
+            else:
+                chosen = choose_images(
+                    pose_tracks(run, tracks),
+                    options.images,
+                    existing=(),
+                    folder=partial,
+                    times=lambda: times_of_frames(source, tracks.num_frames),
+                    decode=lambda: decoded_pictures(source, options),
+                )
         tracked = refine_in_images(
             tracked, source, chosen.frames, options, clock=clock, progress=progress
         )
-        tracks = tracked.tracks
+        # Of a long video no other frame is of use from here on.
+        tracks = keep_frames(tracked.tracks, chosen.frames) if is_long else tracked.tracks
         if len(chosen.names) < LEAST_IMAGES:
             raise ImageError(
                 f"{len(chosen.names)} of {tracks.num_frames} frames become images: a model needs "
@@ -112,7 +118,9 @@ def track_stage(run: Run) -> Kept:
             "warnings": list(tracked.warnings),
         }
 
-    given = (options.images, options.read, options.tracks, options.refine)
+    mapping = run.options.mapping
+    choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
+    given = (options.images, choice, options.read, options.tracks, options.refine)
     listed = digest_if_there(options.images.frame_list)
     return run_stage(
         run.stages,
@@ -175,7 +183,9 @@ def match_stage(
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("pairs"):
             seen = keep_frames(tracks, chosen.frames)
-            index = _key_images(run, seen, chosen, inter_share)
+            index = np.arange(len(chosen.frames))
+            if mapping.key_images:
+                index = _key_images(run, seen, chosen, inter_share)
             keyed = some_images(chosen, index)
             sparse = select_tracks(keep_frames(seen, keyed.frames), density)
         video = run.source.pictures
@@ -224,13 +234,23 @@ def match_stage(
     )
 
 
+def _images_of_long_video(
+    run: Run, tracks: Tracks, inter_share: NDArray[np.float32]
+) -> ChosenImages:
+    """As many images as a trainer wants of a video with more frames, its key images among them."""
+    name = run.options.match.images.image_name
+    frames = np.arange(tracks.num_frames, dtype=np.int32)
+    every = ChosenImages(image_names(name, frames.tolist()), frames)
+    tracks = pose_tracks(run, tracks)
+    key = _key_images(run, tracks, every, inter_share)
+    return some_images(every, spread_images(tracks, run.options.max_images, key))
+
+
 def _key_images(
     run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """The images that are mapped, by their index: all, where key images are not wanted."""
+    """The key images among some images, by their index."""
     mapping = run.options.mapping
-    if not mapping.key_images:
-        return np.arange(len(chosen.frames))
     return key_images(
         tracks,
         chosen.frames,
@@ -240,7 +260,9 @@ def _key_images(
     )
 
 
-def some_images(chosen: ChosenImages, index: Sequence[int] | NDArray[np.int64]) -> ChosenImages:
+def some_images(
+    chosen: ChosenImages, index: Sequence[int] | NDArray[np.integer[Any]]
+) -> ChosenImages:
     """Some of the images, by their index."""
     return ChosenImages([chosen.names[i] for i in index], chosen.frames[np.asarray(index)])
 

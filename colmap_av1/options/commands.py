@@ -72,6 +72,13 @@ class ReconstructOptions(Options):
     )
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
+    max_images: int = option(
+        300,
+        "images of a video with more frames, spread evenly in parallax and as close together as "
+        "tracks need to connect them, where no option says which frames are images",
+        least=3,
+        common=True,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -59,10 +59,15 @@ class ImageOptions(Options):
         "determine the frame are accepted",
     )
 
+    @property
+    def ways(self) -> list[str]:
+        """The options that say which frames are images, of those that are given."""
+        names = ("num_images", "every", "fps", "frame_list")
+        return [name for name in names if getattr(self, name) is not None]
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        ways = ("num_images", "every", "fps", "frame_list")
-        given = [name for name in ways if getattr(self, name) is not None]
+        given = self.ways
         if len(given) > 1:
             raise OptionError(
                 f"{given[0]} and {given[1]} both say which frames are images: give one"

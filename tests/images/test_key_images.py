@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from colmap_av1.images.key_images import key_images
+from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.tracks.tracks import Tracks
 
 _SIZE = (320, 240)
@@ -63,3 +63,22 @@ def test_no_track_at_all() -> None:
         *(tracks.xy[:0], tracks.sigma[:0], tracks.confirmed[:0]),
     )
     assert keys_of(nothing)[-1] == 29
+
+
+def test_images_of_a_long_video_are_key_images_and_even_in_parallax() -> None:
+    # Twice as fast in the second half.
+    tracks = sliding_tracks([2.0] * 100 + [4.0] * 100)
+    key = np.array([0, 7, 8, 9, 50, 120, 200])
+    frames = spread_images(tracks, 40, key)
+    assert set(key) <= set(frames.tolist())
+    assert len(np.unique(frames)) == len(frames)
+    # Three key images lie where one image would do.
+    assert 40 <= len(frames) <= 42
+    assert np.median(np.diff(frames[(frames > 10) & (frames < 100)])) == 8
+    assert np.median(np.diff(frames[frames > 100])) == 4
+
+
+def test_no_more_images_than_frames() -> None:
+    tracks = sliding_tracks([2.0] * 9)
+    assert spread_images(tracks, 10, np.arange(10)).tolist() == list(range(10))
+    assert spread_images(tracks, 3, np.arange(10)).tolist() == list(range(10))
