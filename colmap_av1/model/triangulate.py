@@ -17,8 +17,8 @@ from colmap_av1.util.cpus import threads_or_cpus
 
 _Floats = NDArray[np.float64]
 
-# Observations worked on at a time; bounds memory.
-_CHUNK = 200_000
+# Observations worked on at a time: as many as stay in a processor's cache.
+_CHUNK = 16_384
 # Two rays that a first guess is made of, by their place in the track from 0 to 1.
 _GUESSES = ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75))
 _ITERATIONS = 4

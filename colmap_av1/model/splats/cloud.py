@@ -108,16 +108,18 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
     stage = np.full(len(rank), len(_SPACINGS))
     for key in keys:
         index, xy, depth = key.project(points.xyz)
-        order = np.argsort(rank[index])
-        index, xy = index[order], xy[order]
-        step = np.floor(_STEPS_PER_OCTAVE * np.log2(depth[order])).astype(np.int64)
+        step = np.floor(_STEPS_PER_OCTAVE * np.log2(depth)).astype(np.int64)
         step -= step.min(initial=0)
         step = np.minimum(step, _MOST_STEPS - 1)
+        own = rank[index]
         for number, spacing in enumerate(_SPACINGS):
+            num_columns, num_rows = (-(-length // spacing) for length in key.size)
             column, row = (xy // spacing).astype(np.int64).T
-            cell = (row * key.size[0] + column) * _MOST_STEPS + step
-            _, wanted = np.unique(cell, return_index=True)
-            stage[index[wanted]] = np.minimum(stage[index[wanted]], number)
+            cell = (row * num_columns + column) * _MOST_STEPS + step
+            best = np.full(num_rows * num_columns * _MOST_STEPS, len(rank))
+            np.minimum.at(best, cell, own)
+            wanted = index[own == best[cell]]
+            stage[wanted] = np.minimum(stage[wanted], number)
     return stage
 
 

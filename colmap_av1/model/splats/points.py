@@ -41,7 +41,7 @@ _SUPPORT = 4
 _AROUND = 48.0
 _FEWEST_AROUND = 8
 # Observations worked on at a time; bounds memory.
-_CHUNK = 500_000
+_CHUNK = 65_536
 # Least angle in radians that is divided by.
 _TINY = 1e-12
 
