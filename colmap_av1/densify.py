@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, ModelError, cannot_write
 from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import size_of_images
+from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
+from colmap_av1.images.takes import Pictures, count_through, pictures_of
 from colmap_av1.model.colmap_model import (
     MODEL_FILES,
     ModelImage,
@@ -39,7 +41,7 @@ from colmap_av1.model.track_points import (
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensifyOptions, MatchOptions
-from colmap_av1.tracks.tracks import Tracks, scale_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames, scale_tracks, tracks_in_a_row
 from colmap_av1.tracks.video_tracks import (
     VideoSource,
     decoded_pictures,
@@ -51,7 +53,7 @@ from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.video.facts import Video, read_video
+from colmap_av1.video.facts import Video
 from colmap_av1.video.unchanged import unchanged
 
 
@@ -92,26 +94,50 @@ class DensifyReport:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class _VideoImages:
+    """A video, the model's images of it by their names in a folder, and their (width, height)."""
+
+    video: Video
+    names: list[str]
+    folder: Path | None
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _TrackedImages:
+    """A video's tracks in pixels of its images, in these alone, and what is to be said of it."""
+
+    tracks: Tracks
+    chosen: ChosenImages
+    conversion: str | None
+    warnings: tuple[str, ...]
+
+
 @checks_arguments
 def densify(
     model: str | os.PathLike[str],
-    video: str | os.PathLike[str],
+    video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
     *,
+    photos: str | os.PathLike[str] | None = None,
     image_path: str | os.PathLike[str] | None = None,
     gaussians: str | os.PathLike[str] | None = None,
     options: DensifyOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> DensifyReport:
-    """Triangulate the tracks of a video on the poses of an existing model.
+    """Triangulate the tracks of videos on the poses of an existing model.
 
-    Poses, cameras and image names stay as they are; the points are new.
+    Poses, cameras and image names stay as they are; the points are new. Images of several videos
+    are told apart by their folders, see `match`.
 
     Args:
-        model: folder of a COLMAP model of this video's frames, from whatever mapper.
-        video: a video; one that is not AV1 is converted first, see `match`.
+        model: folder of a COLMAP model of these videos' frames, from whatever mapper.
+        video: a video, or several; one that is not AV1 is converted first, see `match`.
         output: new or empty folder for the dense model.
+        photos: folder of the photos among the model's images, which see no point of a track; None:
+            there are none.
         image_path: folder of the model's images, to recognise by their content which frames
             they are where their names leave doubt.
         gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
@@ -120,10 +146,10 @@ def densify(
         overwrite: replace an output that holds a model and nothing else.
 
     Raises:
-        ModelError: there is no readable model with poses, it is not of this video, or the
+        ModelError: there is no readable model with poses, it is not of these videos, or the
             dense one cannot be written.
-        VideoError: the video cannot be read, or changes meanwhile.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
+        VideoError: a video cannot be read, is given twice, or changes meanwhile.
+        BitstreamError: a stream is damaged, and strict or before its second frame.
         ImageError: the model's images do not say which frames they are.
         OptionError: an option does not go with the images, the folder is not empty, or the file
             for Gaussians cannot be made.
@@ -133,39 +159,41 @@ def densify(
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
-    inputs = [model, video, folder, options.match.images.frame_list]
-    _check_outputs(output, gaussians, inputs, overwrite=overwrite)
+    read = [model, *paths_of(video), photos, folder, options.match.images.frame_list]
+    _check_outputs(output, gaussians, read, overwrite=overwrite)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
-    sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
-    video = read_video(video, options.match.read.operating_point)
-    with unchanged(video.state):
-        size = _check_input(model, video, folder, sizes, options)
-        opening = open_source(video, options.match, beside=output, clock=clock, progress=progress)
-        with opening as source, unchanged(source.stream.state):
-            matching = chaining_for_points(options.match, options.triangulate)
-            tracked = track_video(source, matching, one_size=True, clock=clock, progress=progress)
-            with clock.measure("choice"):
-                chosen = _choose(tracked.tracks, source, list(posed), folder, options.match)
-        images = [posed[name] for name in chosen.names]
-        seen, view = seen_in(scale_tracks(tracked.tracks, size), chosen.frames)
-        with clock.measure("points"):
-            points = triangulate_tracks(
-                *(seen, view, [cameras[i.camera_id] for i in images]),
-                *([i.cam_from_world for i in images], None),
-                options=options.triangulate,
-                num_threads=options.match.run.num_threads,
-                progress=progress,
-            )
-        agreeing = _agreement(model, points)
+    inputs = _read_inputs(video, photos, options, posed)
+    with unchanged(*inputs.states):
+        # What can be refused is refused before the long work.
+        sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
+        of_videos = _images_of_videos(model, sizes, inputs, folder, options)
+        tracked = [
+            _track(own, output, options, clock=clock, progress=progress) for own in of_videos
+        ]
+        photos_there = [photo for photo in inputs.photos if photo.name in posed]
+        takes = count_through(
+            inputs.labels,
+            [own.chosen for own in tracked],
+            [own.tracks.num_frames for own in tracked],
+            [photo.name for photo in photos_there],
+        )
+        images = [posed[name] for name in takes.images.names]
         views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
-        with clock.measure("cloud"):
-            xy = seen.xy[points.observation].astype(np.float64)
-            cloud = cloud_of(points, view, xy, views, options.triangulate)
-        with clock.measure("colours"):
-            pictures = decoded_pictures(source, options.match)
-            cloud = _coloured(cloud, size, pictures, chosen.frames, progress)
+        files = [(own, None) for own in inputs.videos]
+        pictures = pictures_of(takes, files, [p.path for p in photos_there], options.match)
+        row = tracks_in_a_row([own.tracks for own in tracked], takes.num_frames)
+        seen, view = seen_in(row, takes.images.frames)
+        with clock.measure("points"):
+            points = _triangulate(seen, view, views, options, progress)
+        agreeing = _agreement(model, points)
+        cloud = _coloured_cloud(
+            *(points, seen, view, views, pictures),
+            options=options,
+            clock=clock,
+            progress=progress,
+        )
     with clock.measure("coverage"):
         covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
@@ -174,7 +202,7 @@ def densify(
     return DensifyReport(
         output=output,
         model=model,
-        conversion=source.conversion,
+        conversion=inputs.conversion([own.conversion for own in tracked]),
         num_images=len(images),
         num_tracks=points.num_tracks,
         agreeing=agreeing,
@@ -185,13 +213,68 @@ def densify(
         mean_error=mean_error(cloud),
         gaussians=wanted,
         seconds=clock.seconds,
-        warnings=tracked.warnings,
+        warnings=(*inputs.warnings, *inputs.with_names([own.warnings for own in tracked])),
     )
 
 
-def _size(camera: Any) -> tuple[int, int]:
-    """(width, height) in pixels of the images of a pycolmap.Camera."""
-    return int(camera.width), int(camera.height)
+def _track(
+    images: _VideoImages,
+    output: Path,
+    options: DensifyOptions,
+    *,
+    clock: Clock,
+    progress: Progress,
+) -> _TrackedImages:
+    """Track a video, and find the frames of its images."""
+    matching = chaining_for_points(options.match, options.triangulate)
+    opening = open_source(
+        images.video, options.match, beside=output, clock=clock, progress=progress
+    )
+    with opening as source, unchanged(source.stream.state):
+        found = track_video(source, matching, one_size=True, clock=clock, progress=progress)
+        with clock.measure("choice"):
+            chosen = _choose(found.tracks, source, images.names, images.folder, options.match)
+    tracks = keep_frames(scale_tracks(found.tracks, images.size), chosen.frames)
+    return _TrackedImages(tracks, chosen, source.conversion, found.warnings)
+
+
+def _triangulate(
+    seen: Tracks,
+    view: NDArray[np.int64],
+    views: Sequence[PosedCamera],
+    options: DensifyOptions,
+    progress: Progress,
+) -> TriangulatedPoints:
+    return triangulate_tracks(
+        *(seen, view, [own.camera for own in views]),
+        *([own.cam_from_world for own in views], None),
+        options=options.triangulate,
+        num_threads=options.match.run.num_threads,
+        progress=progress,
+    )
+
+
+def _coloured_cloud(
+    points: TriangulatedPoints,
+    seen: Tracks,
+    view: NDArray[np.int64],
+    views: Sequence[PosedCamera],
+    pictures: Pictures,
+    *,
+    options: DensifyOptions,
+    clock: Clock,
+    progress: Progress,
+) -> ModelPoints:
+    """Those of the points that are written, in the colours of the pictures."""
+    with clock.measure("cloud"):
+        xy = seen.xy[points.observation].astype(np.float64)
+        cloud = cloud_of(points, view, xy, views, options.triangulate)
+    with clock.measure("colours"):
+        colours = Colours(cloud, [own.size for own in views])
+        for done, (image, picture) in enumerate(pictures(list(range(len(views)))), start=1):
+            progress("colours", done, len(views))
+            colours.add(image, picture)
+    return replace(cloud, rgb=colours.rgb())
 
 
 def _choose(
@@ -210,26 +293,6 @@ def _choose(
         times=lambda: times_of_frames(source, tracks.num_frames),
         decode=lambda: decoded_pictures(source, options),
     )
-
-
-def _coloured(
-    cloud: ModelPoints,
-    size: tuple[int, int],
-    pictures: Iterable[tuple[int, NDArray[np.uint8]]],
-    frames: NDArray[np.int32],
-    progress: Progress,
-) -> ModelPoints:
-    """The points in the colours of the images of a size, whose frames ascend."""
-    colours = Colours(cloud, size, len(frames))
-    image_of_frame = {int(frame): i for i, frame in enumerate(frames)}
-    last = int(frames[-1])
-    for frame, picture in pictures:
-        progress("colours", frame + 1, last + 1)
-        if frame in image_of_frame:
-            colours.add(image_of_frame[frame], picture)
-        if frame >= last:
-            break
-    return replace(cloud, rgb=colours.rgb())
 
 
 def _write(
@@ -285,17 +348,71 @@ def _check_outputs(
     check_gaussians_path(gaussians, inputs, overwrite=overwrite)
 
 
-def _check_input(
+def _read_inputs(
+    video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    photos: str | os.PathLike[str] | None,
+    options: DensifyOptions,
+    names: Collection[str],
+) -> Inputs:
+    """The videos and photos; these by their names in a model that `match` or `reconstruct` led to.
+
+    `reconstruct` changes names.
+    """
+    inputs = read_inputs(video, photos, options.match)
+    if any(photo.name in names for photo in inputs.photos):
+        return inputs
+    return read_inputs(video, photos, options.match, flat=True) if inputs.photos else inputs
+
+
+def _size(camera: Any) -> tuple[int, int]:
+    return int(camera.width), int(camera.height)
+
+
+def _images_of_videos(
+    model: Path,
+    sizes: Mapping[str, tuple[int, int]],
+    inputs: Inputs,
+    folder: Path | None,
+    options: DensifyOptions,
+) -> list[_VideoImages]:
+    """The model's images of each video, of (width, height) by their names; refuses others.
+
+    Raises:
+        ModelError: the model has an image of another video, or none of one.
+        ImageError: images do not fit their video.
+    """
+    photos = {photo.name for photo in inputs.photos}
+    of_label: dict[str, dict[str, tuple[int, int]]] = {label: {} for label in inputs.labels}
+    for name in sorted(sizes.keys() - photos):
+        label, _, own = name.partition("/") if len(of_label) > 1 else ("", "", name)
+        if label not in of_label:
+            raise ModelError(
+                f"{model}: image '{name}' lies in no folder of a video, "
+                f"{', '.join(of_label)}: give the video it comes from, or the photos as --images"
+            )
+        of_label[label][own] = sizes[name]
+    found = []
+    for video, (label, listed) in zip(inputs.videos, of_label.items(), strict=True):
+        if not listed:
+            raise ModelError(f"{model}: has no image of {video}: leave that video out")
+        own_folder = folder / label if folder is not None else None
+        found.append(_images_of_video(model, video, listed, own_folder, options))
+    return found
+
+
+def _images_of_video(
     model: Path,
     video: Video,
-    folder: Path | None,
     sizes: Mapping[str, tuple[int, int]],
+    folder: Path | None,
     options: DensifyOptions,
-) -> tuple[int, int]:
-    """Refuse what does not fit before the long work; (width, height) of the model's images."""
+) -> _VideoImages:
+    """The model's images of a video; refuses those that do not fit it."""
     check_frame_list(options.match.images)
     if len(sizes) < 2:
-        raise ModelError(f"{model}: only one image has a pose: give a model with two or more")
+        raise ModelError(
+            f"{model}: only one image of {video} has a pose: give a model with two or more"
+        )
     try:
         size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
     except ImageError as error:
@@ -303,4 +420,4 @@ def _check_input(
     missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
     if missing is not None:
         raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
-    return size
+    return _VideoImages(video, list(sizes), folder, size)

@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
+from colmap_av1.database.listed import listed_cameras, listed_of_videos
+from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError, OptionError
-from colmap_av1.images.camera import check_pixel_aspect, make_camera
+from colmap_av1.images.camera import check_pixel_aspect
+from colmap_av1.images.inputs import Inputs, read_inputs
+from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
+from colmap_av1.images.takes import Takes, count_through, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     PairedImages,
+    new_cameras,
     pair_images,
-    shared_focal_length,
+    pairs_of_takes,
     verify_images,
 )
-from colmap_av1.matching.links import LinkedImages, LinkReport, link_video
+from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -44,21 +47,23 @@ class MatchReport:
 
     Attributes:
         database: the database file.
-        video: the video file.
-        stream: the AV1 file whose motion was read: the video, or what it was converted to; None
-            where that was not kept.
-        conversion: how the stream was made of the video, in words; None where it is the video.
+        videos: the video files.
+        streams: for each, the AV1 file whose motion was read: the video, or what it was converted
+            to; None where that was not kept.
+        conversion: how the streams were made of the videos, in words; None where they are these.
+        photos: folder of the photos; None where none was given.
         image_path: folder of the images; None where none was given.
-        num_frames: shown frames of the video.
+        num_frames: shown frames of the videos.
         num_coded_frames: frames with block data, hidden ones included.
         num_images: images of the database.
         num_written_images: image files written; others were there or not asked for.
-        num_tracks: tracks in the video.
+        num_tracks: tracks in the videos.
         track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
             to 1 (longest); empty without a track.
         num_observations: keypoints of all images.
-        focal_length: in heights of a pixel, where it was estimated from the tracks; None where it
-            was given, or the motion does not determine it and the camera has COLMAP's first guess.
+        focal_length: of the first video, in heights of a pixel, where it was estimated from the
+            tracks; None where it was given, or the motion does not determine it and the camera has
+            COLMAP's first guess.
         num_pairs: image pairs written.
         num_verified_pairs: those with a two-view geometry.
         num_matches: matches of all pairs.
@@ -72,9 +77,10 @@ class MatchReport:
     """
 
     database: Path
-    video: Path
-    stream: Path | None
+    videos: tuple[Path, ...]
+    streams: tuple[Path | None, ...]
     conversion: str | None
+    photos: Path | None
     image_path: Path | None
     num_frames: int
     num_coded_frames: int
@@ -120,7 +126,9 @@ class MatchReport:
         if self.forward_motion:
             ours.append("--forward_motion")
         densify = [
-            *("colmap-av1", "densify", "--model", f"{output}/0", "--video", _no_option(self.video)),
+            *("colmap-av1", "densify", "--model", f"{output}/0"),
+            *(word for video in self.videos for word in ("--video", _no_option(video))),
+            *(("--images", _no_option(self.photos)) if self.photos is not None else ()),
             *(("--image_path", images) if self.image_path is not None else ()),
             *("--output", _no_option(self.database.with_name(f"{self.database.stem}_splats"))),
         ]
@@ -131,34 +139,43 @@ class MatchReport:
 @checks_arguments
 def match(
     database: str | os.PathLike[str],
-    video: str | os.PathLike[str],
+    video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
+    photos: str | os.PathLike[str] | None = None,
     image_path: str | os.PathLike[str] | None = None,
     options: MatchOptions | None = None,
     progress: Progress | None = None,
 ) -> MatchReport:
-    """Fill a COLMAP database with keypoints and verified matches from a video's motion.
+    """Fill a COLMAP database with keypoints and verified matches from the motion of videos.
 
     A database that lists images gets rows for these, see `frames_of_images`; a new or empty
     one gets images of its own. The database is written last and in one transaction: any
     error or interrupt leaves it as it was.
 
+    Images of several videos lie in a folder for each, named like it, and have a camera each; what
+    their pictures show in common connects them, and photos with them.
+
     Args:
         database: the database file; made where it is missing.
-        video: a video; one that is not AV1 is converted first, to a file beside the database that
-            is there as long as it is read, or to one that is kept (`options.keep_stream`).
+        video: a video, or several; one that is not AV1 is converted first, to a file beside the
+            database that is there as long as it is read, or to one that is kept
+            (`options.keep_stream`).
+        photos: folder of photos that become images, too, named by the folder and their path in it;
+            None: there are none.
         image_path: folder to write the images to, for the mapper's colours and for
-            training; existing images of the right size are kept. None: none are written.
+            training; existing images of the right size are kept, photos are copied to it. None:
+            none are written.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 
     Raises:
-        VideoError: the video cannot be read, changes meanwhile, or has no motion to match.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: images or names do not fit the video.
+        VideoError: a video cannot be read, is given twice, changes meanwhile, or has no motion to
+            match.
+        BitstreamError: a stream is damaged, and strict or before its second frame.
+        ImageError: images or names do not fit the video, or a photo cannot be read.
         DatabaseError: the database is locked, no COLMAP database, has features of its
             images and must not (`options.on_existing`), or does not fit the video.
-        OptionError: an option does not fit the video or its images.
+        OptionError: an option does not fit the videos or their images.
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress
@@ -167,59 +184,113 @@ def match(
     clock = Clock()
 
     listed = _read_listed_images(database, options)
-    existing = {image.name: (image.width, image.height) for image in listed}
-    video = read_video(video, options.read.operating_point)
-    with unchanged(video.state) as check_video:
-        prepared = prepare_images(
-            *(video, folder, options),
-            listed=existing,
+    inputs = read_inputs(video, photos, options)
+    if folder is not None:
+        check_places(inputs.photos, folder)
+    with unchanged(*inputs.states) as check_videos:
+        images = _prepare(
+            *(inputs, listed_of_videos(database, listed, inputs), folder, options),
             beside=database,
             clock=clock,
             progress=progress,
         )
-        source, chosen, display = prepared.source, prepared.chosen, prepared.display
-        # All tracks of a video are its largest arrays: they make room for the matches.
-        prepared = _with_chosen_tracks(prepared, options, clock)
         cameras, linked = _match_images(
-            prepared, database, listed, options, clock=clock, progress=progress
+            images, database, listed, options, clock=clock, progress=progress
         )
-
         num_written = 0
         if folder is not None:
-            check_video()
+            check_videos()
             with clock.measure("images"):
-                num_written = write_chosen(
-                    source.pictures,
-                    folder,
-                    chosen,
-                    options,
-                    display=display,
-                    progress=progress,
-                )
+                num_written = _write_images(images, folder, options, progress)
 
     with clock.measure("database"):
         write_matched_images(
-            database, chosen.names, cameras.new, linked.matched, options.on_existing
+            database, images.takes.images.names, cameras.new, linked.matched, options.on_existing
         )
+    videos = images.videos
+    notes = inputs.with_names([own.tracked.warnings for own in videos])
     return MatchReport(
         database=database,
-        video=video.path,
-        stream=source.stream.path if source.is_kept else None,
-        conversion=source.conversion,
+        videos=tuple(own.path for own in inputs.videos),
+        streams=tuple(own.source.stream.path if own.source.is_kept else None for own in videos),
+        conversion=inputs.conversion([own.source.conversion for own in videos]),
+        photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        num_frames=prepared.tracks.num_frames,
-        num_coded_frames=prepared.tracked.num_coded_frames,
+        num_frames=sum(own.tracks.num_frames for own in videos),
+        num_coded_frames=sum(own.tracked.num_coded_frames for own in videos),
         num_written_images=num_written,
         focal_length=cameras.focal_length,
         seconds=clock.seconds,
         links=linked.report,
-        warnings=(*prepared.tracked.warnings, *cameras.warnings, *linked.report.warnings),
-        **_figures(prepared.tracks, linked.matched),
+        warnings=(*inputs.warnings, *notes, *cameras.warnings, *linked.report.warnings),
+        **_figures([own.tracks for own in videos], linked.matched),
     )
 
 
+@dataclass(frozen=True)
+class _Images:
+    """The images of all videos and photos, before any are matched.
+
+    Attributes:
+        inputs: the videos and photos.
+        videos: the images of each video, with the tracks that are matched in place of all.
+        takes: all images, counted through.
+    """
+
+    inputs: Inputs
+    videos: Sequence[PreparedImages]
+    takes: Takes
+
+
+def _prepare(
+    inputs: Inputs,
+    listed: Sequence[Mapping[str, tuple[int, int]]],
+    folder: Path | None,
+    options: MatchOptions,
+    *,
+    beside: Path,
+    clock: Clock,
+    progress: Progress,
+) -> _Images:
+    """Find or choose the images of each video, and count them through."""
+    videos = [
+        # All tracks of a video are its largest arrays: they make room for the next.
+        _with_chosen_tracks(
+            prepare_images(
+                *(video, folder / label if folder is not None else None, options),
+                listed=existing,
+                beside=beside,
+                clock=clock,
+                progress=progress,
+            ),
+            options,
+            clock,
+        )
+        for video, label, existing in zip(inputs.videos, inputs.labels, listed, strict=True)
+    ]
+    takes = count_through(
+        inputs.labels,
+        [own.chosen for own in videos],
+        [own.tracks.num_frames for own in videos],
+        [photo.name for photo in inputs.photos],
+    )
+    return _Images(inputs, videos, takes)
+
+
+def _write_images(images: _Images, folder: Path, options: MatchOptions, progress: Progress) -> int:
+    """Write the images of the videos, and copy the photos; returns how many were not there."""
+    num_written = place_photos(images.inputs.photos, folder)
+    for label, own in zip(images.inputs.labels, images.videos, strict=True):
+        num_written += write_chosen(
+            *(own.source.pictures, folder / label, own.chosen, options),
+            display=own.display,
+            progress=progress,
+        )
+    return num_written
+
+
 def _match_images(
-    prepared: PreparedImages,
+    images: _Images,
     database: Path,
     listed: Sequence[DatabaseImage],
     options: MatchOptions,
@@ -228,23 +299,29 @@ def _match_images(
     progress: Progress,
 ) -> tuple[_Cameras, LinkedImages]:
     """Match the images along their tracks, verify that, and link what motion does not connect."""
-    source, chosen, inter_share = prepared.source, prepared.chosen, prepared.tracked.inter_share
-    paired = pair_images(
-        *(source.pictures.path, prepared.tracks, chosen, options),
-        needed=not may_link(inter_share, chosen.frames, options.links),
-        clock=clock,
-        progress=progress,
-    )
-    cameras = _cameras(
-        *(database, listed, chosen.names, paired, options),
-        size=prepared.size,
-        pixel_aspect=prepared.pixel_aspect,
-        clock=clock,
-    )
-    matched = verify_images(paired, cameras.of_images, options, clock=clock, progress=progress)
-    linked = link_video(
-        *(source, matched, cameras.of_images, prepared.size, inter_share),
-        display=prepared.display,
+    takes, videos = images.takes, images.videos
+    shares = [own.tracked.inter_share for own in videos]
+    paired = [
+        pair_images(
+            *(own.source.pictures.path, own.tracks, own.chosen, options),
+            needed=takes.num_takes == 1 and not may_link(share, own.chosen.frames, options.links),
+            clock=clock,
+            progress=progress,
+        )
+        for own, share in zip(videos, shares, strict=True)
+    ]
+    together = pairs_of_takes(paired, takes)
+    cameras = _cameras(images, together, database, listed, options, clock=clock)
+    matched = verify_images(together, cameras.of_images, options, clock=clock, progress=progress)
+    linked = link_images(
+        *(takes, matched, cameras.of_images, np.concatenate([*shares, images.inputs.no_motion])),
+        pictures_of(
+            takes,
+            [(own.source.pictures, own.display) for own in videos],
+            [photo.path for photo in images.inputs.photos],
+            options,
+        ),
+        name=images.inputs.name,
         options=options,
         clock=clock,
         progress=progress,
@@ -262,9 +339,9 @@ def _with_chosen_tracks(
     return replace(prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks))
 
 
-def _figures(tracks: Tracks, matched: MatchedImages) -> dict[str, Any]:
+def _figures(tracks: Sequence[Tracks], matched: MatchedImages) -> dict[str, Any]:
     """The counts of tracks and matches in `MatchReport`."""
-    lengths = np.diff(tracks.offsets)
+    lengths = np.concatenate([np.diff(own.offsets) for own in tracks])
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower") if len(lengths) else ()
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
@@ -331,51 +408,37 @@ class _Cameras:
 
     Attributes:
         of_images: the camera of each image; images share one where it is the same object.
-        new: what a database that lists no images is to get: one camera, or one for each image.
+        new: the same for a database that lists no images; None for one that does.
         focal_length: the estimated one, see `MatchReport`.
         warnings: what the user should know of them.
     """
 
     of_images: list[Any]
-    new: Any
+    new: list[Any] | None
     focal_length: float | None
     warnings: list[str]
 
 
 def _cameras(
+    images: _Images,
+    paired: PairedImages,
     database: Path,
     listed: Sequence[DatabaseImage],
-    names: Sequence[str],
-    paired: PairedImages,
     options: MatchOptions,
     *,
-    size: tuple[int, int],
-    pixel_aspect: float,
     clock: Clock,
 ) -> _Cameras:
     """Those of the database where it lists the images, else new ones."""
-    if listed:
-        of_images = _listed_cameras(database, listed, names)
-        what_to_do = "import the images with one of these"
-        warnings = check_pixel_aspect(of_images[0], pixel_aspect, what_to_do)
-        return _Cameras(of_images, None, None, warnings)
-    focal_length = shared_focal_length(paired, size, pixel_aspect, options, clock=clock)
-    camera = make_camera(options.camera, *size, pixel_aspect, focal_length)
-    what_to_do = "leave out --camera_model or give one"
-    warnings = check_pixel_aspect(camera, pixel_aspect, what_to_do)
-    if options.camera.single_camera:
-        return _Cameras([camera] * len(names), camera, focal_length, warnings)
-    each = [copy.copy(camera) for _ in names]
-    return _Cameras(each, each, focal_length, warnings)
-
-
-def _listed_cameras(
-    database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
-) -> list[Any]:
-    """The cameras that the database has of its images, one for each name."""
-    cameras = read_cameras(database)
-    camera_id = {image.name: image.camera_id for image in listed}
-    missing = next((n for n in names if camera_id[n] not in cameras), None)
-    if missing is not None:
-        raise DatabaseError(f"{database}: image '{missing}' has no camera: import the images again")
-    return [cameras[camera_id[name]] for name in names]
+    takes = images.takes
+    shapes = [(own.size, own.pixel_aspect) for own in images.videos]
+    if not listed:
+        made = new_cameras(paired, takes, shapes, images.inputs.photos, options, clock=clock)
+        return _Cameras(made.of_images, made.of_images, made.focal_length, made.warnings)
+    of_images = listed_cameras(database, listed, takes.images.names)
+    notes: dict[str, None] = {}
+    for video, (_, aspect) in enumerate(shapes):
+        camera = of_images[takes.images_of(video).start]
+        notes |= dict.fromkeys(
+            check_pixel_aspect(camera, aspect, "import the images with one of these")
+        )
+    return _Cameras(of_images, None, None, list(notes))

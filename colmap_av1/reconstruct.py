@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.preparing import check_fit
+from colmap_av1.images.takes import count_through
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -20,23 +24,21 @@ from colmap_av1.model.reconstruct_poses import (
 from colmap_av1.model.reconstruct_stages import (
     Run,
     match_stage,
-    pose_tracks,
     read_links,
     read_tracks,
-    some_images,
+    stage_of_video,
     track_stage,
 )
 from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
-from colmap_av1.tracks.tracks import cut_tracks, join_tracks
+from colmap_av1.tracks.tracks import cut_tracks, join_tracks, tracks_in_a_row
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
-from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
@@ -49,15 +51,16 @@ class ReconstructReport:
 
     Attributes:
         output: the folder with `images/` and `sparse/0/`, as trainers open it.
-        video: the video.
-        conversion: how the video was converted, in words; None where it is AV1.
+        videos: the videos.
+        conversion: how the videos were converted, in words; None where they are AV1.
         database: COLMAP database of the tracks that the poses come from.
-        num_frames: shown frames of the video.
-        num_images: frames chosen as images.
+        num_frames: shown frames of the videos.
+        num_images: frames chosen as images, and photos.
         num_key_images: those of them that were mapped; the others are placed between them.
         num_registered: images with a pose; only these are written.
+        registered: those of each of several videos, by its name.
         other_models: images of further models the mapper made, which are left out.
-        num_tracks: tracks of the video.
+        num_tracks: tracks of the videos.
         num_pose_tracks: tracks that the poses come from.
         num_points: 3D points.
         num_observations: observations of all points.
@@ -66,7 +69,7 @@ class ReconstructReport:
         far_views: median distance in pixels of what the pictures of images ten and more apart show
             in common from where the poses put it; None where no such images see the same.
         far_views_largest: the 90 % quantile of it over such pairs of images.
-        focal_length: of the output's camera, in pixels.
+        focal_length: of the output's first camera, in pixels.
         mapper: which of COLMAP's mappers found the poses.
         forward_motion: the camera moves along its axis, see `MatchReport`.
         links: what connects images where motion does not, see `LinkReport`.
@@ -77,13 +80,14 @@ class ReconstructReport:
     """
 
     output: Path
-    video: Path
+    videos: tuple[Path, ...]
     conversion: str | None
     database: Path
     num_frames: int
     num_images: int
     num_key_images: int
     num_registered: int
+    registered: dict[str, int]
     other_models: tuple[int, ...]
     num_tracks: int
     num_pose_tracks: int
@@ -105,15 +109,16 @@ class ReconstructReport:
 
 @checks_arguments
 def reconstruct(
-    video: str | os.PathLike[str],
+    video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
     *,
+    photos: str | os.PathLike[str] | None = None,
     gaussians: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     options: ReconstructOptions | None = None,
     progress: Progress | None = None,
 ) -> ReconstructReport:
-    """Make a dense model of a video, in a folder that trainers of Gaussian splats open.
+    """Make a dense model of videos, in a folder that trainers of Gaussian splats open.
 
     The poses come from COLMAP's mapper on a spread selection of long, accurate tracks; then every
     track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one
@@ -121,10 +126,14 @@ def reconstruct(
     `report.json`. A run that was stopped is resumed after its last finished stage; a changed
     option redoes what depends on it, and what is damaged or gone is made again.
 
+    Several videos have a camera each, and their images a folder each in `images/`, named like the
+    video; what their pictures show in common connects them, and photos with them.
+
     Args:
-        video: a video; one that is not AV1 is converted first, to a stream that a
+        video: a video, or several; one that is not AV1 is converted first, to a stream that a
             resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
+        photos: folder of photos of the same scene; None: there are none.
         gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
         overwrite: replace a file of Gaussians that was not written here, too.
         options: options of every stage.
@@ -142,20 +151,32 @@ def reconstruct(
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()
-    check_folder(output, [video, options.match.images.frame_list])
-    video = read_video(video, options.match.read.operating_point)
+    check_folder(output, [*paths_of(video), photos, options.match.images.frame_list])
+    inputs = read_inputs(video, photos, options.match, flat=True)
     # What can be refused is refused before the long work.
-    inputs = [video.path, options.match.images.frame_list]
-    check_gaussians_path(gaussians, inputs, overwrite=overwrite)
-    check_fit(options.match, video.picture_size, video.display.pixel_aspect)
-    with open_stages(output, "reconstruct") as stages:
-        matching = with_stream_kept(options.match, stages)
-        with open_source(video, matching, beside=output, clock=clock, progress=progress) as source:
-            try:
-                report = _run_stages(Run(source, output, stages, options, clock, progress))
-            except ColmapAv1Error:  # which may come of a change
-                check_unchanged(*source.files)
-                raise
+    checked = [*(own.path for own in inputs.videos), options.match.images.frame_list]
+    check_gaussians_path(gaussians, checked, overwrite=overwrite)
+    for own in inputs.videos:
+        check_fit(options.match, own.picture_size, own.display.pixel_aspect)
+    with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
+        sources = tuple(
+            opened.enter_context(
+                open_source(
+                    own,
+                    with_stream_kept(options.match, stages, label),
+                    beside=output,
+                    clock=clock,
+                    progress=progress,
+                )
+            )
+            for own, label in zip(inputs.videos, inputs.labels, strict=True)
+        )
+        run = Run(inputs, sources, output, stages, options, clock, progress)
+        try:
+            report = _run_stages(run)
+        except ColmapAv1Error:  # which may come of a change
+            check_unchanged(*run.files)
+            raise
         if gaussians is not None:
             with clock.measure("gaussians"):
                 write_model_gaussians(Path(gaussians), output / "sparse" / "0")
@@ -165,34 +186,49 @@ def reconstruct(
 
 
 def _run_stages(run: Run) -> ReconstructReport:
-    tracked = track_stage(run)
-    tracks, chosen, inter_share = read_tracks(run.stages)
-    matched = match_stage(run, pose_tracks(run, tracks), chosen, inter_share, tracked)
+    numbers = range(len(run.sources))
+    tracked = [track_stage(run, video) for video in numbers]
+    videos = [read_tracks(run, video) for video in numbers]
+    takes = count_through(
+        run.inputs.labels,
+        [own.chosen for own in videos],
+        [own.tracks.num_frames for own in videos],
+        [photo.name for photo in run.inputs.photos],
+    )
+    matched = match_stage(run, videos, takes, tracked)
     links, broken = read_links(run.stages)
+    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
     tracks = cut_tracks(tracks, broken.tolist())
-    keyed = some_images(chosen, matched.facts["key_images"])
-    posed = pose_stage(run, matched, len(keyed.names))
-    kept = {"tracks": tracked, "matches": matched, "poses": posed}
-    if len(keyed.names) < len(chosen.names):
-        kept["resection"] = posed = resection_stage(run, tracks, chosen, keyed, posed)
+    keyed = takes.some(matched.facts["key_images"])
+    posed = pose_stage(run, matched, keyed)
+    kept = {stage_of_video(run, video): tracked[video] for video in numbers}
+    kept |= {"matches": matched, "poses": posed}
+    if len(keyed.take) < len(takes.take):
+        kept["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
     if run.options.mapping.adjust:
-        kept["adjustment"] = posed = adjustment_stage(run, tracks, links, chosen, posed)
-    kept["model"] = model_stage(run, join_tracks(tracks, links), chosen, posed)
+        kept["adjustment"] = posed = adjustment_stage(run, tracks, links, takes, posed)
+    kept["model"] = model_stage(run, join_tracks(tracks, links), takes, posed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
-    notes = [*facts.pop("warnings"), *facts.pop("link_warnings"), *_notes(facts)]
+    facts["num_images"] = len(takes.take)
+    facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
+    notes = [
+        *run.inputs.warnings,
+        *run.inputs.with_names([stage.facts["warnings"] for stage in tracked]),
+        *facts["link_warnings"],
+        *_notes(facts),
+    ]
     reported: dict[str, Any] = {
         f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
     }
-    reported["other_models"] = tuple(facts["other_models"])
+    reported |= {"other_models": tuple(facts["other_models"]), "warnings": tuple(notes)}
     return ReconstructReport(
         output=run.output,
-        video=run.source.pictures.path,
-        conversion=run.source.conversion,
+        videos=tuple(source.pictures.path for source in run.sources),
+        conversion=run.inputs.conversion([source.conversion for source in run.sources]),
         database=run.output / "database.db",
         gaussians=None,
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
         seconds=run.clock.seconds,
-        warnings=tuple(notes),
         **reported,
     )
 
@@ -203,6 +239,12 @@ def _notes(facts: dict[str, Any]) -> list[str]:
         notes.append(
             f"{facts['num_images'] - facts['num_registered']} of {facts['num_images']} images have "
             "no pose and are left out"
+        )
+    left_out = [name for name, count in facts["registered"].items() if count == 0]
+    if left_out:
+        names = ", ".join(f"'{name}'" for name in left_out)
+        notes.append(
+            f"the model holds no image of {names}: reconstruct what shows another scene apart"
         )
     if facts["other_models"]:
         sizes = ", ".join(map(str, facts["other_models"]))

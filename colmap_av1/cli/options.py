@@ -128,7 +128,7 @@ def _add_option(
     hint = field_types(type(options))[field.name]
     names = [*declared.spellings, field.name]
     parse, metavar = _value_parser(hint)
-    how: dict[str, Any] = {"nargs": "?", "const": True} if hint is bool else {}
+    how: dict[str, Any] = {"nargs": "?", "const": True} if bool in members_of(hint) else {}
     how |= {"dest": dest, "type": parse, "default": argparse.SUPPRESS}
     text = f"{declared.help} [{_spell(getattr(options, field.name))}]".replace("None", "none")
     action = group.add_argument(

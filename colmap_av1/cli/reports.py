@@ -26,6 +26,7 @@ Rows = list[tuple[str, str]]
 # Rarer reference distances are summed up.
 _LEAST_LISTED_SHARE = 0.005
 _NUM_LISTED_GAPS = 4
+_NOT_KEPT = "converted and not kept, see --keep_stream"
 
 
 def match_rows(report: MatchReport) -> Rows:
@@ -35,7 +36,10 @@ def match_rows(report: MatchReport) -> Rows:
     inlier_share = report.num_inliers / max(report.num_matches, 1)
     rows = [
         ("database", str(report.database)),
-        ("stream", str(report.stream or "converted and not kept, see --keep_stream")),
+        *(
+            ("stream", str(s or "converted and not kept, see --keep_stream"))
+            for s in report.streams
+        ),
         *_conversion_row(report.conversion),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
@@ -130,17 +134,26 @@ def _link_rows(
     num_images: int,
     num_links: int,
     num_revisits: int,
+    num_between: int,
     weak_gaps: Sequence[Sequence[int]],
+    videos: Sequence[tuple[str, int]],
     **_: object,
 ) -> Rows:
     """What connects images where motion does not; none where pictures were not needed."""
     if num_images == 0:
         return []
-    shown = ", ".join(f"{a}-{b}" for a, b in weak_gaps[:_NUM_LISTED_GAPS])
+    shown = ", ".join(_named(gap, videos) for gap in weak_gaps[:_NUM_LISTED_GAPS])
     more = ", ..." if len(weak_gaps) > _NUM_LISTED_GAPS else ""
     gaps = f", weak gaps at frames {shown}{more}" if weak_gaps else ""
     pairs = f"{num_links} pairs linked by {num_images} pictures, {num_revisits} seen again"
-    return [("links", f"{pairs}{gaps}")]
+    between = f", {num_between} of different videos or photos" if num_between else ""
+    return [("links", f"{pairs}{between}{gaps}")]
+
+
+def _named(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> str:
+    """The frames of a gap, counted in their own video where there are several."""
+    name, first = next((v for v in reversed(videos) if v[1] <= gap[0]), ("", 0))
+    return f"{name} {gap[0] - first}-{gap[1] - first}".strip()
 
 
 def densify_rows(report: DensifyReport) -> Rows:

@@ -80,8 +80,8 @@ def write_matches(
     Args:
         database: path of the file.
         names: name of each image, its path relative to the image folder.
-        cameras: the camera of all inserted images, or one for each image; may be None where
-            the database lists the images.
+        cameras: the camera of all inserted images, or one for each image, of which several may
+            be the same object; may be None where the database lists the images.
         keypoints: keypoints of each image.
         pairs: int32 [m, 2] indices of images.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
@@ -169,8 +169,11 @@ def _insert_images(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
 ) -> dict[str, int]:
     """Insert images with a camera for all or one for each; returns the ids of the names."""
-    shared = isinstance(cameras, pycolmap.Camera)
-    rows: list[Any] = [cameras] if shared else list(cameras)
+    each: list[Any] = (
+        [cameras] * len(names) if isinstance(cameras, pycolmap.Camera) else list(cameras)
+    )
+    rows = list({id(camera): camera for camera in each}.values())
+    row_of = {id(camera): row for row, camera in enumerate(rows)}
     (first_id,) = connection.execute(
         "SELECT COALESCE(MAX(camera_id), 0) + 1 FROM cameras"
     ).fetchone()
@@ -195,8 +198,8 @@ def _insert_images(
     connection.executemany(
         "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, ?)",
         (
-            (first_image_id + i, name, first_id if shared else first_id + i)
-            for i, name in enumerate(names)
+            (first_image_id + i, name, first_id + row_of[id(camera)])
+            for i, (name, camera) in enumerate(zip(names, each, strict=True))
         ),
     )
     return {name: first_image_id + i for i, name in enumerate(names)}

@@ -31,7 +31,7 @@ from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 
 # Images that others wrote are only read.
-_READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
+READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
 # Frames waiting to be compressed, per thread; bounds memory.
 _QUEUE_PER_THREAD = 2
 
@@ -107,7 +107,7 @@ def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
     names = [
         p.name
         for p in root.iterdir()
-        if p.suffix.lower() in _READABLE and not p.name.startswith(".")
+        if p.suffix.lower() in READABLE and not p.name.startswith(".")
     ]
     if image_names(pattern, [0])[0] in names:
         return []
@@ -259,7 +259,7 @@ def _write_frames(
                     )
                 if index in wanted:
                     image = change(index, picture) if change is not None else picture
-                    queue.append(executor.submit(_write_image, wanted[index], image))
+                    queue.append(executor.submit(write_image, wanted[index], image))
                     num_taken += 1
                 while len(queue) > (num_threads * _QUEUE_PER_THREAD if index < last else 0):
                     queue.pop(0).result()
@@ -318,7 +318,13 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
+def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image (BGR), PNG or JPEG by its extension; it appears when it is complete.
+
+    Raises:
+        ImageError: it cannot be written.
+        OptionError: the extension is none of these.
+    """
     check_extension(path.name)
     suffix = path.suffix.lower()
     _, encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import is_nearly_pinhole
+from colmap_av1.images.camera import check_pixel_aspect, is_nearly_pinhole, make_camera
 from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.photos import Photo
+from colmap_av1.images.takes import Takes
 from colmap_av1.matching.focal import estimate_focal_length
 from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
@@ -93,7 +96,49 @@ def pair_images(
     return PairedImages(keypoints, pairs, matches)
 
 
-def nothing_to_match(video: Path, options: MatchOptions) -> VideoError:
+def pairs_of_takes(videos: Sequence[PairedImages], takes: Takes) -> PairedImages:
+    """The images of all takes, those of each video paired among themselves.
+
+    Args:
+        videos: the images of each video; the same object is given back where nothing is beside it.
+        takes: all images.
+    """
+    if takes.num_takes == 1:
+        return videos[0]
+    keypoints: list[ImageKeypoints] = []
+    pairs, matches = [np.empty((0, 2), np.int32)], []
+    first_track = 0
+    for video, own in enumerate(videos):
+        first_frame = int(takes.first_frame[video])
+        pairs.append((own.pairs + len(keypoints)).astype(np.int32))
+        matches += own.matches
+        keypoints += [
+            replace(k, frame=k.frame + first_frame, track=k.track + first_track)
+            for k in own.keypoints
+        ]
+        first_track += max(
+            (int(k.track.max()) + 1 for k in own.keypoints if k.track.size), default=0
+        )
+    nothing = np.empty((0, 2), np.float32), np.empty(0, np.int64)
+    photos = takes.images.frames[len(keypoints) :]
+    keypoints += [ImageKeypoints(int(frame), *nothing) for frame in photos]
+    return PairedImages(keypoints, np.concatenate(pairs), matches)
+
+
+def _of_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
+    """Some of the images, ascending, with the pairs among them."""
+    if len(images) == len(paired.keypoints):
+        return paired
+    place = np.full(len(paired.keypoints), -1, dtype=np.int32)
+    place[list(images)] = np.arange(len(images))
+    pairs = place[paired.pairs]
+    kept = np.flatnonzero((pairs >= 0).all(axis=1))
+    return PairedImages(
+        [paired.keypoints[i] for i in images], pairs[kept], [paired.matches[k] for k in kept]
+    )
+
+
+def nothing_to_match(video: Path | str, options: MatchOptions) -> VideoError:
     """The error where no two images have enough matches."""
     return VideoError(
         f"{video}: no two images share {options.pairs.min_matches} tracks, so there is nothing to "
@@ -134,6 +179,83 @@ def shared_focal_length(
             pixel_aspect=pixel_aspect,
             seed=options.run.seed,
         )
+
+
+@dataclass(frozen=True)
+class NewCameras:
+    """Cameras of images that have none yet.
+
+    Attributes:
+        of_images: the camera of each image; images share one where it is the same object.
+        focal_length: of the first video's, in heights of a pixel, where it was estimated.
+        warnings: what the user should know of them.
+    """
+
+    of_images: list[Any]
+    focal_length: float | None
+    warnings: list[str]
+
+
+def new_cameras(
+    paired: PairedImages,
+    takes: Takes,
+    shapes: Sequence[tuple[tuple[int, int], float]],
+    photos: Sequence[Photo],
+    options: MatchOptions,
+    *,
+    clock: Clock,
+) -> NewCameras:
+    """Make a camera for each video, and for the photos of each camera and size.
+
+    Given intrinsics are those of videos. Others are estimated from the tracks of a video, and from
+    what EXIF says of photos.
+
+    Args:
+        paired: the images.
+        takes: of which video each image is, or whether it is a photo.
+        shapes: of each video, (width, height) of its images, and width of a pixel over its height.
+        photos: the photos.
+        options: those of the camera and the seed are used.
+        clock: gets the stage "focal length".
+
+    Raises:
+        OptionError: given parameters do not fit such pixels.
+    """
+    of_images: list[Any] = [None] * len(takes.take)
+    estimated: list[float | None] = []
+    notes: dict[str, None] = {}
+    for shared in _takes_by_camera(len(shapes), photos, options):
+        images = [image for take in shared for image in takes.images_of(take)]
+        given, aspect = options.camera, 1.0
+        if shared[0] < len(shapes):
+            size, aspect = shapes[shared[0]]
+            of_videos = [i for t in shared if t < len(shapes) for i in takes.images_of(t)]
+            own = _of_images(paired, of_videos)
+            focal_length = shared_focal_length(own, size, aspect, options, clock=clock)
+            estimated.append(focal_length)
+        else:
+            photo = photos[shared[0] - len(shapes)]
+            size, focal_length = photo.size, photo.focal_length
+            given = replace(given, camera_params=None)
+        camera = make_camera(given, *size, aspect, focal_length)
+        notes |= dict.fromkeys(
+            check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
+        )
+        for image in images:
+            of_images[image] = copy.copy(camera) if given.single_camera is False else camera
+    return NewCameras(of_images, estimated[0], list(notes))
+
+
+def _takes_by_camera(
+    num_videos: int, photos: Sequence[Photo], options: MatchOptions
+) -> list[list[int]]:
+    """The takes that one camera each took."""
+    if options.camera.single_camera:
+        return [list(range(num_videos + len(photos)))]
+    of_photos: dict[object, list[int]] = {}
+    for take, photo in enumerate(photos, start=num_videos):
+        of_photos.setdefault((photo.size, photo.camera, photo.focal_length), []).append(take)
+    return [*([video] for video in range(num_videos)), *of_photos.values()]
 
 
 def verify_images(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.takes import Pictures
 from colmap_av1.matching.features import FeatureExtractor, Features, match_features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
@@ -17,9 +18,6 @@ from colmap_av1.matching.verify import agreeing_matches, verify_pairs
 from colmap_av1.options import LinkOptions, RunOptions, VerifyOptions
 from colmap_av1.util.progress import Progress
 
-Image = NDArray[np.uint8]
-# Gives the pictures of images, by index, ascending.
-Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
 # Inliers of a pair across a gap, and of a place seen again, which must be surer: nothing says that
 # the camera was there.
 _MIN_GAP_INLIERS = 20
@@ -45,11 +43,18 @@ class Links:
     pairs: NDArray[np.int32]
     geometries: list[TwoViewGeometry]
 
+    def joined(self, other: Links) -> Links:
+        """These and others, of other pairs."""
+        pairs = np.concatenate([self.pairs, other.pairs])
+        geometries = [*self.geometries, *other.geometries]
+        order = np.lexsort((pairs[:, 1], pairs[:, 0])).tolist()
+        return Links(pairs[order], [geometries[k] for k in order])
+
 
 def extract_features(
     wanted: list[int],
     pictures: Pictures,
-    size: tuple[int, int],
+    cameras: Sequence[Any],
     options: LinkOptions,
     *,
     effort: Literal["light", "full"],
@@ -60,7 +65,8 @@ def extract_features(
     found: dict[int, Features] = {}
     for image, picture in pictures(wanted):
         features = extractor.extract(picture)
-        scale = np.array([size[0] / picture.shape[1], size[1] / picture.shape[0]], np.float32)
+        width, height = int(cameras[image].width), int(cameras[image].height)
+        scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
         found[image] = replace(features, xy=features.xy * scale)
         progress("links", len(found), len(wanted))
     return found
@@ -96,28 +102,38 @@ def match_pairs(
 
 
 def supported_links(
-    links: Links, revisits: set[tuple[int, int]], key: list[int]
-) -> tuple[Links, int]:
-    """The links without places seen again that nothing beside them confirms, and how many stay."""
-    place = {image: index for index, image in enumerate(key)}
+    links: Links, revisits: set[tuple[int, int]], place: dict[int, int], lone: set[int]
+) -> Links:
+    """The links without places seen again that nothing beside them confirms.
+
+    Args:
+        links: the links.
+        revisits: pairs of images that see a place again, or may.
+        place: of key images in a row; those near each other in it see nearly the same.
+        lone: images that have none beside them: what confirms theirs may be a third image that is
+            linked to both.
+    """
     pairs = [(i, j) for i, j in links.pairs.tolist()]
     sure = {
-        (place[i], place[j])
+        (i, j)
         for (i, j), g in zip(pairs, links.geometries, strict=True)
         if (i, j) in revisits and len(g.inlier_matches) >= _MIN_REVISIT_INLIERS
     }
+    places = {(place[i], place[j]) for i, j in sure}
     around = range(-_SUPPORT_REACH, _SUPPORT_REACH + 1)
-    supported = {
-        (a, b)
-        for a, b in sure
-        if any((a + da, b + db) in sure for da in around for db in around if (da, db) != (0, 0))
-    }
-    kept = [
-        k
-        for k, (i, j) in enumerate(pairs)
-        if (i, j) not in revisits or (place[i], place[j]) in supported
-    ]
-    return Links(links.pairs[kept], [links.geometries[k] for k in kept]), len(supported)
+    linked: dict[int, set[int]] = {}
+    for i, j in sure:
+        linked.setdefault(i, set()).add(j)
+        linked.setdefault(j, set()).add(i)
+
+    def is_supported(i: int, j: int) -> bool:
+        a, b = place[i], place[j]
+        beside = ((a + da, b + db) in places for da in around for db in around if da or db)
+        return any(beside) or bool({i, j} & lone and linked[i] & linked[j])
+
+    supported = {pair for pair in sure if is_supported(*pair)}
+    kept = [k for k, pair in enumerate(pairs) if pair not in revisits or pair in supported]
+    return Links(links.pairs[kept], [links.geometries[k] for k in kept])
 
 
 def broken_gaps(

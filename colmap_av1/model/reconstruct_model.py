@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.files import write_images
+from colmap_av1.images.files import read_image, write_image, write_images
+from colmap_av1.images.takes import Takes
 from colmap_av1.model.colmap_model import ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage
 from colmap_av1.model.far_views import FarViewCheck, FarViews
@@ -29,8 +31,6 @@ from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
 _Image = NDArray[np.uint8]
-# Trainers want one camera.
-_CAMERA_ID = 1
 
 
 @dataclass(frozen=True)
@@ -43,23 +43,43 @@ class _DenseCloud:
 
 
 def _dense_cloud(
-    run: Run, placed: PosedImages, camera: Any, seen: Tracks, view: NDArray[np.int64]
+    run: Run, placed: PosedImages, views: list[PosedCamera], seen: Tracks, view: NDArray[np.int64]
 ) -> _DenseCloud:
     options, clock = run.options.triangulate, run.clock
+    pinholes = [own.camera for own in views]
     with clock.measure("points"):
         points = triangulate_images(
-            *(run, placed, seen, view), pinhole=camera, options=options, progress=run.progress
+            *(run, placed, seen, view), pinholes=pinholes, options=options, progress=run.progress
         )
-    views = [PosedCamera(camera, image.cam_from_world) for image in placed.images]
     with clock.measure("cloud"):
-        xy = on_pinhole(placed.camera, camera, seen.xy[points.observation])
+        xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
         cloud = cloud_of(points, view, xy, views, options)
     with clock.measure("coverage"):
         return _DenseCloud(points, cloud, coverage(views, cloud.xyz))
 
 
+def _on_pinholes(
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    xy: NDArray[np.float32],
+    image: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Pixels of observations [n, 2] by images [n] in the undistorted pictures of these."""
+    found = np.empty(xy.shape)
+    camera_ids = np.array([own.camera_id for own in placed.images])
+    pinholes = {int(own.camera.camera_id): own.camera for own in views}
+    for camera_id, camera in placed.cameras.items():
+        own = camera_ids[image] == camera_id
+        found[own] = on_pinhole(camera, pinholes[camera_id], xy[own])
+    return found
+
+
 def _write_images(
-    run: Run, folder: Path, placed: PosedImages, camera: Any, cloud: ModelPoints
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    cloud: ModelPoints,
 ) -> tuple[FarViews, ModelPoints]:
     """Write the images, undistorted; look at their colours and at views from far apart on the way.
 
@@ -67,58 +87,75 @@ def _write_images(
         How far views from far apart disagree; and the points in colours.
     """
     options, progress = run.options, run.progress
-    undistort = undistortion(placed.camera, camera)
-    far = FarViewCheck(placed.images, {_CAMERA_ID: camera}, lambda image: points_seen(cloud, image))
-    colours = Colours(cloud, (int(camera.width), int(camera.height)), len(placed.images))
+    pinholes = {int(view.camera.camera_id): view.camera for view in views}
+    undistort = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+    far = FarViewCheck(placed.images, pinholes, lambda image: points_seen(cloud, image))
+    colours = Colours(cloud, [view.size for view in views])
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
-    def change(frame: int, picture: _Image) -> _Image:
-        index = index_of_frame[frame]
-        shown = undistort(picture) if undistort is not None else picture
+    def change(first: int, frame: int, picture: _Image) -> _Image:
+        index = index_of_frame[first + frame]
+        how = undistort[placed.images[index].camera_id]
+        shown = how(picture) if how is not None else picture
         colours.add(index, shown)
         far.add(index, shown)
         return shown
 
+    done = 0
+
+    def report(count: int) -> None:
+        progress("images", done + count, len(names))
+
     with run.clock.measure("images"):
-        write_images(
-            run.source.pictures,
-            folder,
-            names,
-            placed.frames.tolist(),
-            num_threads=options.match.run.num_threads,
-            operating_point=options.match.read.operating_point,
-            change=change,
-            progress=lambda done: progress("images", done, len(names)),
-        )
+        for take in np.unique(placed.take).tolist():
+            own = np.flatnonzero(placed.take == take)
+            first = int(placed.first_frame[take])
+            if take < len(run.sources):
+                write_images(
+                    run.sources[take].pictures,
+                    folder,
+                    [names[i] for i in own],
+                    (placed.frames[own] - first).tolist(),
+                    num_threads=options.match.run.num_threads,
+                    operating_point=options.match.read.operating_point,
+                    change=partial(change, first),
+                    progress=report,
+                )
+            else:
+                photo = run.inputs.photos[take - len(run.sources)]
+                (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
+                write_image(folder / photo.name, change(first, 0, read_image(photo.path)))
+                report(1)
+            done += len(own)
     with run.clock.measure("far views"):
         return far.result(), replace(cloud, rgb=colours.rgb())
 
 
-def model_stage(run: Run, tracks: Tracks, chosen: ChosenImages, posed: Kept) -> Kept:
+def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
     """Triangulate all tracks and write the images and the model that trainers open."""
-    options, clock, source = run.options, run.clock, run.source
+    options, clock = run.options, run.clock
 
     def make(partial: Path) -> dict[str, Any]:
-        placed = read_posed_images(run, posed, chosen)
-        of_one = [replace(image, camera_id=_CAMERA_ID) for image in placed.images]
-        placed = replace(placed, images=of_one)
-        camera = pinhole_camera(placed.camera)
+        placed = read_posed_images(run, posed, takes)
+        cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
+        images = placed.images
+        views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
         seen, view = seen_in(tracks, placed.frames)
-        dense = _dense_cloud(run, placed, camera, seen, view)
+        dense = _dense_cloud(run, placed, views, seen, view)
         points, cloud = dense.points, dense.cloud
-        far_views, cloud = _write_images(run, partial / "images", placed, camera, cloud)
-        check_unchanged(*source.files)
+        far_views, cloud = _write_images(run, partial / "images", placed, views, cloud)
+        check_unchanged(*run.files)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
-            write_model(folder, {_CAMERA_ID: camera}, placed.images, cloud)
+            write_model(folder, cameras, images, cloud)
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),
             "coverage": dense.coverage,
             "mean_error": mean_error(cloud),
-            "focal_length": float(camera.params[0]),
+            "focal_length": float(views[0].camera.params[0]),
             "far_views": far_views.median,
             "far_views_largest": far_views.largest,
             "far_views_warning": far_views.warning,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
-from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.takes import Takes
 from colmap_av1.model.colmap_model import (
     ModelImage,
     no_points,
@@ -48,7 +50,7 @@ _FEWEST_VIEWS = 3
 _FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
 
-def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
+def pose_stage(run: Run, matched: Kept, takes: Takes) -> Kept:
     """Estimate the poses by COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
     mapping = options.mapping
@@ -75,7 +77,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
                 how,
                 image_path=None,
                 log=run.stages / "mapper.log",
-                num_images=num_images,
+                num_images=len(takes.images.names),
                 progress=progress,
             )
         if max(sizes, default=0) < LEAST_IMAGES:
@@ -85,6 +87,7 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
             "other_models": [n for n in sizes[1:] if n >= LEAST_IMAGES],
             "mapper": mapper,
             "poses": "poses/0",
+            "registered": _registered(partial / "poses" / "0", takes),
         }
 
     return run_stage(
@@ -95,6 +98,17 @@ def pose_stage(run: Run, matched: Kept, num_images: int) -> Kept:
         products=["poses"],
         make=make,
     )
+
+
+def _registered(model: Path, takes: Takes) -> dict[str, int]:
+    """Images with a pose of each of several videos, by its name."""
+    if len(takes.videos) == 1:
+        return {}
+    posed = posed_images(read_model(model))
+    return {
+        name: sum(image in posed for image in takes.of_video(video).names)
+        for video, name in enumerate(takes.videos)
+    }
 
 
 def _refines_intrinsics(options: ReconstructOptions) -> bool:
@@ -132,65 +146,81 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     )
 
 
-def resection_stage(
-    run: Run, tracks: Tracks, chosen: ChosenImages, keyed: ChosenImages, posed: Kept
-) -> Kept:
+def resection_stage(run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed: Kept) -> Kept:
     """Place the images between the key images by the points of tracks that they see."""
-    options = run.options
-    seed, num_threads = options.match.run.seed, options.match.run.num_threads
 
     def make(partial: Path) -> dict[str, Any]:
         known = read_posed_images(run, posed, keyed)
         with run.clock.measure("resection"):
-            seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
-            left = np.setdiff1d(chosen.frames, known.frames)
-            spread = select_tracks(keep_frames(seen_thrice, chosen.frames), _RESECTED)
-            seen, view = seen_in(spread, known.frames)
-            points = triangulate_images(
-                *(run, known, seen, view), pinhole=None, options=_FOR_POSES, progress=no_progress
-            )
-            sightings = sightings_of(points, seen, spread, left, known.camera)
-            poses = resect(
-                sightings,
-                interpolate_poses(
-                    np.array([i.cam_from_world for i in known.images]), known.frames, left
-                ),
-                float(known.camera.mean_focal_length()),
-                seed=seed,
-                num_threads=num_threads,
-                progress=lambda done: run.progress("resection", done, len(left)),
-            )
-        placed = dict(
-            zip(known.frames.tolist(), (i.cam_from_world for i in known.images), strict=True)
-        )
-        found = zip(left.tolist(), poses, strict=True)
-        placed |= {frame: pose for frame, pose in found if pose is not None}
-        camera_id = int(known.camera.camera_id)
-        images = [
-            ModelImage(i + 1, name, camera_id, placed[frame])
-            for i, (name, frame) in enumerate(
-                zip(chosen.names, chosen.frames.tolist(), strict=True)
-            )
-            if frame in placed
-        ]
+            placed = _resect(run, tracks, takes, known)
         folder = partial / "placed"
         folder.mkdir()
-        write_model(folder, {camera_id: known.camera}, images, no_points())
-        return {"poses": "placed", "num_registered": len(images)}
+        write_model(folder, known.cameras, placed, no_points())
+        facts = {"poses": "placed", "num_registered": len(placed)}
+        return facts | {"registered": _registered(folder, takes)}
 
     return run_stage(
         run.stages,
         "resection",
-        [posed.digest, _RESECTED, seed],
+        [posed.digest, _RESECTED, run.options.match.run.seed],
         into=run.stages,
         products=["placed"],
         make=make,
     )
 
 
-def adjustment_stage(
-    run: Run, tracks: Tracks, links: Tracks, chosen: ChosenImages, posed: Kept
-) -> Kept:
+def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[ModelImage]:
+    """The images that have a pose, and those between them that get one; see `resection_stage`."""
+    run_options = run.options.match.run
+    seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
+    spread = select_tracks(keep_frames(seen_thrice, takes.images.frames), _RESECTED)
+    seen, view = seen_in(spread, known.frames)
+    points = triangulate_images(
+        *(run, known, seen, view), pinholes=None, options=_FOR_POSES, progress=no_progress
+    )
+    pose_of = {
+        frame: (image.camera_id, image.cam_from_world)
+        for frame, image in zip(known.frames.tolist(), known.images, strict=True)
+    }
+    for video in sorted({int(take) for take in known.take if take < len(takes.videos)}):
+        own = np.flatnonzero(known.take == video)
+        frames = known.frames[own]
+        images = takes.images_of(video)
+        left = np.setdiff1d(takes.images.frames[images.start : images.stop], frames)
+        if len(left) == 0:
+            continue
+        camera_id = known.images[own[0]].camera_id
+        camera = known.cameras[camera_id]
+        guesses = interpolate_poses(
+            np.array([known.images[i].cam_from_world for i in own]), frames, left
+        )
+        found = resect(
+            sightings_of(points, seen, spread, left, camera),
+            guesses,
+            float(camera.mean_focal_length()),
+            seed=run_options.seed,
+            num_threads=run_options.num_threads,
+            progress=partial(_count, run.progress, len(left)),
+        )
+        pose_of |= {
+            frame: (camera_id, pose)
+            for frame, pose in zip(left.tolist(), found, strict=True)
+            if pose is not None
+        }
+    return [
+        ModelImage(i + 1, name, *pose_of[frame])
+        for i, (name, frame) in enumerate(
+            zip(takes.images.names, takes.images.frames.tolist(), strict=True)
+        )
+        if frame in pose_of
+    ]
+
+
+def _count(progress: Progress, total: int, done: int) -> None:
+    progress("resection", done, total)
+
+
+def adjustment_stage(run: Run, tracks: Tracks, links: Tracks, takes: Takes, posed: Kept) -> Kept:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
     Links take part whole: without them places seen again would drift apart once more.
@@ -201,20 +231,21 @@ def adjustment_stage(
     refine = _refines_intrinsics(options)
 
     def make(partial: Path) -> dict[str, Any]:
-        placed = read_posed_images(run, posed, chosen)
+        placed = read_posed_images(run, posed, takes)
         longer = keep_frames(pose_tracks(run, tracks), placed.frames)
         spread = join_tracks(select_tracks(longer, _ADJUSTED), keep_frames(links, placed.frames))
         with run.clock.measure("adjustment"):
             seen, view = seen_in(spread, placed.frames)
             points = triangulate_images(
-                *(run, placed, seen, view), pinhole=None, options=_FOR_POSES, progress=no_progress
+                *(run, placed, seen, view), pinholes=None, options=_FOR_POSES, progress=no_progress
             )
             folder = partial / "adjusted"
             folder.mkdir()
             black = np.zeros((len(points.xyz), 3), np.uint8)
             xy = seen.xy[points.observation].astype(np.float64)
-            cameras = {int(placed.camera.camera_id): placed.camera}
-            write_model(folder, cameras, placed.images, to_model_points(points, black, view, xy))
+            write_model(
+                folder, placed.cameras, placed.images, to_model_points(points, black, view, xy)
+            )
             run.progress("adjustment", 0, 1)
             adjust_model(
                 folder,
@@ -241,28 +272,39 @@ def adjustment_stage(
 
 @dataclass(frozen=True)
 class PosedImages:
-    """The images that have a pose, of one camera.
+    """The images that have a pose.
 
     Attributes:
-        images: the images, in display order.
-        frames: int32 [n] their frames.
-        camera: their pycolmap.Camera.
+        images: the images, in the order of their frames.
+        frames: int32 [n] their frames, counted through all takes.
+        take: int32 [n] their takes.
+        first_frame: frame at which each take begins, see `Takes`.
+        cameras: their pycolmap.Cameras, by id.
     """
 
     images: list[ModelImage]
     frames: NDArray[np.int32]
-    camera: Any
+    take: NDArray[np.int32]
+    first_frame: NDArray[np.int64]
+    cameras: dict[int, Any]
+
+    @property
+    def camera_of_image(self) -> list[Any]:
+        """The camera of each image."""
+        return [self.cameras[image.camera_id] for image in self.images]
 
 
-def read_posed_images(run: Run, posed: Kept, chosen: ChosenImages) -> PosedImages:
+def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
     """The images with the poses that a stage left."""
     poses = read_model(run.stages / posed.facts["poses"])
     posed_by_name = posed_images(poses)
-    index = [i for i, name in enumerate(chosen.names) if name in posed_by_name]
-    found = [posed_by_name[chosen.names[i]] for i in index]
-    camera = poses.cameras[found[0].camera_id]
+    names = takes.images.names
+    index = [i for i, name in enumerate(names) if name in posed_by_name]
+    found = [posed_by_name[names[i]] for i in index]
+    cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
     images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
-    return PosedImages(images, chosen.frames[index], camera)
+    frames, take = takes.images.frames[index], takes.take[index]
+    return PosedImages(images, frames, take, takes.first_frame, cameras)
 
 
 def triangulate_images(
@@ -271,14 +313,14 @@ def triangulate_images(
     seen: Tracks,
     view: NDArray[np.int64],
     *,
-    pinhole: Any | None,
+    pinholes: Sequence[Any] | None,
     options: TriangulateOptions,
     progress: Progress,
 ) -> TriangulatedPoints:
     """Points of tracks in the images that have a pose, one at least; see `triangulate_tracks`."""
     points = triangulate_tracks(
-        *(seen, view, [placed.camera] * len(placed.images)),
-        *([image.cam_from_world for image in placed.images], pinhole),
+        *(seen, view, placed.camera_of_image),
+        *([image.cam_from_world for image in placed.images], pinholes),
         options=options,
         num_threads=run.options.match.run.num_threads,
         progress=progress,

@@ -16,17 +16,20 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.images.camera import make_camera
 from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
+from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
+    new_cameras,
     pair_images,
-    shared_focal_length,
+    pairs_of_takes,
     verify_images,
 )
-from colmap_av1.matching.links import LinkedImages, images_to_link, link_video
+from colmap_av1.matching.link_plan import images_to_link
+from colmap_av1.matching.links import LinkedImages, link_images
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.model.track_points import chaining_for_points
@@ -43,7 +46,7 @@ from colmap_av1.tracks.video_tracks import (
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.util.stages import Kept, run_stage
-from colmap_av1.video.unchanged import check_unchanged
+from colmap_av1.video.unchanged import FileState, check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
@@ -55,7 +58,8 @@ class Run:
     """What every stage is given.
 
     Attributes:
-        source: the video.
+        inputs: the videos and photos.
+        sources: for each video, where its motion and pictures come from.
         output: the folder that is made.
         stages: the folder in it that holds what later runs resume from.
         options: options of every stage.
@@ -63,18 +67,47 @@ class Run:
         progress: called in each stage.
     """
 
-    source: VideoSource
+    inputs: Inputs
+    sources: tuple[VideoSource, ...]
     output: Path
     stages: Path
     options: ReconstructOptions
     clock: Clock
     progress: Progress
 
+    @property
+    def files(self) -> tuple[FileState, ...]:
+        """All files as they were at the start."""
+        photos = [photo.state for photo in self.inputs.photos]
+        return (*(file for source in self.sources for file in source.files), *photos)
 
-def track_stage(run: Run) -> Kept:
-    """Chain the motion of the video into tracks and choose the frames that are images."""
-    source, clock, progress = run.source, run.clock, run.progress
+
+@dataclass(frozen=True)
+class VideoTracks:
+    """What `track_stage` keeps of a video.
+
+    Attributes:
+        tracks: its tracks.
+        chosen: the frames that are images.
+        inter_share: see `TrackedVideo`.
+    """
+
+    tracks: Tracks
+    chosen: ChosenImages
+    inter_share: NDArray[np.float32]
+
+
+def stage_of_video(run: Run, video: int) -> str:
+    """Name of the stage that makes the tracks of a video."""
+    label = run.inputs.labels[video]
+    return f"tracks_{label}" if label else "tracks"
+
+
+def track_stage(run: Run, video: int) -> Kept:
+    """Chain the motion of a video into tracks and choose the frames that are images."""
+    source, clock, progress = run.sources[video], run.clock, run.progress
     options = chaining_for_points(run.options.match, run.options.triangulate)
+    name = stage_of_video(run, video)
 
     def make(partial: Path) -> dict[str, Any]:
         tracked = track_video(source, options, one_size=True, clock=clock, progress=progress)
@@ -97,7 +130,7 @@ def track_stage(run: Run) -> Kept:
         )
         # Of a long video no other frame is of use from here on.
         tracks = keep_frames(tracked.tracks, chosen.frames) if is_long else tracked.tracks
-        if len(chosen.names) < LEAST_IMAGES:
+        if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
             raise ImageError(
                 f"{len(chosen.names)} of {tracks.num_frames} frames become images: a model needs "
                 f"{LEAST_IMAGES} or more"
@@ -105,7 +138,7 @@ def track_stage(run: Run) -> Kept:
         unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
         if unfit is not None:
             raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
-        with (partial / "tracks.npz").open("wb") as file:
+        with (partial / f"{name}.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
             names = np.array(chosen.names)
             share = tracked.inter_share
@@ -113,7 +146,6 @@ def track_stage(run: Run) -> Kept:
         check_unchanged(*source.files)
         return {
             "num_frames": tracks.num_frames,
-            "num_images": len(chosen.names),
             "num_tracks": len(tracks.offsets) - 1,
             "warnings": list(tracked.warnings),
         }
@@ -124,19 +156,19 @@ def track_stage(run: Run) -> Kept:
     listed = digest_if_there(options.images.frame_list)
     return run_stage(
         run.stages,
-        "tracks",
+        name,
         [[file_digest(file.path) for file in source.files], given, listed],
         into=run.stages,
-        products=["tracks.npz"],
+        products=[f"{name}.npz"],
         make=make,
     )
 
 
-def read_tracks(stages: Path) -> tuple[Tracks, ChosenImages, NDArray[np.float32]]:
-    """The tracks, images and shares of inter units that `track_stage` kept."""
-    with np.load(stages / "tracks.npz") as file:
+def read_tracks(run: Run, video: int) -> VideoTracks:
+    """The tracks, images and shares of inter units that `track_stage` kept of a video."""
+    with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
         chosen = ChosenImages([str(name) for name in file["names"]], file["frames"])
-        return _tracks_of(file), chosen, file["inter_share"]
+        return VideoTracks(_tracks_of(file), chosen, file["inter_share"])
 
 
 def _write_links(folder: Path, linked: LinkedImages) -> None:
@@ -165,15 +197,11 @@ def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
 
 
 def match_stage(
-    run: Run,
-    tracks: Tracks,
-    chosen: ChosenImages,
-    inter_share: NDArray[np.float32],
-    tracked: Kept,
+    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
 ) -> Kept:
-    """Choose the key images; write the database of their tracks, and of links."""
-    options, clock, progress = run.options, run.clock, run.progress
-    mapping, linking = options.mapping, options.match.links
+    """Write the database of the tracks that the poses come from, and of links."""
+    options, clock = run.options, run.clock
+    mapping = options.mapping
     density = DensityOptions(
         preset="sparse",
         max_tracks_per_image=mapping.pose_tracks_per_image,
@@ -182,52 +210,38 @@ def match_stage(
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("pairs"):
-            seen = keep_frames(tracks, chosen.frames)
-            index = np.arange(len(chosen.frames))
-            if mapping.key_images:
-                index = _key_images(run, seen, chosen, inter_share)
-            keyed = some_images(chosen, index)
-            sparse = select_tracks(keep_frames(seen, keyed.frames), density)
-        video = run.source.pictures
-        paired = pair_images(
-            *(video.path, sparse, keyed, options.match),
-            needed=not may_link(inter_share, keyed.frames, linking),
-            clock=clock,
-            progress=progress,
-        )
-        size = (tracks.width, tracks.height)
-        pixel_aspect = video.display.pixel_aspect
-        focal_length = shared_focal_length(paired, size, pixel_aspect, options.match, clock=clock)
-        camera = make_camera(options.match.camera, *size, pixel_aspect, focal_length)
-        matched = verify_images(paired, camera, options.match, clock=clock, progress=progress)
-        linked = link_video(
-            *(run.source, matched, [camera] * len(keyed.names), size, inter_share),
-            images_apart=len(chosen.names) / len(keyed.names),
-            display=None,
-            options=options.match,
-            clock=clock,
-            progress=progress,
-        )
+            index = _key_images(run, videos, takes)
+            keyed = takes.some(index)
+            sparse = [
+                select_tracks(
+                    keep_frames(pose_tracks(run, own.tracks), keyed.of_video(video).frames), density
+                )
+                for video, own in enumerate(videos)
+            ]
+        apart = len(takes.take) / len(keyed.take)
+        linked, cameras = _match_images(run, videos, sparse, keyed, images_apart=apart)
         matched = linked.matched
         with clock.measure("database"):
-            write_matched_images(partial / "database.db", keyed.names, camera, matched)
+            write_matched_images(partial / "database.db", keyed.images.names, cameras, matched)
         _write_links(partial / run.stages.name, linked)
+        of_videos = cameras[: keyed.images_of(len(videos)).start]
         return {
             "links": dataclasses.asdict(linked.report),
             "link_warnings": list(linked.report.warnings),
-            "key_images": index.tolist(),
+            "key_images": index,
             "num_key_images": len(index),
-            "num_pose_tracks": len(sparse.offsets) - 1,
-            "guessed": not camera.has_prior_focal_length,
+            "num_pose_tracks": sum(len(own.offsets) - 1 for own in sparse),
+            "guessed": not all(camera.has_prior_focal_length for camera in of_videos),
             **_pair_facts(matched),
         }
 
     match = options.match
     given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
+    photos = [[photo.name, file_digest(photo.path)] for photo in run.inputs.photos]
     return run_stage(
         run.stages,
         "matches",
-        [tracked.digest, given, options.match.run.seed],
+        [[t.digest for t in tracked], takes.videos, photos, given, options.match.run.seed],
         into=run.output,
         products=["database.db", f"{run.stages.name}/{_LINKS}"],
         make=make,
@@ -242,14 +256,14 @@ def _images_of_long_video(
     frames = np.arange(tracks.num_frames, dtype=np.int32)
     every = ChosenImages(image_names(name, frames.tolist()), frames)
     tracks = pose_tracks(run, tracks)
-    key = _key_images(run, tracks, every, inter_share)
+    key = _key_images_of_video(run, tracks, every, inter_share)
     return some_images(every, spread_images(tracks, run.options.max_images, key))
 
 
-def _key_images(
+def _key_images_of_video(
     run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """The key images among some images, by their index."""
+    """The key images among some images of a video, by their index."""
     mapping = run.options.mapping
     return key_images(
         tracks,
@@ -265,6 +279,65 @@ def some_images(
 ) -> ChosenImages:
     """Some of the images, by their index."""
     return ChosenImages([chosen.names[i] for i in index], chosen.frames[np.asarray(index)])
+
+
+def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[int]:
+    """The images that are mapped, by their index: all, where key images are not wanted.
+
+    Photos are key images: no track says where they are.
+    """
+    if not run.options.mapping.key_images:
+        return list(range(len(takes.take)))
+    index: list[int] = []
+    for video, own in enumerate(videos):
+        frames = own.chosen.frames
+        tracks = keep_frames(pose_tracks(run, own.tracks), frames)
+        found = _key_images_of_video(run, tracks, own.chosen, own.inter_share)
+        index += (found + takes.images_of(video).start).tolist()
+    return index + list(range(takes.images_of(len(videos)).start, len(takes.take)))
+
+
+def _match_images(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    sparse: Sequence[Tracks],
+    takes: Takes,
+    *,
+    images_apart: float,
+) -> tuple[LinkedImages, list[Any]]:
+    """The images matched along some tracks of each video and by links; and their cameras."""
+    options, clock, progress = run.options.match, run.clock, run.progress
+    files = [source.pictures for source in run.sources]
+    paired = []
+    for video, (file, tracks) in enumerate(zip(files, sparse, strict=True)):
+        chosen = takes.of_video(video)
+        linked_anyway = may_link(videos[video].inter_share, chosen.frames, options.links)
+        paired.append(
+            pair_images(
+                *(file.path, tracks, chosen, options),
+                needed=takes.num_takes == 1 and not linked_anyway,
+                clock=clock,
+                progress=progress,
+            )
+        )
+    together = pairs_of_takes(paired, takes)
+    shapes = [(file.picture_size, file.display.pixel_aspect) for file in files]
+    photos = run.inputs.photos
+    cameras = new_cameras(together, takes, shapes, photos, options, clock=clock).of_images
+    matched = verify_images(together, cameras, options, clock=clock, progress=progress)
+    shares = [own.inter_share for own in videos]
+    linked = link_images(
+        *(takes, matched, cameras, np.concatenate([*shares, run.inputs.no_motion])),
+        pictures_of(
+            takes, [(file, None) for file in files], [photo.path for photo in photos], options
+        ),
+        name=run.inputs.name,
+        images_apart=images_apart,
+        options=options,
+        clock=clock,
+        progress=progress,
+    )
+    return linked, cameras
 
 
 def _pair_facts(matched: MatchedImages) -> dict[str, Any]:

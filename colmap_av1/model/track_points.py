@@ -56,7 +56,7 @@ def triangulate_tracks(
     view: NDArray[np.int64],
     cameras: Sequence[Any],
     poses: Sequence[NDArray[np.float64]],
-    pinhole: Any | None,
+    pinholes: Sequence[Any] | None,
     *,
     options: TriangulateOptions,
     num_threads: int | None,
@@ -64,14 +64,14 @@ def triangulate_tracks(
 ) -> TriangulatedPoints:
     """Points of all tracks, of the kind that the options say.
 
-    Errors are in pixels of `pinhole`, else of each image's camera.
+    Errors are in pixels of each image's pinhole camera, else of its own.
     """
     rays = np.full((len(view), 2), np.nan)
     camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
     for camera in {int(camera.camera_id): camera for camera in cameras}.values():
         own = camera_of_view[view] == int(camera.camera_id)
         rays[own] = np.asarray(camera.cam_from_img(tracks.xy[own].astype(np.float64)))
-    shown = [pinhole if pinhole is not None else camera for camera in cameras]
+    shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = len(tracks.offsets) - 1
     return (splat_points if options.points == "splats" else triangulate)(
@@ -86,21 +86,23 @@ def triangulate_tracks(
 class Colours:
     """Colours of points as the middle one of the pictures shows them, picture by picture.
 
-    A blurred, bright or hidden view among several does not change them.
+    A blurred, bright or hidden view among several does not change them. `sizes` are the (width,
+    height) in pixels that each image has in the points.
     """
 
-    def __init__(self, points: ModelPoints, size: tuple[int, int], num_images: int) -> None:
-        self._points, self._size = points, np.array(size)
+    def __init__(self, points: ModelPoints, sizes: Sequence[tuple[int, int]]) -> None:
+        self._points, self._sizes = points, np.array(sizes)
         self._order = np.argsort(points.image, kind="stable")
         ordered = points.image[self._order]
-        self._bounds = np.searchsorted(ordered, np.arange(num_images + 1))
+        self._bounds = np.searchsorted(ordered, np.arange(len(sizes) + 1))
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
     def add(self, image: int, picture: _Image) -> None:
         """Look at the picture (BGR, of any scale) of an image, of its model's camera."""
         own = self._order[self._bounds[image] : self._bounds[image + 1]]
         size = np.array(picture.shape[1::-1])
-        x, y = np.clip((self._points.xy[own] * size / self._size).astype(np.int64), 0, size - 1).T
+        at = self._points.xy[own] * size / self._sizes[image]
+        x, y = np.clip(at.astype(np.int64), 0, size - 1).T
         self._seen[own] = picture[y, x, ::-1]
 
     def rgb(self) -> _Image:

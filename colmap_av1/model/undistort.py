@@ -27,7 +27,7 @@ def pinhole_camera(camera: Any) -> Any:
         camera: pycolmap.Camera of any perspective model.
 
     Returns:
-        pycolmap.Camera, PINHOLE, with id 1 and the principal point of the given one.
+        pycolmap.Camera, PINHOLE, with the id and the principal point of the given one.
 
     Raises:
         ModelError: no such camera exists, as with a fisheye lens that sees to the side.
@@ -62,7 +62,8 @@ def pinhole_camera(camera: Any) -> Any:
             low, high = (low, middle) if is_filled(middle) else (middle, high)
         zoom = high
     params = [*(focal * zoom), *centre]
-    return pycolmap.Camera(camera_id=1, model="PINHOLE", params=params, **size)
+    camera_id = int(camera.camera_id)
+    return pycolmap.Camera(camera_id=camera_id, model="PINHOLE", params=params, **size)
 
 
 def _project(camera: Any, rays: NDArray[np.float64]) -> NDArray[np.float64]:

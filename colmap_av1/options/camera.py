@@ -38,7 +38,11 @@ class CameraOptions(Options):
         "centre",
         common=True,
     )
-    single_camera: bool = option(True, "one camera for all images instead of one for each")
+    single_camera: bool | None = option(
+        None,
+        "1: one camera for all images; 0: one for each; None: one for each video, and for the "
+        "photos of each camera and size",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -68,7 +68,7 @@ class ReconstructOptions(Options):
 
     match: MatchOptions = part(
         MatchOptions(),
-        unused=("density", "on_existing", "images.first_number", "camera.single_camera"),
+        unused=("density", "on_existing", "images.first_number"),
     )
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
@@ -82,9 +82,10 @@ class ReconstructOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.match.camera.single_camera:
+        if self.match.camera.single_camera is False:
             raise OptionError(
-                "single_camera is 0, but a trainer's folder has one camera: leave it at 1"
+                "single_camera is 0, but trainers want one camera for all images of a video: leave "
+                "it out, or give 1"
             )
         name = self.match.images.image_name
         if name.count(".") != 1:

@@ -218,6 +218,38 @@ def join_tracks(a: Tracks, b: Tracks) -> Tracks:
     )
 
 
+def tracks_in_a_row(videos: Sequence[Tracks], num_frames: int) -> Tracks:
+    """The tracks of several videos as of one that shows them in a row.
+
+    Args:
+        videos: tracks of each.
+        num_frames: frames of them all, and of what has no tracks after them.
+
+    Returns:
+        All tracks, those of the first video first, each in pixels of its own; width and height are
+        the largest. The same object where there is but one video and nothing after it.
+    """
+    first = videos[0]
+    if len(videos) == 1 and num_frames == first.num_frames:
+        return first
+    starts = np.cumsum([0, *(video.num_frames for video in videos)])
+    counts = np.cumsum([0, *(video.offsets[-1] for video in videos)])
+    return Tracks(
+        num_frames=num_frames,
+        width=max(video.width for video in videos),
+        height=max(video.height for video in videos),
+        offsets=np.concatenate(
+            [[0], *(v.offsets[1:] + n for v, n in zip(videos, counts, strict=False))]
+        ).astype(np.int64),
+        frame=np.concatenate(
+            [v.frame + np.int32(n) for v, n in zip(videos, starts, strict=False)]
+        ).astype(np.int32),
+        xy=np.concatenate([video.xy for video in videos]),
+        sigma=np.concatenate([video.sigma for video in videos]),
+        confirmed=np.concatenate([video.confirmed for video in videos]),
+    )
+
+
 def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
     """Indices of observations by their frames, those of a frame in their former order."""
     # A type of two bytes is sorted by radix, in a quarter of the time.

@@ -149,11 +149,18 @@ def _made_source(
     return VideoSource(stream, video, is_kept, conversion)
 
 
-def with_stream_kept(options: MatchOptions, folder: Path) -> MatchOptions:
-    """The same options; a stream that is made is kept in a folder unless they say where."""
+def with_stream_kept(options: MatchOptions, folder: Path, name: str = "") -> MatchOptions:
+    """The same options; a stream that is made is kept in a folder unless they say where.
+
+    Args:
+        options: any.
+        folder: the folder.
+        name: of the video, where there are several.
+    """
     if options.keep_stream is not None:
         return options
-    return replace(options, keep_stream=str(folder.absolute() / "stream.mp4"))
+    file = f"stream_{name}.mp4" if name else "stream.mp4"
+    return replace(options, keep_stream=str(folder.absolute() / file))
 
 
 @contextmanager

@@ -156,7 +156,16 @@ def test_help_shows_few_options_and_help_all_the_rest(
 def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixture[str]) -> None:
     assert options_in(help_of("match", "-h", capsys)) == {
         *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
-        *("image_path", "num_images", "every", "fps", "frame_list", "on_existing", "encoder"),
+        *(
+            "images",
+            "image_path",
+            "num_images",
+            "every",
+            "fps",
+            "frame_list",
+            "on_existing",
+            "encoder",
+        ),
         *("refine", "preset", "links", "camera_model", "camera_params", "num_threads"),
     }
 

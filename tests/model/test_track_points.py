@@ -94,7 +94,7 @@ def test_images_of_several_cameras_see_one_scene() -> None:
 
     def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> TriangulatedPoints:
         return triangulate_tracks(
-            *(replace(seen, xy=xy), view, cameras, POSES, pinhole),
+            *(replace(seen, xy=xy), view, cameras, POSES, pinhole and [pinhole] * len(cameras)),
             options=TriangulateOptions(),
             num_threads=1,
             progress=no_progress,
@@ -119,7 +119,7 @@ def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
     offsets = np.array([0, 3, 6, 7, 10])
     none = np.zeros((4, 3), np.uint8)
     points = ModelPoints(np.zeros((4, 3)), none, np.zeros(4), offsets, image, xy)
-    colours = Colours(points, (WIDTH, HEIGHT), 3)
+    colours = Colours(points, [(WIDTH, HEIGHT)] * 3)
     blue, red, white = np.zeros((3, HEIGHT, WIDTH, 3), dtype=np.uint8)
     blue[..., 0], red[..., 2], white[...] = 200, 100, 255
     half = np.ascontiguousarray(red[::2, ::2])

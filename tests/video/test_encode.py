@@ -217,7 +217,7 @@ def test_match_takes_any_codec(phone: Path, tmp_path: Path) -> None:
     stream = tmp_path / "elsewhere.mp4"
     options = MatchOptions(keep_stream=str(stream))
     report = match(tmp_path / "a.db", video, image_path=tmp_path / "frames", options=options)
-    assert report.stream == stream
+    assert report.streams == (stream,)
     assert report.num_images == 12
     assert report.num_verified_pairs > 0
     # The pictures are the video's own, not those of the stream.
@@ -243,7 +243,7 @@ def test_nothing_is_left_of_a_conversion(phone: Path, tmp_path: Path) -> None:
     leftover.mkdir()
     (leftover / "stream.mp4").touch()
     report = match(tmp_path / "work" / "a.db", video, progress=look)
-    assert report.stream is None
+    assert report.streams == (None,)
     assert report.num_images == 12
     assert seen == {leftover.name}
     assert [p.name for p in (tmp_path / "work").iterdir()] == ["a.db"]
@@ -265,7 +265,7 @@ def test_reencode_only_what_is_poor(
     assert "--reencode 1" not in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.db", "intra.mp4"]
     good = match(tmp_path / "b.db", clip, options=MatchOptions(reencode=True))
-    assert good.stream == clip
+    assert good.streams == (clip,)
 
 
 def hurt(video: Path, output: Path, packet: int) -> Path:

@@ -13,7 +13,7 @@ from colmap_av1.cli.commands.shared import (
     add_output,
     add_overwrite,
     add_quiet,
-    add_video,
+    add_videos,
     print_result,
 )
 from colmap_av1.cli.options import add_options, given
@@ -30,13 +30,13 @@ def add_densify(commands: Any) -> None:
         "densify",
         _run,
         "triangulate dense points on the poses of an existing model",
-        "--model PATH --video PATH --output PATH",
+        "--model PATH --video PATH [--video PATH] [--images PATH] --output PATH",
         full_help=True,
     )
     command.add_argument(
         "--model", "--model_path", required=True, metavar="PATH", help="folder of a COLMAP model"
     )
-    add_video(command, "the video from which its images were taken")
+    add_videos(command, "the video from which its images were taken")
     add_output(command, "new folder for the model")
     add_overwrite(command, ONLY_MODELS)
     add_images(command, "folder of its images, where their names do not determine the frames")
@@ -52,6 +52,7 @@ def _run(namespace: argparse.Namespace) -> None:
             namespace.model,
             namespace.video,
             namespace.output,
+            photos=namespace.images,
             image_path=namespace.image_path,
             gaussians=namespace.gaussians,
             options=options,

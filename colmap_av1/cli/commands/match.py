@@ -11,7 +11,7 @@ from colmap_av1.cli.commands.shared import (
     add_database,
     add_images,
     add_quiet,
-    add_video,
+    add_videos,
     print_result,
 )
 from colmap_av1.cli.options import add_options, given
@@ -28,11 +28,11 @@ def add_match(commands: Any) -> None:
         "match",
         _run,
         "fill a COLMAP database from a video",
-        "--database PATH --video PATH [--image_path PATH]",
+        "--database PATH --video PATH [--video PATH] [--images PATH] [--image_path PATH]",
         full_help=True,
     )
     add_database(command, "COLMAP database; its images are used, or it is created")
-    add_video(command, ANY_VIDEO)
+    add_videos(command, ANY_VIDEO)
     add_images(command, "folder to write the images to; existing ones of the right size are kept")
     add_options(command, MatchOptions)
     add_quiet(command)
@@ -44,6 +44,7 @@ def _run(namespace: argparse.Namespace) -> None:
         result = match(
             namespace.database,
             namespace.video,
+            photos=namespace.images,
             image_path=namespace.image_path,
             options=options,
             progress=report,

@@ -12,7 +12,7 @@ from colmap_av1.cli.commands.shared import (
     add_output,
     add_overwrite,
     add_quiet,
-    add_video,
+    add_videos,
     print_result,
 )
 from colmap_av1.cli.options import add_options, given
@@ -29,10 +29,10 @@ def add_reconstruct(commands: Any) -> None:
         "reconstruct",
         _run,
         "reconstruct a dense model for 3D Gaussian splatting",
-        "--video PATH --output PATH",
+        "--video PATH [--video PATH] [--images PATH] --output PATH",
         full_help=True,
     )
-    add_video(command, ANY_VIDEO)
+    add_videos(command, ANY_VIDEO)
     add_output(command, "folder for images/ and sparse/0/; that of an earlier run is resumed")
     add_gaussians(command)
     add_overwrite(command, "replace a file of --gaussians that exists")
@@ -44,7 +44,9 @@ def _run(namespace: argparse.Namespace) -> None:
     options = given(namespace, ReconstructOptions)
     with progress_bars(namespace.quiet) as report:
         result = reconstruct(
-            *(namespace.video, namespace.output),
+            namespace.video,
+            namespace.output,
+            photos=namespace.images,
             gaussians=namespace.gaussians,
             overwrite=namespace.overwrite,
             options=options,

@@ -60,6 +60,20 @@ def add_video(command: Parser, what: str = "an AV1 video") -> None:
     command.add_argument("--video", "--video_path", required=True, metavar="PATH", help=what)
 
 
+def add_videos(command: Parser, what: str) -> None:
+    """Add --video, which may be given several times, and --images."""
+    command.add_argument(
+        *("--video", "--video_path"),
+        required=True,
+        action="append",
+        metavar="PATH",
+        help=f"{what}; several videos: give it for each",
+    )
+    command.add_argument(
+        "--images", metavar="PATH", help="folder of photos of the same scene, which are added"
+    )
+
+
 def add_images(command: Parser, what: str) -> None:
     """Add --image_path."""
     command.add_argument("--image_path", metavar="PATH", help=what)

@@ -1,0 +1,63 @@
+"""Images that a database lists already: of which video they are, and their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from colmap_av1.database.reading import DatabaseImage, read_cameras
+from colmap_av1.errors import DatabaseError
+from colmap_av1.images.inputs import Inputs
+
+
+def listed_of_videos(
+    database: Path, listed: Sequence[DatabaseImage], inputs: Inputs
+) -> list[Mapping[str, tuple[int, int]]]:
+    """(width, height) of the images of each video that a database lists, by name in its folder.
+
+    Raises:
+        DatabaseError: it lists images, but none of a video or not each photo, or others.
+    """
+    sizes = {image.name: (image.width, image.height) for image in listed}
+    of_videos: list[dict[str, tuple[int, int]]] = [{} for _ in inputs.labels]
+    for photo in inputs.photos if listed else ():
+        if sizes.pop(photo.name, None) is None:
+            raise DatabaseError(
+                f"{database}: lists images, but not '{photo.name}': import that, too, or use a new "
+                "database"
+            )
+    if inputs.labels == ("",):
+        return [sizes]
+    for name, size in sizes.items():
+        label, _, own = name.partition("/")
+        if label not in inputs.labels:
+            raise DatabaseError(
+                f"{database}: lists image '{name}', which is in no folder of a video, "
+                f"{', '.join(inputs.labels)}: import the images by such names, or use a new "
+                "database"
+            )
+        of_videos[inputs.labels.index(label)][own] = size
+    for label, found in zip(inputs.labels, of_videos, strict=True):
+        if sizes and not found:
+            raise DatabaseError(
+                f"{database}: lists images, but none in folder '{label}': import those of the "
+                "video, or use a new database"
+            )
+    return [*of_videos]
+
+
+def listed_cameras(
+    database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
+) -> list[Any]:
+    """The cameras that the database has of its images, one for each name.
+
+    Raises:
+        DatabaseError: an image has none.
+    """
+    cameras = read_cameras(database)
+    camera_id = {image.name: image.camera_id for image in listed}
+    missing = next((n for n in names if camera_id[n] not in cameras), None)
+    if missing is not None:
+        raise DatabaseError(f"{database}: image '{missing}' has no camera: import the images again")
+    return [cameras[camera_id[name]] for name in names]

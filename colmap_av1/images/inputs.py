@@ -1,0 +1,197 @@
+"""The videos and photos of one run, opened once and told apart by name."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.images.photos import Photo, photo_files, read_photos
+from colmap_av1.options import MatchOptions
+from colmap_av1.util.digests import file_digest
+from colmap_av1.video.facts import Video, read_video
+from colmap_av1.video.unchanged import FileState
+
+_Path = str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The videos and photos of one run.
+
+    Attributes:
+        videos: the videos, in the order in which they were given.
+        labels: folder of each video's images among all images; '' of a lone one.
+        photos: the photos.
+        warnings: what the user should know of them.
+    """
+
+    videos: tuple[Video, ...]
+    labels: tuple[str, ...]
+    photos: tuple[Photo, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def states(self) -> tuple[FileState, ...]:
+        """The states of all files as they were at the start."""
+        return (*(video.state for video in self.videos), *(photo.state for photo in self.photos))
+
+    @property
+    def no_motion(self) -> NDArray[np.float32]:
+        """Shares of inter units of the photos, which have none."""
+        return np.zeros(len(self.photos), np.float32)
+
+    def with_names(self, of_videos: Sequence[Sequence[str]]) -> list[str]:
+        """What is to be said of each video, with its name where there are several."""
+        several = len(self.videos) > 1
+        return [
+            f"{video}: {note}" if several else note
+            for video, notes in zip(self.videos, of_videos, strict=True)
+            for note in notes
+        ]
+
+    def conversion(self, of_videos: Sequence[str | None]) -> str | None:
+        """How videos were converted, in words; None where none was."""
+        given = [[words] if words is not None else [] for words in of_videos]
+        return "; ".join(self.with_names(given)) or None
+
+    @property
+    def name(self) -> str:
+        """What messages call them all."""
+        return ", ".join(str(video) for video in self.videos)
+
+
+def paths_of(video: _Path | Sequence[_Path]) -> list[Path]:
+    """The paths of a video, or of several."""
+    return [Path(v) for v in ([video] if isinstance(video, str | os.PathLike) else video)]
+
+
+def read_inputs(
+    video: _Path | Sequence[_Path],
+    photos: _Path | None,
+    options: MatchOptions,
+    *,
+    flat: bool = False,
+) -> Inputs:
+    """Open the videos and look at the photos of a run.
+
+    Args:
+        video: a video, or several.
+        photos: folder of photos; None: there are none.
+        options: refused where they are for one video and there are several, or leave photos
+            without links.
+        flat: names of photos are made fit for trainers, see `read_photos`.
+
+    Raises:
+        VideoError: a video cannot be read, or is given twice.
+        BitstreamError: no frame of a video can be decoded.
+        ImageError: the photos cannot be read.
+        OptionError: an option does not fit.
+    """
+    paths = paths_of(video)
+    if not paths:
+        raise OptionError("no video is given: give one or several")
+    folder = Path(photos) if photos is not None else None
+    _check_options(len(paths), folder, options)
+    files, warning = photo_files(folder) if folder is not None else ([], None)
+    videos = tuple(read_video(path, options.read.operating_point) for path in paths)
+    _check_different(videos)
+    places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
+    if folder is not None:
+        places.append(os.path.abspath(folder))
+    labels = labels_of(places)
+    found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
+    _check_one_camera(videos, found, options)
+    return Inputs(
+        videos,
+        tuple(labels[: len(videos)]) if len(videos) > 1 else ("",),
+        tuple(found),
+        (warning,) if warning is not None else (),
+    )
+
+
+def labels_of(places: Sequence[str]) -> list[str]:
+    """Names that tell files or folders apart: their own, with those of folders where alike.
+
+    Args:
+        places: absolute paths, without extensions.
+
+    Raises:
+        OptionError: no number of folders tells them apart.
+    """
+    parts = [[_plain(part) for part in Path(place).parts[1:]] or ["root"] for place in places]
+    for count in range(1, max(map(len, parts)) + 1):
+        labels = ["_".join(part[-count:]) for part in parts]
+        # Some file systems take 'A' for 'a'.
+        if len({label.lower() for label in labels}) == len(labels):
+            return labels
+    twice = next(place for i, place in enumerate(places) if parts[i] in parts[:i])
+    raise OptionError(f"{twice}: another video or folder has nearly this name: rename one")
+
+
+def _plain(word: str) -> str:
+    """The word without what programs take for an extension or another word in names."""
+    return re.sub(r"[^\w-]+", "_", word)
+
+
+def _check_options(num_videos: int, photos: Path | None, options: MatchOptions) -> None:
+    if photos is not None and options.links.links == "none":
+        raise OptionError(
+            "links 'none': photos have no motion, only links connect them: leave out --links or "
+            "--images"
+        )
+    if num_videos == 1:
+        return
+    if options.images.frame_list is not None:
+        raise OptionError(
+            "frame_list lists the frames of one video, and there are several: choose images by "
+            "--every, --fps or --num_images, which count for each"
+        )
+    if options.keep_stream is not None:
+        raise OptionError(
+            "keep_stream names one file, and there are several videos: leave it out, or convert "
+            "them by 'colmap-av1 encode' first"
+        )
+
+
+def _check_different(videos: Sequence[Video]) -> None:
+    for index, video in enumerate(videos):
+        for other in videos[:index]:
+            if _are_same(video, other):
+                raise VideoError(f"{video} and {other} are the same video: give it once")
+
+
+def _are_same(a: Video, b: Video) -> bool:
+    if a.state.found is None or b.state.found is None:
+        return False
+    if a.state.found[0] == b.state.found[0]:
+        return True
+    # Only those of one length are read for it.
+    return a.state.found[1] == b.state.found[1] and file_digest(a.path) == file_digest(b.path)
+
+
+def _check_one_camera(
+    videos: Sequence[Video], photos: Sequence[Photo], options: MatchOptions
+) -> None:
+    """Refuse one camera, or given intrinsics, for pictures of several sizes."""
+    camera = options.camera
+    sizes = {str(video): video.picture_size for video in videos}
+    if camera.single_camera:
+        sizes |= {str(photo.path): photo.size for photo in photos}
+    elif camera.camera_params is None:
+        return
+    first, size = next(iter(sizes.items()))
+    odd = next((name for name, other in sizes.items() if other != size), None)
+    if odd is None:
+        return
+    what = "single_camera is 1" if camera.single_camera else "camera_params are those of one size"
+    raise OptionError(
+        f"{what}, but {first} is {size[0]}x{size[1]} and {odd} {sizes[odd][0]}x{sizes[odd][1]}: "
+        "leave it out, or give what one camera took"
+    )

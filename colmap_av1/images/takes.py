@@ -1,0 +1,143 @@
+"""Images of several videos and photos, counted through, and their pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.files import read_image
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.video_tracks import decodable_frames
+from colmap_av1.video.display import Display
+from colmap_av1.video.facts import Video
+
+Image = NDArray[np.uint8]
+# Gives the pictures of images, by index, ascending.
+Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
+
+
+@dataclass(frozen=True)
+class Takes:
+    """Images that were taken together: those of each video, and every photo by itself.
+
+    Frames are counted through all takes in a row: a photo is a take of one frame.
+
+    Attributes:
+        videos: what messages call the videos, which are the first takes; '' of a lone one.
+        images: the images, with their names among all images and frames counted through.
+        take: int32 [num_images] the take of each image, ascending.
+        first_frame: int64 [num_takes + 1] frame at which each take begins, and their number.
+    """
+
+    videos: tuple[str, ...]
+    images: ChosenImages
+    take: NDArray[np.int32]
+    first_frame: NDArray[np.int64]
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames of all takes."""
+        return int(self.first_frame[-1])
+
+    @property
+    def num_takes(self) -> int:
+        """Number of videos and photos."""
+        return len(self.first_frame) - 1
+
+    def images_of(self, take: int) -> range:
+        """The images of a take."""
+        first, last = np.searchsorted(self.take, [take, take + 1])
+        return range(int(first), int(last))
+
+    def some(self, index: Sequence[int] | NDArray[np.int64]) -> Takes:
+        """Some of the images, by their index, ascending."""
+        names = [self.images.names[i] for i in index]
+        chosen = np.asarray(index, dtype=np.int64)
+        images = ChosenImages(names, self.images.frames[chosen])
+        return replace(self, images=images, take=self.take[chosen])
+
+    def of_video(self, video: int) -> ChosenImages:
+        """The images of a video, at the frames of its own."""
+        own = self.images_of(video)
+        names = self.images.names[own.start : own.stop]
+        frames = self.images.frames[own.start : own.stop] - self.first_frame[video]
+        return ChosenImages(names, frames.astype(np.int32))
+
+
+def count_through(
+    videos: Sequence[str],
+    chosen: Sequence[ChosenImages],
+    num_frames: Sequence[int],
+    photos: Sequence[str] = (),
+) -> Takes:
+    """Count the images of videos and photos through.
+
+    Args:
+        videos: the folder of each video's images among all images; '' where they have none.
+        chosen: the images of each video, by their names in its folder.
+        num_frames: number of frames of each video.
+        photos: names of the photos among all images.
+    """
+    first = np.concatenate([[0], np.cumsum([*num_frames, *(1 for _ in photos)])]).astype(np.int64)
+    names = [
+        f"{video}/{name}" if video else name
+        for video, own in zip(videos, chosen, strict=True)
+        for name in own.names
+    ]
+    frames = [own.frames + first[video] for video, own in enumerate(chosen)]
+    counts = [*(len(own.names) for own in chosen), *(1 for _ in photos)]
+    return Takes(
+        tuple(videos),
+        ChosenImages(
+            [*names, *photos],
+            np.concatenate([*frames, first[len(chosen) : -1]]).astype(np.int32),
+        ),
+        np.repeat(np.arange(len(counts), dtype=np.int32), counts),
+        first,
+    )
+
+
+def pictures_of(
+    takes: Takes,
+    videos: Sequence[tuple[Video, Display | None]],
+    photos: Sequence[Path],
+    options: MatchOptions,
+) -> Pictures:
+    """What gives the pictures of images.
+
+    Args:
+        takes: the images.
+        videos: the videos, and how their pictures are shown; None: as players show them.
+        photos: the files of the photos.
+        options: those of reading are used.
+
+    Returns:
+        A function that decodes those videos which the asked images are of, up to the last of them.
+        Where a video is damaged the pictures after it are missing, with a warning.
+    """
+
+    def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
+        left = set(wanted)
+        for number, (video, display) in enumerate(videos):
+            own = takes.of_video(number)
+            first = takes.images_of(number).start
+            image_of = {
+                int(frame): first + index
+                for index, frame in enumerate(own.frames)
+                if first + index in left
+            }
+            if image_of:
+                for frame, picture in decodable_frames(video, max(image_of) + 1, options, display):
+                    if frame in image_of:
+                        yield image_of[frame], picture
+        first_photo = len(takes.take) - len(photos)
+        for index, photo in enumerate(photos, start=first_photo):
+            if index in left:
+                yield index, read_image(photo)
+
+    return pictures

@@ -1,0 +1,304 @@
+"""Several videos, and photos, in one database or one model."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import PROJECT, Encode, make_frames
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_av1.cli import main
+from colmap_av1.database.check import check
+from colmap_av1.database.reading import read_cameras, read_images
+from colmap_av1.errors import ColmapAv1Error, DatabaseError, ImageError, OptionError, VideoError
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.inputs import labels_of
+from colmap_av1.images.takes import count_through
+from colmap_av1.match import match
+from colmap_av1.options import (
+    CameraOptions,
+    ImageOptions,
+    LinkOptions,
+    MatchOptions,
+    ReconstructOptions,
+)
+from colmap_av1.reconstruct import reconstruct
+from colmap_av1.tracks.tracks import Tracks, tracks_in_a_row
+from colmap_av1.video.decoding import decode_frames
+
+SCENE = PROJECT / "examples" / "scene.mp4"
+SIZE = (384, 216)
+X264 = ("-c:v", "libx264", "-crf", "14", "-g", "250")
+# Frames of the scene in the first video, in the second, and as photos.
+FIRST, SECOND, AS_PHOTOS = range(25), range(25, 50), (24, 27, 30)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> NDArray[np.uint8]:
+    shown = [image for _, image in decode_frames(SCENE)]
+    return np.array([cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA) for image in shown])
+
+
+@pytest.fixture(scope="module")
+def halves(
+    pictures: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """A clip in two parts, the second of which is not AV1."""
+    folder = tmp_path_factory.mktemp("halves")
+    first = encode(pictures[FIRST.start : FIRST.stop], folder / "walk in.mp4")
+    return first, encode(pictures[SECOND.start : SECOND.stop], folder / "back.mp4", *X264)
+
+
+@pytest.fixture(scope="module")
+def photos(pictures: NDArray[np.uint8], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some pictures of the clip, as files of another size."""
+    folder = tmp_path_factory.mktemp("album") / "photos"
+    (folder / "more").mkdir(parents=True)
+    for number, frame in enumerate(AS_PHOTOS):
+        name = f"more/IMG.{number}.jpg" if number else "IMG.0.JPG"
+        cv2.imwrite(str(folder / name), cv2.resize(pictures[frame], (480, 270)))
+    (folder / "notes.txt").write_text("not a picture")
+    return folder
+
+
+def test_two_videos_and_photos_are_one_database(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    images = tmp_path / "images"
+    report = match(tmp_path / "a.db", halves, photos=photos, image_path=images)
+    assert report.videos == halves
+    assert report.streams == (halves[0], None)
+    assert report.num_images == len(FIRST) + len(SECOND) + len(AS_PHOTOS)
+    assert report.links.num_between > 20
+    assert report.links.parts == report.links.unlinked_photos == ()
+    assert report.warnings == ()
+    listed = read_images(tmp_path / "a.db")
+    of_photos = ["IMG.0.JPG", "more/IMG.1.jpg", "more/IMG.2.jpg"]
+    assert [image.name for image in listed] == [
+        *(f"walk_in/frame_{i:06d}.png" for i in range(len(FIRST))),
+        *(f"back/frame_{i:06d}.png" for i in range(len(SECOND))),
+        *(f"photos/{name}" for name in of_photos),
+    ]
+    assert all((images / image.name).is_file() for image in listed)
+    for name in of_photos:
+        assert (images / "photos" / name).read_bytes() == (photos / name).read_bytes()
+    by_camera = {i.camera_id: (i.width, i.height) for i in listed}
+    assert list(by_camera.values()) == [SIZE, SIZE, (480, 270)]
+    assert [image.camera_id for image in listed[:: len(FIRST)]] == [1, 2, 3]
+    assert check(tmp_path / "a.db").num_connected_images == report.num_images
+
+    # Once more into the same rows, with the images that are there.
+    again = replace(MatchOptions(), on_existing="replace")
+    match(tmp_path / "a.db", halves, photos=photos, image_path=images, options=again)
+    assert read_images(tmp_path / "a.db") == listed
+
+
+def test_videos_share_a_camera_where_they_are_told_to(
+    halves: tuple[Path, Path], pictures: NDArray[np.uint8], encode: Encode, tmp_path: Path
+) -> None:
+    one = MatchOptions(camera=CameraOptions(single_camera=True))
+    match(tmp_path / "a.db", halves, options=one)
+    assert len(read_cameras(tmp_path / "a.db")) == 1
+    small = encode(pictures[:9, :128], tmp_path / "small.mp4")
+    with pytest.raises(OptionError, match=r"single_camera is 1, but .* 384x216 .* 384x128"):
+        match(tmp_path / "b.db", [halves[0], small], options=one)
+    given = MatchOptions(camera=CameraOptions("PINHOLE", "300,300,192,108"))
+    with pytest.raises(OptionError, match="camera_params are those of one size"):
+        match(tmp_path / "b.db", [halves[0], small], options=given)
+    assert not (tmp_path / "b.db").exists()
+
+
+def test_videos_of_different_scenes_are_told(
+    halves: tuple[Path, Path], clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*("match", "--database", str(tmp_path / "a.db"), "--quiet")]
+    assert main([*words, "--video", str(halves[0]), "--video", str(clip)]) == 0
+    err = capsys.readouterr().err
+    assert "nothing in the pictures connects 'walk_in' from 'clip'" in err
+    assert "2 separate models" in err
+    report = match(
+        tmp_path / "b.db",
+        [halves[0], clip],
+        options=MatchOptions(links=LinkOptions(links="none")),
+    )
+    assert report.links.num_images == 0
+    assert any("links none" in warning for warning in report.warnings)
+
+
+def test_a_photo_of_something_else_is_told(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    album = tmp_path / "album"
+    shutil.copytree(photos, album)
+    cv2.imwrite(str(album / "cat.png"), make_frames(1)[0])
+    report = match(tmp_path / "a.db", halves[0], photos=album)
+    assert report.links.unlinked_photos == ("album/cat.png",)
+    assert any("'album/cat.png'" in warning for warning in report.warnings)
+    # A lone video's images keep their names.
+    assert read_images(tmp_path / "a.db")[0].name == "frame_000000.png"
+
+
+def test_one_video_twice_is_refused(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    copy = tmp_path / "copy.mp4"
+    shutil.copyfile(halves[0], copy)
+    for other in (halves[0], copy, os.path.relpath(halves[0])):
+        with pytest.raises(VideoError, match="are the same video: give it once"):
+            match(tmp_path / "a.db", [halves[0], halves[1], other])
+    assert not (tmp_path / "a.db").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "no such folder"),
+        ("file", "is a file: give the folder"),
+        ("empty", "holds no photo that can be read: give a folder with JPEG or PNG"),
+        ("heic", r"convert these to JPEG or PNG: IMG_1\.HEIC"),
+        ("damaged", r"bad\.jpg: is "),
+        ("cut short", r"bad\.jpg: is damaged: copy it anew, or remove it"),
+    ],
+)
+def test_photos_that_cannot_be_read(
+    kind: str, message: str, halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    album = tmp_path / "album"
+    if kind == "file":
+        album.write_text("")
+    elif kind != "missing":
+        album.mkdir()
+    if kind == "heic":
+        (album / "IMG_1.HEIC").write_bytes(b"whatever")
+    if kind in ("damaged", "cut short"):
+        data = (photos / "IMG.0.JPG").read_bytes()
+        (album / "bad.jpg").write_bytes(data[: len(data) // 2] if kind == "cut short" else b"bad")
+    with pytest.raises(ImageError, match=message):
+        match(tmp_path / "a.db", halves[0], photos=album)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["album"] * album.exists()
+
+
+def test_another_file_with_a_photos_name_is_kept(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "images" / "photos").mkdir(parents=True)
+    (tmp_path / "images" / "photos" / "IMG.0.JPG").write_bytes(b"mine")
+    with pytest.raises(ImageError, match="is another file than"):
+        match(tmp_path / "a.db", halves[0], photos=photos, image_path=tmp_path / "images")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (MatchOptions(images=ImageOptions(frame_list="list.txt")), "frame_list lists the frames"),
+        (MatchOptions(keep_stream="kept.mp4"), "keep_stream names one file"),
+        (MatchOptions(links=LinkOptions(links="none")), "only links connect them"),
+    ],
+)
+def test_options_for_one_video(
+    options: MatchOptions, message: str, halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        match(tmp_path / "a.db", halves, photos=photos, options=options)
+
+
+def test_a_database_of_other_images_is_refused(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    match(tmp_path / "a.db", halves[0])
+    again = replace(MatchOptions(), on_existing="append")
+    with pytest.raises(DatabaseError, match=r"is in no folder of a video, walk_in, back"):
+        match(tmp_path / "a.db", halves, options=again)
+
+
+@pytest.mark.parametrize(
+    ("places", "labels"),
+    [
+        (["/x/a", "/x/b"], ["a", "b"]),
+        (["/cam 0/video", "/cam 1/video"], ["cam_0_video", "cam_1_video"]),
+        (["/x/a.b/c", "/y/a.b/C"], ["x_a_b_c", "y_a_b_C"]),
+        (["/x/a", "/x"], ["a", "x"]),
+    ],
+)
+def test_labels_tell_videos_apart(places: list[str], labels: list[str]) -> None:
+    assert labels_of(places) == labels
+
+
+def test_names_that_only_signs_tell_apart_are_refused() -> None:
+    with pytest.raises(OptionError, match="rename one"):
+        labels_of(["/x/a b", "/x/a-b", "/x/a+b"])
+
+
+@given(st.lists(st.text(min_size=1, max_size=4), min_size=1, max_size=4))
+def test_labels_are_plain_and_different(names: list[str]) -> None:
+    try:
+        labels = labels_of([f"/x/{name.replace('/', '_')}" for name in names])
+    except ColmapAv1Error:
+        return
+    assert len({label.lower() for label in labels}) == len(names)
+    assert not any(set(label) & set("./ ") for label in labels)
+
+
+def some_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
+    """A track through all frames, and one through the last two."""
+    frame = np.array([*range(num_frames), num_frames - 2, num_frames - 1], np.int32)
+    return Tracks(
+        *(num_frames, *size, np.array([0, num_frames, num_frames + 2]), frame),
+        xy=np.random.default_rng(num_frames).random((len(frame), 2), np.float32),
+        sigma=np.ones(len(frame), np.float32),
+        confirmed=np.zeros(len(frame), np.bool_),
+    )
+
+
+def test_frames_are_counted_through() -> None:
+    one, two = some_tracks(5, (64, 48)), some_tracks(3, (32, 80))
+    row = tracks_in_a_row([one, two], 9)
+    assert (row.num_frames, row.width, row.height) == (9, 64, 80)
+    assert row.offsets.tolist() == [0, 5, 7, 10, 12]
+    assert row.frame.tolist() == [0, 1, 2, 3, 4, 3, 4, 5, 6, 7, 6, 7]
+    assert tracks_in_a_row([one], 5) is one
+    chosen = [ChosenImages(["0.png", "4.png"], np.array([0, 4], np.int32))]
+    chosen.append(ChosenImages(["2.png"], np.array([2], np.int32)))
+    takes = count_through(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])
+    assert takes.images.names == ["a/0.png", "a/4.png", "b/2.png", "photos/x.jpg"]
+    assert takes.images.frames.tolist() == [0, 4, 7, 8]
+    assert takes.take.tolist() == [0, 0, 1, 2]
+    assert takes.of_video(1).names == ["b/2.png"]
+    assert takes.of_video(1).frames.tolist() == [2]
+    assert (takes.num_takes, takes.num_frames) == (3, 9)
+
+
+def test_two_videos_and_photos_are_one_model(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=2)))
+    made = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
+    assert made.num_registered == made.num_images == 13 + 13 + len(AS_PHOTOS)
+    assert made.registered == {"walk_in": 13, "back": 13}
+    model = pycolmap.Reconstruction(str(made.output / "sparse" / "0"))
+    sizes = {(int(c.width), int(c.height)) for c in model.cameras.values()}
+    assert (len(model.cameras), sizes) == (3, {SIZE, (480, 270)})
+    for image in model.images.values():
+        picture = cv2.imread(str(made.output / "images" / image.name))
+        camera = model.cameras[image.camera_id]
+        assert picture.shape[1::-1] == (camera.width, camera.height)
+        assert image.name.count(".") == 1
+    seen_by = {
+        frozenset(model.images[e.image_id].name.split("/")[0] for e in point.track.elements)
+        for point in model.points3D.values()
+    }
+    assert {frozenset({"walk_in"}), frozenset({"back"}), frozenset({"walk_in", "back"})} <= seen_by
+
+    resumed = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
+    assert resumed.resumed == (
+        *("tracks_walk_in", "tracks_back", "matches", "poses", "adjustment", "model"),
+    )
+    (photos / "more" / "IMG.2.jpg").unlink()
+    fewer = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
+    assert fewer.resumed == ("tracks_walk_in", "tracks_back")
+    assert fewer.num_images == made.num_images - 1
