@@ -90,6 +90,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
             f"{report.num_registered} of {report.num_images} with a pose, {report.num_frames} "
             "frames in the video",
         ),
+        *((f"images of {name}", f"{n} with a pose") for name, n in report.registered.items()),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),
