@@ -131,7 +131,8 @@ def labels_of(places: Sequence[str]) -> list[str]:
         # Some file systems take 'A' for 'a'.
         if len({label.lower() for label in labels}) == len(labels):
             return labels
-    twice = next(place for i, place in enumerate(places) if parts[i] in parts[:i])
+    lower = [label.lower() for label in labels]
+    twice = next(place for i, place in enumerate(places) if lower[i] in lower[:i])
     raise OptionError(f"{twice}: another video or folder has nearly this name: rename one")
 
 
