@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from colmap_av1.cli import main
 from colmap_av1.database.check import check
 from colmap_av1.database.reading import read_cameras, read_images
-from colmap_av1.errors import ColmapAv1Error, DatabaseError, ImageError, OptionError, VideoError
+from colmap_av1.densify import densify
+from colmap_av1.errors import (
+    ColmapAv1Error,
+    DatabaseError,
+    ImageError,
+    ModelError,
+    OptionError,
+    VideoError,
+)
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import labels_of
 from colmap_av1.images.takes import count_through
@@ -304,6 +312,13 @@ def test_two_videos_and_photos_are_one_model(
         for point in model.points3D.values()
     }
     assert {frozenset({"walk_in"}), frozenset({"back"}), frozenset({"walk_in", "back"})} <= seen_by
+
+    posed = made.output / ".stages" / "adjusted"
+    dense = densify(posed, halves, tmp_path / "dense", photos=photos)
+    assert dense.num_images == made.num_images
+    assert dense.agreeing > 0.9
+    with pytest.raises(ModelError, match=r"image 'photos/.*' lies in no folder of a video"):
+        densify(posed, halves, tmp_path / "none")
 
     resumed = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
     assert resumed.resumed == (
