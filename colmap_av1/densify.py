@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -169,9 +170,8 @@ def densify(
         # What can be refused is refused before the long work.
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
         of_videos = _images_of_videos(model, sizes, inputs, folder, options)
-        tracked = [
-            _track(own, output, options, clock=clock, progress=progress) for own in of_videos
-        ]
+        track = partial(_track, output=output, options=options, clock=clock, progress=progress)
+        tracked = [track(own) for own in of_videos]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
         takes = count_through(
             inputs.labels,
