@@ -179,7 +179,7 @@ def test_help_of_other_commands_is_whole(capsys: pytest.CaptureFixture[str]) -> 
 def test_help_has_a_group_for_each_kind_of_options(capsys: pytest.CaptureFixture[str]) -> None:
     text = help_of("reconstruct", "--help-all", capsys)
     titles = [line[:-1] for line in text.splitlines() if re.fullmatch(r"\w.*:", line)]
-    assert titles[:3] == ["options", "database and stream", "images"]
+    assert titles[:4] == ["options", "reconstruction", "database and stream", "images"]
     assert {"tracks", "two-view geometry", "poses", "points", "run"} <= set(titles)
     assert "selection of tracks" not in titles
     assert "Shown frames" not in text
