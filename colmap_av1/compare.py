@@ -42,6 +42,8 @@ _PSEUDO_TRUTHS = (PSEUDO_TRUTH, "sift-sequential")
 _LARGEST_ATE = 0.02
 ALL_TRACKS = " + all tracks"
 _OWN = "av1"
+# Folder of the front-ends in the output.
+_FRONTENDS = "frontends"
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ def compare(
     if options.trainer is not None:
         check_trainer(options.trainer)
     files = [file for frontend in frontends.values() for file in frontend.files]
-    check_folder(output, [video, image_path, reference, options.match.images.frame_list, *files])
+    check_folder(output, [video, image_path, options.match.images.frame_list, *files])
+    _check_reference(output, reference)
     video = read_video(video, options.match.read.operating_point)
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
@@ -133,7 +136,7 @@ def compare(
                 name,
                 frontend,
                 footage,
-                output / "frontends" / name,
+                output / _FRONTENDS / name,
                 settings=settings,
                 options=options,
                 progress=progress,
@@ -172,6 +175,13 @@ def _writing(output: Path) -> Iterator[None]:
             f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
             "run the same command again once that is fixed"
         ) from error
+
+
+def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> None:
+    """Refuse a truth within the output; the model of a front-end is one that stays."""
+    models = (output / _FRONTENDS).resolve()
+    if reference is not None and not Path(reference).resolve().is_relative_to(models):
+        check_folder(output, [reference])
 
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:

@@ -71,9 +71,15 @@ def test_what_is_no_path(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    takes_several = name == "video" and call in (match, reconstruct)
     for value in NO_PATHS:
+        if takes_several and isinstance(value, list):
+            with pytest.raises(OptionError, match="no video is given"):
+                call(**{name: value}, **others)
+            continue
+        given = [VIDEO, value] if takes_several else value
         with pytest.raises(TypeError, match=f"{name} is of type {type(value).__name__}"):
-            call(**{name: value}, **others)
+            call(**{name: given}, **others)
     with pytest.raises(OptionError, match=f"{name} 'a.x00b' is no path"):
         call(**{name: "a\0b"}, **others)
     assert list(tmp_path.iterdir()) == []

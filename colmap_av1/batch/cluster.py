@@ -13,6 +13,7 @@ from colmap_av1.batch.jobs import Ended, Job, Outcome, Row, Work
 from colmap_av1.batch.worker import Worker
 from colmap_av1.errors import OptionError
 from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.signals import handlers_kept
 
 EXTRA = "colmap-av1[cluster]"
 # Tasks that Ray is given ahead of what it can run at a time: enough for every node to have a
@@ -46,7 +47,8 @@ class RayEngine:
             how = {"num_cpus": threads_or_cpus(None), "address": "local"}
         # Functions and options of this package are sent by name: nodes have it installed.
         try:
-            context = ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
+            with handlers_kept():  # Ray has one of its own for the end of a process
+                context = ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError, RuntimeError) as error:
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise OptionError(f"no Ray at {address or 'this machine'}: {line}") from error

@@ -22,6 +22,7 @@ from colmap_av1.util.memory import resident_memory
 from colmap_av1.util.processes import bound
 
 # A process is replaced after so many videos, for what libraries do not give back.
+_READY = "ready"
 _VIDEOS_OF_PROCESS = 100
 _LOOK = 0.25  # seconds between looks at its memory
 _END = 5.0  # seconds
@@ -74,7 +75,7 @@ class Worker:
     def _running(self) -> subprocess.Popen[bytes]:
         if self._closed:
             raise EOFError
-        if self._process is None or self._process.poll() is not None:
+        if self._process is None or not _answers(self._process):
             self._end()
             path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *sys.path])
             self._process = subprocess.Popen(
@@ -126,17 +127,30 @@ def serve(scratch: str) -> None:
     channel = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries may print
     with scratch_of_process(scratch) as folder:
-        while (given := _load(sys.stdin.buffer)) is not None:
-            pickle.dump(attempt(*given, folder), channel)
+        for given in _requests(sys.stdin.buffer):
+            pickle.dump(_READY if given is None else attempt(*given, folder), channel)
             channel.flush()
 
 
-def _load(file: BinaryIO) -> tuple[Work, Job] | None:
+def _requests(file: BinaryIO) -> Iterator[tuple[Work, Job] | None]:
+    """What is to be attempted; None where it is only asked whether the process is there."""
+    while True:
+        try:
+            yield pickle.load(file)
+        except EOFError:
+            return
+
+
+def _answers(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a process that waits for a video is still there: one killed meanwhile is no fault."""
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
-        work, job = pickle.load(file)
-    except EOFError:
-        return None
-    return work, job
+        pickle.dump(None, process.stdin)
+        process.stdin.flush()
+        return bool(pickle.load(process.stdout) == _READY)
+    except (EOFError, OSError, pickle.UnpicklingError):
+        return False
 
 
 @contextmanager

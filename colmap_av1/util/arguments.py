@@ -7,7 +7,7 @@ import inspect
 import os
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -50,6 +50,11 @@ def _check(function: str, name: str, value: Any, kinds: tuple[Any, ...]) -> None
     if value is None and type(None) in kinds:
         return
     origins = {typing.get_origin(kind) for kind in kinds} - {None}
+    if origins == {os.PathLike, Sequence}:
+        several = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        for one in value if several else [value]:
+            _check_path(function, name, one)
+        return
     if os.PathLike in origins and (len(origins) == 1 or isinstance(value, str | os.PathLike)):
         _check_path(function, name, value)
         return

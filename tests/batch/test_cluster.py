@@ -15,6 +15,7 @@ from conftest import PROJECT
 
 from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
 from colmap_av1.batch.run import Counts
+from colmap_av1.util.signals import handlers_kept
 
 ray: Any = pytest.importorskip("ray", reason="needs ray: pip install '.[cluster]'")
 
@@ -24,7 +25,7 @@ def cluster() -> Iterator[Any]:
     """A Ray of two nodes on this machine, of one core each."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - where there is a Ray
 
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, handlers_kept():
         patch.setenv("PYTHONPATH", str(PROJECT), prepend=os.pathsep)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         store = {"object_store_memory": 80 << 20, "include_dashboard": False}
