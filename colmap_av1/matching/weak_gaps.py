@@ -11,10 +11,10 @@ from colmap_av1.options import LinkOptions
 _NEIGHBOURS = 8
 # A frame is weak whose share of inter units is below this, or below this share of its neighbours'
 # median. Where a camera jerks, or a picture is blurred, an encoder finds no motion and codes new
-# pictures: 2 to 24 % inter units where the frames around have 45 to 95 %. Ordinary frames keep half
-# of what is usual around them.
+# pictures: 2 to 24 % inter units where the frames around have 45 to 95 %; or half of what these
+# have, where it finds what only compresses well. Nearly all ordinary frames have more.
 _LEAST_INTER_SHARE = 0.25
-_LEAST_OF_NEIGHBOURS = 0.4
+_LEAST_OF_NEIGHBOURS = 0.55
 
 
 def weak_frames(inter_share: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -60,6 +60,10 @@ def test_weak_frames_are_those_without_motion_among_others() -> None:
     drive[[0, 8, 20]] = 0, 0.33, 0.15
     assert np.flatnonzero(weak_frames(drive)).tolist() == [20]
     # Where the camera is always too fast, no motion is to be trusted.
+    # What only compresses well is found across a jerk, too.
+    half = np.full(40, 0.94, np.float32)
+    half[17], half[30] = 0.47, 0.62
+    assert np.flatnonzero(weak_frames(half)).tolist() == [17]
     assert weak_frames(np.full(9, 0.04, np.float32))[1:].all()
 
 
