@@ -11,22 +11,26 @@ from typing import Any
 
 import pytest
 from batch_output import files_of, rows_of, workers_of
-from conftest import PROJECT
 
+import colmap_av1
 from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
 from colmap_av1.batch.run import Counts
 from colmap_av1.util.signals import handlers_kept
 
+# The folder that the package under test is installed in.
+PACKAGES = Path(colmap_av1.__file__).parents[1]
 ray: Any = pytest.importorskip("ray", reason="needs ray: pip install '.[cluster]'")
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A Ray of two nodes on this machine, of one core each."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - where there is a Ray
 
     with pytest.MonkeyPatch.context() as patch, handlers_kept():
-        patch.setenv("PYTHONPATH", str(PROJECT), prepend=os.pathsep)
+        # Not where the checkout, that holds no compiled part, would be imported.
+        patch.chdir(tmp_path_factory.mktemp("cluster"))
+        patch.setenv("PYTHONPATH", str(PACKAGES), prepend=os.pathsep)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         store = {"object_store_memory": 80 << 20, "include_dashboard": False}
         started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, **store})

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 from batch_output import files_of, rows_of, workers_of
-from conftest import PROJECT
 
+import colmap_av1
 from colmap_av1 import (
     BatchOptions,
     BitstreamError,
@@ -33,15 +33,21 @@ from colmap_av1.batch.worker import Worker
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.container import read_file
 
+# The folder that the package under test is installed in.
+PACKAGES = Path(colmap_av1.__file__).parents[1]
+
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
 
 def drive(clips: Path, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "colmap_av1", "batch", "--inputs", clips, "--output", out]
     words = [*command, "--task", "match", "--retries", "99", "--quiet"]
-    path = os.pathsep.join([str(PROJECT), *filter(None, sys.path)])
+    path = os.pathsep.join([str(PACKAGES), *filter(None, sys.path)])
     return subprocess.Popen(
-        list(map(str, words)), stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": path}
+        list(map(str, words)),
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=clips.parent,
     )
 
 
