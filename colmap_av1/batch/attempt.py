@@ -37,6 +37,7 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
+from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.digests import digest_of
 from colmap_av1.video.container import read_file
 
@@ -85,7 +86,7 @@ class _Attempt:
     def __init__(self, work: Work, job: Job, scratch: Path) -> None:
         self._work, self._job = work, job
         self._folder, self._copies = scratch / "output", scratch / "input"
-        self._start, self._cpu = time.perf_counter(), _cpu_seconds()
+        self._start, self._cpu = time.perf_counter(), cpu_seconds()
         self._found: dict[str, Any] = {}
 
     def run(self) -> Outcome:
@@ -167,7 +168,7 @@ class _Attempt:
             str(self._job.source),
             state,
             seconds=round(time.perf_counter() - self._start, 3),
-            cpu_seconds=round(_cpu_seconds() - self._cpu, 3),
+            cpu_seconds=round(cpu_seconds() - self._cpu, 3),
             **self._found,
         )
 
@@ -235,8 +236,3 @@ def _line_of(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return "out of memory"
     return f"{type(error).__name__}: {error}"
-
-
-def _cpu_seconds() -> float:
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system

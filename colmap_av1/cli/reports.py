@@ -13,6 +13,7 @@ from colmap_av1.database.check import CheckReport
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
+from colmap_av1.matching.links import gap_in_video
 from colmap_av1.model.far_views import FarViews
 from colmap_av1.model.figures import ModelFigures
 from colmap_av1.motion.info import StreamReport
@@ -153,8 +154,8 @@ def _link_rows(
 
 def _named(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> str:
     """The frames of a gap, counted in their own video where there are several."""
-    name, first = next((v for v in reversed(videos) if v[1] <= gap[0]), ("", 0))
-    return f"{name} {gap[0] - first}-{gap[1] - first}".strip()
+    name, before, after = gap_in_video(gap, videos)
+    return f"{name} {before}-{after}".strip()
 
 
 def densify_rows(report: DensifyReport) -> Rows:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,6 +59,10 @@ class ChosenImages:
 
     names: list[str]
     frames: NDArray[np.int32]
+
+    def some(self, index: Sequence[int] | NDArray[np.integer[Any]]) -> ChosenImages:
+        """Some of the images, by their index, ascending."""
+        return ChosenImages([self.names[i] for i in index], self.frames[np.asarray(index, int)])
 
 
 def choose_images(
@@ -161,7 +166,7 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
         float64 [num_frames - 1] pixels from each frame to the next, all above 0.
     """
     focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
-    number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    number = tracks.track
     step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
     order = step[order_by_frame(tracks.frame[step], tracks.num_frames)]
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames))
@@ -427,7 +432,7 @@ def _rotation_field(
 
 def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
     """A function that lists the tracks a frame sees, ascending."""
-    number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    number = tracks.track
     order = order_by_frame(tracks.frame, tracks.num_frames)
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
     return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]

@@ -81,13 +81,10 @@ class _TracksByImage:
     """Which tracks each image sees, and in how many of its cells."""
 
     def __init__(self, tracks: Tracks, frames: NDArray[np.int32], spacing: float) -> None:
-        number = np.repeat(
-            np.arange(len(tracks.offsets) - 1, dtype=np.int32), np.diff(tracks.offsets)
-        )
         order = order_by_frame(tracks.frame, tracks.num_frames)
         ends = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
         self._rows = [order[ends[frame] : ends[frame + 1]] for frame in frames.tolist()]
-        self._number = number
+        self._number = tracks.track.astype(np.int32)
         self._xy = tracks.xy
         self._spacing = np.float32(max(spacing, 1.0))
         self._num_columns = int(tracks.width // self._spacing) + 1

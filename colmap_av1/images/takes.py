@@ -56,10 +56,8 @@ class Takes:
 
     def some(self, index: Sequence[int] | NDArray[np.int64]) -> Takes:
         """Some of the images, by their index, ascending."""
-        names = [self.images.names[i] for i in index]
         chosen = np.asarray(index, dtype=np.int64)
-        images = ChosenImages(names, self.images.frames[chosen])
-        return replace(self, images=images, take=self.take[chosen])
+        return replace(self, images=self.images.some(index), take=self.take[chosen])
 
     def of_video(self, video: int) -> ChosenImages:
         """The images of a video, at the frames of its own."""

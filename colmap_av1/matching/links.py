@@ -106,12 +106,8 @@ class LinkReport:
 
     def _frames(self, gap: tuple[int, int]) -> str:
         """The frames of a gap, counted in their own video."""
-        before, after = gap
-        own = [video for video in self.videos if video[1] <= before]
-        if not own:
-            return f"{before} and {after}"
-        name, first = own[-1]
-        return f"{before - first} and {after - first} of '{name}'"
+        name, before, after = gap_in_video(gap, self.videos)
+        return f"{before} and {after} of '{name}'" if name else f"{before} and {after}"
 
     def _parts(self) -> tuple[str, ...]:
         if not self.parts:
@@ -134,6 +130,12 @@ class LinkReport:
             f"{len(self.unlinked_photos)} photos show nothing that a video shows, and are "
             f"connected to none: {names}{more}",
         )
+
+
+def gap_in_video(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> tuple[str, int, int]:
+    """The frames of a gap counted in their own video, after its name; '' where there is one."""
+    name, first = next((v for v in reversed(videos) if v[1] <= gap[0]), ("", 0))
+    return name, gap[0] - first, gap[1] - first
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     image_of_frame[chosen] = np.arange(chosen.size)
     image = image_of_frame[tracks.frame]
     num_tracks = tracks.offsets.size - 1
-    track = np.repeat(np.arange(num_tracks, dtype=np.int64), np.diff(tracks.offsets))
+    track = tracks.track
     seen = image >= 0
     often_enough = np.bincount(track[seen], minlength=num_tracks) >= 2
     kept = np.flatnonzero(seen & often_enough[track])

@@ -8,7 +8,6 @@ matchers mean the same.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ from colmap_av1.matching.two_view_models import (
 from colmap_av1.options import RunOptions, VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.digests import seed_of
 
 _Floats = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def verify_pairs(
         found = views.get(image)
         if found is None:
             # Where two threads make it at a time, both make the same.
-            seed = _seed(run.seed, image)
+            seed = seed_of(run.seed, image)
             found = views[image] = _view(keypoints[image], cameras[image], seed)
         return found
 
@@ -101,7 +101,7 @@ def verify_pairs(
         found = []
         for index in some:
             i, j = pairs[index].tolist()
-            search = Search(options, _seed(run.seed, i, j))
+            search = Search(options, seed_of(run.seed, i, j))
             found.append(_verify_pair(view(i), view(j), matches[index], search))
         return found
 
@@ -226,10 +226,6 @@ def _verify_pair(
 
 def _degenerate() -> TwoViewGeometry:
     return TwoViewGeometry(TwoViewConfig.DEGENERATE, np.empty((0, 2), dtype=np.uint32))
-
-
-def _seed(*words: int) -> int:
-    return zlib.crc32(repr(words).encode())
 
 
 def _verify_calibrated(

@@ -257,7 +257,7 @@ def _images_of_long_video(
     every = ChosenImages(image_names(name, frames.tolist()), frames)
     tracks = pose_tracks(run, tracks)
     key = _key_images_of_video(run, tracks, every, inter_share)
-    return some_images(every, spread_images(tracks, run.options.max_images, key))
+    return every.some(spread_images(tracks, run.options.max_images, key))
 
 
 def _key_images_of_video(
@@ -272,13 +272,6 @@ def _key_images_of_video(
         spacing=mapping.pose_spacing,
         num_cells=mapping.pose_tracks_per_image,
     )
-
-
-def some_images(
-    chosen: ChosenImages, index: Sequence[int] | NDArray[np.integer[Any]]
-) -> ChosenImages:
-    """Some of the images, by their index."""
-    return ChosenImages([chosen.names[i] for i in index], chosen.frames[np.asarray(index)])
 
 
 def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from colmap_av1.model.colmap_model import camera_centres
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.digests import seed_of
 
 _Floats = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def sightings_of(
         frames: int32 [num_images] frames whose poses are asked for, ascending.
         camera: their pycolmap.Camera.
     """
-    number = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    number = tracks.track
     known = np.zeros(tracks.num_frames, dtype=np.bool_)
     known[seen.frame] = True
     in_seen = np.unique(number[known[tracks.frame]])
@@ -105,7 +105,7 @@ def resect(
     def work(image: int) -> _Floats | None:
         own = slice(int(sightings.bounds[image]), int(sightings.bounds[image + 1]))
         rays, xyz = sightings.rays[own], sightings.xyz[own]
-        return _resect_one(rays * focal, xyz, guesses[image], camera, seed=_seed(seed, image))
+        return _resect_one(rays * focal, xyz, guesses[image], camera, seed=seed_of(seed, image))
 
     found: list[_Floats | None] = []
     with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
@@ -163,7 +163,3 @@ def interpolate_poses(
     centre = np.column_stack([np.interp(at, frames, along) for along in centres.T])
     translation = -np.einsum("nij,nj->ni", rotation, centre)
     return np.concatenate([rotation, translation[:, :, None]], axis=2)
-
-
-def _seed(*words: int) -> int:
-    return zlib.crc32(repr(words).encode())

@@ -150,7 +150,6 @@ class RefinedTracks:
     def start(cls, tracks: Tracks, options: RefineOptions) -> RefinedTracks:
         """What is known before the first frame."""
         num_observations = len(tracks.frame)
-        num_tracks = len(tracks.offsets) - 1
         is_first = np.zeros(num_observations, dtype=np.bool_)
         is_first[tracks.offsets[:-1]] = True
         is_last = np.zeros(num_observations, dtype=np.bool_)
@@ -163,7 +162,7 @@ class RefinedTracks:
         return cls(
             tracks=tracks,
             options=options,
-            track=np.repeat(np.arange(num_tracks), np.diff(tracks.offsets)),
+            track=tracks.track,
             is_first=is_first,
             is_last=is_last,
             step=np.diff(tracks.xy, axis=0, prepend=np.zeros((1, 2), np.float32)),

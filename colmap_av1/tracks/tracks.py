@@ -51,6 +51,11 @@ class Tracks:
     sigma: NDArray[np.float32]
     confirmed: NDArray[np.bool_]
 
+    @property
+    def track(self) -> NDArray[np.int64]:
+        """Int64 [num_observations] the track of each observation."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+
 
 @checks_arguments
 def build_tracks(

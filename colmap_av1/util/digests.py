@@ -8,6 +8,7 @@ import hashlib
 import os
 import stat
 import time
+import zlib
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -160,3 +161,8 @@ def _spell(value: Any, left_out: frozenset[str]) -> str:
     if value is None or type(value) in (bool, int, float, str):
         return repr(value)
     raise TypeError(f"{value!r}: give a plain value")
+
+
+def seed_of(*words: int) -> int:
+    """A seed of random numbers for one of many searches, that others have no part in."""
+    return zlib.crc32(repr(words).encode())

@@ -36,17 +36,5 @@ def ending_in_order() -> Iterator[None]:
             signal.signal(number, old)
 
 
-@contextmanager
-def handlers_kept() -> Iterator[None]:
-    """Undo what the body does to the handlers of signals that end a process."""
-    before = {number: signal.getsignal(number) for number in ENDING}
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
 def _unwind(number: int, _: types.FrameType | None) -> NoReturn:
     raise SystemExit(128 + number)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -49,6 +50,18 @@ def held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def handlers_kept() -> Iterator[None]:
+    """Undo what the body does to the handlers of signals that end a process."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
 def let_through() -> None:
     """Take the signals that the process which started this one held back."""
     if hasattr(signal, "pthread_sigmask"):
@@ -60,13 +73,9 @@ def import_pycolmap() -> None:
 
     That one prints a stack trace of C++, and may hang.
     """
-    before = {number: signal.getsignal(number) for number in ENDING}
-    with held_back():
+    with held_back(), handlers_kept():
         import numpy as np  # noqa: F401, PLC0415 - before pycolmap
         import pycolmap  # noqa: F401, PLC0415
-
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def open_closed_streams() -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from colmap_av1.errors import ColmapAv1Error, EvaluationError
+from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.processes import bind
 from colmap_av1.util.start import held_back, let_through
 
@@ -107,12 +108,10 @@ def _call(
         os.dup2(file.fileno(), 2)
     let_through()
     outcome: Measured[Any] | ColmapAv1Error | str
-    start, cpu = time.perf_counter(), _cpu_seconds()
+    start, cpu = time.perf_counter(), cpu_seconds()
     try:
         result = function(*args)
-        outcome = Measured(
-            result, time.perf_counter() - start, _cpu_seconds() - cpu, _peak_memory()
-        )
+        outcome = Measured(result, time.perf_counter() - start, cpu_seconds() - cpu, _peak_memory())
     except ColmapAv1Error as error:
         outcome = error
     except Exception as error:
@@ -120,11 +119,6 @@ def _call(
         outcome = f"{type(error).__name__}: {error}"
     sender.send(outcome)
     sender.close()
-
-
-def _cpu_seconds() -> float:
-    spent = os.times()
-    return spent.user + spent.system + spent.children_user + spent.children_system
 
 
 def _peak_memory() -> int | None:

@@ -32,7 +32,7 @@ def pairs_at_span(
         int64 [n, 2] rows of `tracks.frame` and `tracks.xy`, the earlier frame first, in the
         tracks' order.
     """
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    track = tracks.track
     # Tracks are sorted by frame, so these keys ascend.
     key = track * (tracks.num_frames + span) + tracks.frame
     first = np.flatnonzero(tracks.frame + span < tracks.num_frames)

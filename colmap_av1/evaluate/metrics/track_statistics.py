@@ -48,7 +48,7 @@ def track_statistics(tracks: Tracks, frames: NDArray[np.integer] | None = None) 
     images = np.arange(tracks.num_frames) if frames is None else np.unique(frames)
     is_image = np.zeros(tracks.num_frames, dtype=bool)
     is_image[images] = True
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    track = tracks.track
     seen = is_image[tracks.frame]
     length = np.bincount(track[seen], minlength=len(tracks.offsets) - 1)
     # What a single image sees is no track.
