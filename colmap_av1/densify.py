@@ -16,7 +16,8 @@ from colmap_av1.errors import ImageError, ModelError, cannot_write
 from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import size_of_images
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
-from colmap_av1.images.takes import Pictures, count_through, pictures_of
+from colmap_av1.images.masks import VideoMasks
+from colmap_av1.images.takes import Pictures, pictures_of
 from colmap_av1.model.colmap_model import (
     MODEL_FILES,
     ModelImage,
@@ -25,7 +26,7 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model
+from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model, views_of
 from colmap_av1.model.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
@@ -42,7 +43,13 @@ from colmap_av1.model.track_points import (
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensifyOptions, MatchOptions
-from colmap_av1.tracks.tracks import Tracks, keep_frames, scale_tracks, tracks_in_a_row
+from colmap_av1.tracks.tracks import (
+    Tracks,
+    keep_frames,
+    least_length,
+    scale_tracks,
+    tracks_in_a_row,
+)
 from colmap_av1.tracks.video_tracks import (
     VideoSource,
     decoded_pictures,
@@ -67,6 +74,7 @@ class DensifyReport:
         model: the model whose poses it has.
         conversion: how the video was converted, in words; None where it is AV1.
         num_images: images of the model.
+        masked: share of the images' pixels that masks leave out; None without masks.
         num_tracks: tracks of the video that its images see often enough.
         agreeing: share of these that agree with the poses.
         num_points: 3D points.
@@ -83,6 +91,7 @@ class DensifyReport:
     model: Path
     conversion: str | None
     num_images: int
+    masked: float | None
     num_tracks: int
     agreeing: float
     num_points: int
@@ -97,12 +106,13 @@ class DensifyReport:
 
 @dataclass(frozen=True)
 class _VideoImages:
-    """A video, the model's images of it by their names in a folder, and their (width, height)."""
+    """A video, the model's images of it by their names in a folder, their size and masks."""
 
     video: Video
     names: list[str]
     folder: Path | None
     size: tuple[int, int]
+    masks: VideoMasks | None
 
 
 @dataclass(frozen=True)
@@ -160,7 +170,7 @@ def densify(
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
-    read = [model, *paths_of(video), photos, folder, options.match.images.frame_list]
+    read = [model, *paths_of(video), photos, folder, *options.match.files]
     _check_outputs(output, gaussians, read, overwrite=overwrite)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
@@ -173,14 +183,13 @@ def densify(
         track = partial(_track, output=output, options=options, clock=clock, progress=progress)
         tracked = [track(own) for own in of_videos]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
-        takes = count_through(
-            inputs.labels,
+        takes = inputs.takes(
             [own.chosen for own in tracked],
             [own.tracks.num_frames for own in tracked],
-            [photo.name for photo in photos_there],
+            photos_there,
         )
         images = [posed[name] for name in takes.images.names]
-        views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+        views = views_of(images, cameras, takes.masks)
         files = [(own, None) for own in inputs.videos]
         pictures = pictures_of(takes, files, [p.path for p in photos_there], options.match)
         row = tracks_in_a_row([own.tracks for own in tracked], takes.num_frames)
@@ -204,6 +213,7 @@ def densify(
         model=model,
         conversion=inputs.conversion([own.conversion for own in tracked]),
         num_images=len(images),
+        masked=takes.masked,
         num_tracks=points.num_tracks,
         agreeing=agreeing,
         num_points=len(cloud.xyz),
@@ -234,7 +244,11 @@ def _track(
         found = track_video(source, matching, one_size=True, clock=clock, progress=progress)
         with clock.measure("choice"):
             chosen = _choose(found.tracks, source, images.names, images.folder, options.match)
-    tracks = keep_frames(scale_tracks(found.tracks, images.size), chosen.frames)
+    tracks = scale_tracks(found.tracks, images.size)
+    if images.masks is not None:
+        least = least_length(matching.tracks)
+        tracks = images.masks.on_tracks(tracks, chosen, least)
+    tracks = keep_frames(tracks, chosen.frames)
     return _TrackedImages(tracks, chosen, source.conversion, found.warnings)
 
 
@@ -392,11 +406,16 @@ def _images_of_videos(
             )
         of_label[label][own] = sizes[name]
     found = []
-    for video, (label, listed) in zip(inputs.videos, of_label.items(), strict=True):
+    given = zip(inputs.videos, of_label.items(), inputs.masks_of_videos, strict=True)
+    for video, (label, listed), masks in given:
         if not listed:
             raise ModelError(f"{model}: has no image of {video}: leave that video out")
         own_folder = folder / label if folder is not None else None
-        found.append(_images_of_video(model, video, listed, own_folder, options))
+        images = _images_of_video(model, video, listed, own_folder, options)
+        if masks is not None:
+            sizes_of_masks = [images.size, video.picture_size]
+            masks.check(sizes_of_masks, images.names, options.match.images)
+        found.append(replace(images, masks=masks))
     return found
 
 
@@ -420,4 +439,4 @@ def _images_of_video(
     missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
     if missing is not None:
         raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
-    return _VideoImages(video, list(sizes), folder, size)
+    return _VideoImages(video, list(sizes), folder, size, None)

@@ -19,7 +19,7 @@ from colmap_av1.images.camera import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
-from colmap_av1.images.takes import Takes, count_through, pictures_of
+from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     PairedImages,
@@ -57,6 +57,7 @@ class MatchReport:
         num_coded_frames: frames with block data, hidden ones included.
         num_images: images of the database.
         num_written_images: image files written; others were there or not asked for.
+        masked: share of the images' pixels that masks leave out; None without masks.
         num_tracks: tracks in the videos.
         track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
             to 1 (longest); empty without a track.
@@ -86,6 +87,7 @@ class MatchReport:
     num_coded_frames: int
     num_images: int
     num_written_images: int
+    masked: float | None
     num_tracks: int
     track_lengths: dict[float, int]
     num_observations: int
@@ -219,6 +221,7 @@ def match(
         num_frames=sum(own.tracks.num_frames for own in videos),
         num_coded_frames=sum(own.tracked.num_coded_frames for own in videos),
         num_written_images=num_written,
+        masked=images.takes.masked,
         focal_length=cameras.focal_length,
         seconds=clock.seconds,
         links=linked.report,
@@ -259,6 +262,7 @@ def _prepare(
             prepare_images(
                 *(video, folder / label if folder is not None else None, options),
                 listed=existing,
+                masks=masks,
                 beside=beside,
                 clock=clock,
                 progress=progress,
@@ -266,14 +270,11 @@ def _prepare(
             options,
             clock,
         )
-        for video, label, existing in zip(inputs.videos, inputs.labels, listed, strict=True)
+        for video, label, masks, existing in zip(
+            inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True
+        )
     ]
-    takes = count_through(
-        inputs.labels,
-        [own.chosen for own in videos],
-        [own.tracks.num_frames for own in videos],
-        [photo.name for photo in inputs.photos],
-    )
+    takes = inputs.takes([own.chosen for own in videos], [own.tracks.num_frames for own in videos])
     return _Images(inputs, videos, takes)
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.inputs import paths_of, read_inputs
+from colmap_av1.images.names import names_of_all
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.images.takes import count_through
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -39,6 +39,7 @@ from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
+from colmap_av1.video.facts import count_shown
 from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
@@ -56,6 +57,7 @@ class ReconstructReport:
         database: COLMAP database of the tracks that the poses come from.
         num_frames: shown frames of the videos.
         num_images: frames chosen as images, and photos.
+        masked: share of the images' pixels that masks leave out; None without masks.
         num_key_images: those of them that were mapped; the others are placed between them.
         num_registered: images with a pose; only these are written.
         registered: those of each of several videos, by its name.
@@ -85,6 +87,7 @@ class ReconstructReport:
     database: Path
     num_frames: int
     num_images: int
+    masked: float | None
     num_key_images: int
     num_registered: int
     registered: dict[str, int]
@@ -151,13 +154,19 @@ def reconstruct(
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()
-    check_folder(output, [*paths_of(video), photos, options.match.images.frame_list])
+    check_folder(output, [*paths_of(video), photos, *options.match.files])
     inputs = read_inputs(video, photos, options.match, flat=True)
     # What can be refused is refused before the long work.
-    checked = [*(own.path for own in inputs.videos), options.match.images.frame_list]
+    checked = [*(own.path for own in inputs.videos), *options.match.files]
     check_gaussians_path(gaussians, checked, overwrite=overwrite)
-    for own in inputs.videos:
+    for own, masks in zip(inputs.videos, inputs.masks_of_videos, strict=True):
         check_fit(options.match, own.picture_size, own.display.pixel_aspect)
+        if masks is not None:
+            count = count_shown(own)
+            names = (
+                names_of_all(options.match.images, count) if count <= options.max_images else None
+            )
+            masks.check([own.picture_size], names, options.match.images)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
         sources = tuple(
             opened.enter_context(
@@ -189,11 +198,8 @@ def _run_stages(run: Run) -> ReconstructReport:
     numbers = range(len(run.sources))
     tracked = [track_stage(run, video) for video in numbers]
     videos = [read_tracks(run, video) for video in numbers]
-    takes = count_through(
-        run.inputs.labels,
-        [own.chosen for own in videos],
-        [own.tracks.num_frames for own in videos],
-        [photo.name for photo in run.inputs.photos],
+    takes = run.inputs.takes(
+        [own.chosen for own in videos], [own.tracks.num_frames for own in videos]
     )
     matched = match_stage(run, videos, takes, tracked)
     links, broken = read_links(run.stages)
@@ -209,7 +215,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         kept["adjustment"] = posed = adjustment_stage(run, tracks, links, takes, posed)
     kept["model"] = model_stage(run, join_tracks(tracks, links), takes, posed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
-    facts["num_images"] = len(takes.take)
+    facts |= {"num_images": len(takes.take), "masked": takes.masked}
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
     notes = [
         *run.inputs.warnings,

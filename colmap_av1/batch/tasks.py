@@ -88,8 +88,10 @@ def depends_on(work: Work) -> list[Any]:
         OSError: a file that options name cannot be read.
     """
     matching = matching_of(work.options)
-    listed = digest_if_there(matching.images.frame_list) if matching is not None else None
-    return [work.task, work.options, listed, work.write_images]
+    if matching is None:
+        return [work.task, work.options, None, work.write_images]
+    files = digest_if_there(matching.images.frame_list), digest_if_there(matching.masks.mask_path)
+    return [work.task, work.options, files, work.write_images]
 
 
 def write_thumbnail(video: Path, folder: Path) -> None:

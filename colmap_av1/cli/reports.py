@@ -44,6 +44,7 @@ def match_rows(report: MatchReport) -> Rows:
         *_conversion_row(report.conversion),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
+        *_mask_row(report.masked),
         ("tracks", str(report.num_tracks)),
         ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
         (
@@ -91,6 +92,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
             f"{report.num_registered} of {report.num_images} with a pose, {report.num_frames} "
             "frames in the video",
         ),
+        *_mask_row(report.masked),
         *((f"images of {name}", f"{n} with a pose") for name, n in report.registered.items()),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
@@ -131,6 +133,10 @@ def _conversion_row(conversion: str | None) -> Rows:
     return [] if conversion is None else [("converted", conversion)]
 
 
+def _mask_row(masked: float | None) -> Rows:
+    return [] if masked is None else [("masks", f"{masked:.1%} of the images are left out")]
+
+
 def _link_rows(
     *,
     num_images: int,
@@ -164,6 +170,7 @@ def densify_rows(report: DensifyReport) -> Rows:
         ("output", str(report.output)),
         *_conversion_row(report.conversion),
         ("images", str(report.num_images)),
+        *_mask_row(report.masked),
         ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
         ("points", f"{report.num_points}, the model had {report.num_model_points}"),
         (

@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.masks import Mask, Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
+from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import MatchOptions
 from colmap_av1.util.digests import file_digest
-from colmap_av1.video.facts import Video, read_video
+from colmap_av1.video.facts import Video, count_shown, read_video
 from colmap_av1.video.unchanged import FileState
 
 _Path = str | os.PathLike[str]
@@ -29,12 +32,14 @@ class Inputs:
         videos: the videos, in the order in which they were given.
         labels: folder of each video's images among all images; '' of a lone one.
         photos: the photos.
+        masks: what of their pictures counts; None: all does.
         warnings: what the user should know of them.
     """
 
     videos: tuple[Video, ...]
     labels: tuple[str, ...]
     photos: tuple[Photo, ...] = ()
+    masks: Masks | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -46,6 +51,44 @@ class Inputs:
     def no_motion(self) -> NDArray[np.float32]:
         """Shares of inter units of the photos, which have none."""
         return np.zeros(len(self.photos), np.float32)
+
+    @property
+    def masks_of_videos(self) -> list[VideoMasks | None]:
+        """The masks of each video; None where it has none."""
+        return [self.masks.of_video(label) if self.masks else None for label in self.labels]
+
+    def takes(
+        self,
+        chosen: Sequence[ChosenImages],
+        num_frames: Sequence[int],
+        photos: Sequence[Photo] | None = None,
+    ) -> Takes:
+        """The images counted through, with their masks.
+
+        Args:
+            chosen: the images of each video.
+            num_frames: number of frames of each.
+            photos: those of the photos that are images; None: all.
+
+        Raises:
+            ImageError: some images of a video have a mask, and others have none.
+        """
+        photos = photos if photos is not None else self.photos
+        masks = self._masks_of_images(chosen, photos)
+        names = [photo.name for photo in photos]
+        return count_through(self.labels, chosen, num_frames, names, masks=masks)
+
+    def _masks_of_images(
+        self, chosen: Sequence[ChosenImages], photos: Sequence[Photo]
+    ) -> list[list[Mask | None]]:
+        """The masks of the images of each video, then those of photos; None where one has none."""
+        if self.masks is None:
+            return []
+        of_videos: list[list[Mask | None]] = [
+            list[Mask | None](masks.of(own)) if masks is not None else [None] * len(own.names)
+            for own, masks in zip(chosen, self.masks_of_videos, strict=True)
+        ]
+        return [*of_videos, [self.masks.of_photo(photo.name, photo.size) for photo in photos]]
 
     def with_names(self, of_videos: Sequence[Sequence[str]]) -> list[str]:
         """What is to be said of each video, with its name where there are several."""
@@ -91,7 +134,7 @@ def read_inputs(
     Raises:
         VideoError: a video cannot be read, or is given twice.
         BitstreamError: no frame of a video can be decoded.
-        ImageError: the photos cannot be read.
+        ImageError: the photos or masks cannot be read, or do not fit.
         OptionError: an option does not fit.
     """
     paths = paths_of(video)
@@ -108,12 +151,16 @@ def read_inputs(
     labels = labels_of(places)
     found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
     _check_one_camera(videos, found, options)
-    return Inputs(
-        videos,
-        tuple(labels[: len(videos)]) if len(videos) > 1 else ("",),
-        tuple(found),
-        (warning,) if warning is not None else (),
-    )
+    of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
+    notes = (warning,) if warning is not None else ()
+    inputs = Inputs(videos, of_videos, tuple(found), None, notes)
+    if options.masks.mask_path is None:
+        return inputs
+    counts = [count_shown(video) for video in videos]
+    masks = read_masks(Path(options.masks.mask_path), of_videos, counts)
+    for photo in found:
+        masks.of_photo(photo.name, photo.size)  # which is refused where it does not fit
+    return replace(inputs, masks=masks)
 
 
 def labels_of(places: Sequence[str]) -> list[str]:

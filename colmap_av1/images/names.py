@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
-from colmap_av1.options.images import check_extension, check_image_pattern
+from colmap_av1.options.images import ImageOptions, check_extension, check_image_pattern
 
 _MOST_DIGITS = 255
 WRITE_PARAMETERS = {
@@ -33,6 +33,11 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
     """
     check_image_pattern(pattern)
     return [pattern % frame for frame in frames]
+
+
+def names_of_all(options: ImageOptions, num_frames: int) -> list[str] | None:
+    """Names of new images where every frame becomes one; None where an option chooses."""
+    return None if options.ways else image_names(options.image_name, range(num_frames))
 
 
 def frames_of_images(

@@ -21,9 +21,11 @@ from colmap_av1.images.files import (
     size_of_images,
     write_images,
 )
+from colmap_av1.images.masks import VideoMasks
+from colmap_av1.images.names import names_of_all
 from colmap_av1.images.recognising import check_content, is_turned_back
 from colmap_av1.options import MatchOptions
-from colmap_av1.tracks.tracks import Tracks, scale_tracks, show_tracks
+from colmap_av1.tracks.tracks import Tracks, least_length, scale_tracks, show_tracks
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
@@ -36,7 +38,7 @@ from colmap_av1.tracks.video_tracks import (
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display, shown_size, turned_back
-from colmap_av1.video.facts import Video
+from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
 
 _Image = NDArray[np.uint8]
@@ -113,6 +115,7 @@ def prepare_images(
     options: MatchOptions,
     *,
     listed: Mapping[str, tuple[int, int]],
+    masks: VideoMasks | None = None,
     beside: Path,
     clock: Clock,
     progress: Progress,
@@ -124,6 +127,7 @@ def prepare_images(
         folder: folder of the images, which may exist; None: none are wanted.
         options: all but those of density, pairs and verification are used.
         listed: (width, height) of images that a database lists, by name.
+        masks: what of the pictures counts; None: all.
         beside: the file that is being made, see `open_source`.
         clock: gets the stages up to "choice".
         progress: called in these stages.
@@ -131,7 +135,7 @@ def prepare_images(
     Raises:
         VideoError: the video cannot be read.
         BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: images or names do not fit the video.
+        ImageError: images, names or masks do not fit the video.
         OptionError: an option does not fit the video or its images.
     """
     # What can be refused is refused before the long work.
@@ -142,6 +146,9 @@ def prepare_images(
         check_image_folder(folder, existing or options.images.image_name, size)
         if size != fit.video_size:
             check_images_there(folder, existing)
+    if masks is not None:
+        names = existing or names_of_all(options.images, count_shown(video))
+        masks.check([size, fit.video_size], names, options.images)
 
     with (
         open_source(video, options, beside=beside, clock=clock, progress=progress) as source,
@@ -150,7 +157,7 @@ def prepare_images(
         tracked = track_video(
             source, options, one_size=folder is not None, clock=clock, progress=progress
         )
-        tracks = _tracks_as_shown(tracked.tracks, source, fit)
+        tracks = _tracks_that_count(tracked.tracks, source, fit, masks, options)
 
         def decode() -> Iterator[tuple[int, _Image]]:
             pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
@@ -171,7 +178,11 @@ def prepare_images(
             tracked, source, chosen.frames, options, clock=clock, progress=progress
         )
         if refined is not tracked:
-            tracked, tracks = refined, _tracks_as_shown(refined.tracks, source, fit)
+            tracked = refined
+            tracks = _tracks_that_count(tracked.tracks, source, fit, masks, options)
+    if masks is not None:
+        tracks = masks.on_images(tracks, chosen, least_length(options.tracks))
+        tracked = replace(tracked, inter_share=masks.on_motion(tracked.inter_share))
     if folder is not None:
         check_image_folder(folder, chosen.names, size)
         kept = zip(chosen.names, chosen.frames.tolist(), strict=True)
@@ -208,6 +219,18 @@ def _fit(
         video_size = shown_size(video_size, back)
     size = size_of_images(existing, video_size, display.pixel_aspect)
     return _Fit(existing, display, back, video_size, size)
+
+
+def _tracks_that_count(
+    tracks: Tracks,
+    source: VideoSource,
+    fit: _Fit,
+    masks: VideoMasks | None,
+    options: MatchOptions,
+) -> Tracks:
+    """The tracks as the images show the video, where masks of frames leave them."""
+    shown = _tracks_as_shown(tracks, source, fit)
+    return shown if masks is None else masks.on_frames(shown, least_length(options.tracks))
 
 
 def _tracks_as_shown(tracks: Tracks, source: VideoSource, fit: _Fit) -> Tracks:

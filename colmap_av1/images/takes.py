@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
+from colmap_av1.images.masks import Mask
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.video.display import Display
@@ -32,12 +33,14 @@ class Takes:
         images: the images, with their names among all images and frames counted through.
         take: int32 [num_images] the take of each image, ascending.
         first_frame: int64 [num_takes + 1] frame at which each take begins, and their number.
+        masks: of each image, which of its pixels count; None: all.
     """
 
     videos: tuple[str, ...]
     images: ChosenImages
     take: NDArray[np.int32]
     first_frame: NDArray[np.int64]
+    masks: tuple[Mask | None, ...]
 
     @property
     def num_frames(self) -> int:
@@ -49,6 +52,13 @@ class Takes:
         """Number of videos and photos."""
         return len(self.first_frame) - 1
 
+    @property
+    def masked(self) -> float | None:
+        """Share of the images' pixels that masks leave out; None without masks."""
+        if all(mask is None for mask in self.masks):
+            return None
+        return 1.0 - sum(m.share if m is not None else 1.0 for m in self.masks) / len(self.masks)
+
     def images_of(self, take: int) -> range:
         """The images of a take."""
         first, last = np.searchsorted(self.take, [take, take + 1])
@@ -57,7 +67,9 @@ class Takes:
     def some(self, index: Sequence[int] | NDArray[np.int64]) -> Takes:
         """Some of the images, by their index, ascending."""
         chosen = np.asarray(index, dtype=np.int64)
-        return replace(self, images=self.images.some(index), take=self.take[chosen])
+        masks = tuple(self.masks[i] for i in chosen)
+        taken = self.take[chosen]
+        return replace(self, images=self.images.some(index), take=taken, masks=masks)
 
     def of_video(self, video: int) -> ChosenImages:
         """The images of a video, at the frames of its own."""
@@ -72,6 +84,8 @@ def count_through(
     chosen: Sequence[ChosenImages],
     num_frames: Sequence[int],
     photos: Sequence[str] = (),
+    *,
+    masks: Sequence[Sequence[Mask | None]] = (),
 ) -> Takes:
     """Count the images of videos and photos through.
 
@@ -80,6 +94,7 @@ def count_through(
         chosen: the images of each video, by their names in its folder.
         num_frames: number of frames of each video.
         photos: names of the photos among all images.
+        masks: those of the images of each video, then those of the photos; empty: there are none.
     """
     first = np.concatenate([[0], np.cumsum([*num_frames, *(1 for _ in photos)])]).astype(np.int64)
     names = [
@@ -89,6 +104,7 @@ def count_through(
     ]
     frames = [own.frames + first[video] for video, own in enumerate(chosen)]
     counts = [*(len(own.names) for own in chosen), *(1 for _ in photos)]
+    found = [mask for own in masks for mask in own]
     return Takes(
         tuple(videos),
         ChosenImages(
@@ -97,6 +113,7 @@ def count_through(
         ),
         np.repeat(np.arange(len(counts), dtype=np.int32), counts),
         first,
+        tuple(found or [None] * sum(counts)),
     )
 
 

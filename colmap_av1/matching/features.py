@@ -10,6 +10,8 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.images.masks import Mask
+
 # Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from
 # far apart share; with it there are several times as many.
 _FIRST_OCTAVE = {"light": 0, "full": -1}
@@ -59,6 +61,14 @@ class FeatureExtractor:
         descriptors = np.asarray(found.data, dtype=np.float32).reshape(-1, _NUM_DIMENSIONS)
         length = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(xy, descriptors / np.maximum(length, 1e-6))
+
+
+def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask | None) -> Features:
+    """The features of a picture on pixels of it that count; None: all do."""
+    if mask is None:
+        return features
+    kept = mask.keeps(features.xy, picture.shape[1::-1])
+    return Features(features.xy[kept], features.descriptors[kept])
 
 
 def match_features(a: Features, b: Features) -> NDArray[np.uint32]:

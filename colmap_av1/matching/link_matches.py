@@ -9,8 +9,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Pictures
-from colmap_av1.matching.features import FeatureExtractor, Features, match_features
+from colmap_av1.matching.features import (
+    FeatureExtractor,
+    Features,
+    masked_features,
+    match_features,
+)
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewGeometry
@@ -55,16 +61,17 @@ def extract_features(
     wanted: list[int],
     pictures: Pictures,
     cameras: Sequence[Any],
+    masks: Sequence[Mask | None],
     options: LinkOptions,
     *,
     effort: Literal["light", "full"],
     progress: Progress,
 ) -> dict[int, Features]:
-    """Features of the pictures of images, in pixels of the images."""
+    """Features of the pictures of images where masks leave them, in pixels of the images."""
     extractor = FeatureExtractor(options.max_link_features, effort)
     found: dict[int, Features] = {}
     for image, picture in pictures(wanted):
-        features = extractor.extract(picture)
+        features = masked_features(extractor.extract(picture), picture, masks[image])
         width, height = int(cameras[image].width), int(cameras[image].height)
         scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
         found[image] = replace(features, xy=features.xy * scale)

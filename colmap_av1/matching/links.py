@@ -232,7 +232,9 @@ def _link(
     """Link the images of a plan, see `link_images`."""
     gaps = plan.gaps
     features = extract_features(
-        plan.wanted, pictures, cameras, options.links, effort=plan.effort, progress=progress
+        *(plan.wanted, pictures, cameras, takes.masks, options.links),
+        effort=plan.effort,
+        progress=progress,
     )
 
     def matched_pairs(pairs: set[tuple[int, int]]) -> Links:

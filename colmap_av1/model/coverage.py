@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import posed_images
+from colmap_av1.images.masks import Mask
+from colmap_av1.model.colmap_model import ModelImage, posed_images
 
 _Floats = NDArray[np.float64]
 
@@ -34,10 +35,12 @@ class PosedCamera:
     Attributes:
         camera: its pycolmap.Camera.
         cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
+        mask: which pixels of the image count; None: all.
     """
 
     camera: Any
     cam_from_world: _Floats
+    mask: Mask | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -48,6 +51,22 @@ class PosedCamera:
     def centre(self) -> _Floats:
         """Float64 [3] place of the camera in the world."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
+
+    @property
+    def counting_cells(self) -> NDArray[np.bool_]:
+        """Bool [rows, columns] the cells of the image that have pixels which count."""
+        width, height = self.size
+        rows, columns = -(-height // CELL), -(-width // CELL)
+        if self.mask is None:
+            return np.ones((rows, columns), dtype=np.bool_)
+        own = [(np.arange(n) + 0.5) * m / n for n, m in zip(self.size, self.mask.size, strict=True)]
+        kept = np.zeros((rows * CELL, columns * CELL), dtype=np.bool_)
+        kept[:height, :width] = self.mask.kept[np.ix_(own[1].astype(int), own[0].astype(int))]
+        return np.asarray(kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
+
+    def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
+        """Whether pixels [n, 2] of the image count."""
+        return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
 
     def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
         """The points that lie in the picture.
@@ -83,6 +102,16 @@ class PosedCamera:
         return index, xy, depth
 
 
+def views_of(
+    images: Sequence[ModelImage], cameras: Mapping[int, Any], masks: Sequence[Mask | None]
+) -> list[PosedCamera]:
+    """The cameras where images were taken, by the cameras' ids, and what of them counts."""
+    return [
+        PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
+        for image, mask in zip(images, masks, strict=True)
+    ]
+
+
 def evenly_spread(count: int, most: int) -> list[int]:
     """Indices from 0 to before `count`, evenly spread, `most` at most."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
@@ -91,8 +120,8 @@ def evenly_spread(count: int, most: int) -> list[int]:
 def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     """Share of the images' cells of 16x16 pixels that a visible point projects into.
 
-    A point that is seen through a gap in the surface before it does not count. Of long videos 64
-    images, evenly spread, are looked at.
+    A point that is seen through a gap in the surface before it does not count, nor do cells that
+    masks leave out. Of long videos 64 images, evenly spread, are looked at.
 
     Args:
         views: the images.
@@ -104,8 +133,9 @@ def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     filled = total = 0
     for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
         depth = without_gaps(nearest_depth(view, xyz))
-        filled += int(np.isfinite(depth).sum())
-        total += depth.size
+        cells = view.counting_cells
+        filled += int(np.isfinite(depth[cells]).sum())
+        total += int(cells.sum())
     return filled / max(total, 1)
 
 

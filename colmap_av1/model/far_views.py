@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.images.files import read_image
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import image_file, natural_order
-from colmap_av1.matching.features import FeatureExtractor, Features
+from colmap_av1.matching.features import FeatureExtractor, Features, masked_features
 from colmap_av1.matching.link_matches import match_pairs
 from colmap_av1.matching.two_view_models import epipolar_terms
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
@@ -107,10 +108,14 @@ class FarViewCheck:
         """Indices of the images whose pictures are needed, ascending."""
         return sorted(self._wanted)
 
-    def add(self, index: int, picture: _Image) -> None:
-        """Take the picture of an image: uint8 [height, width, 3], BGR, as its camera says."""
+    def add(self, index: int, picture: _Image, mask: Mask | None = None) -> None:
+        """Take the picture of an image: uint8 [height, width, 3], BGR, as its camera says.
+
+        `mask` says what of it counts.
+        """
         if index in self._wanted and self._extractor is not None:
-            self._features[index] = self._extractor.extract(picture)
+            features = self._extractor.extract(picture)
+            self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> FarViews:
         """What the pictures say; all that are needed have been added."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.colmap_model import ModelPoints, points_seen, write_model
-from colmap_av1.model.coverage import PosedCamera, coverage
+from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
 from colmap_av1.model.reconstruct_stages import Run
@@ -25,12 +26,20 @@ from colmap_av1.model.track_points import (
     seen_in,
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
-from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
+from colmap_av1.model.undistort import (
+    on_pinhole,
+    pinhole_camera,
+    undistorted_masks,
+    undistortion,
+)
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
 _Image = NDArray[np.uint8]
+
+# Folder of the masks, where there are any.
+_MASKS = "masks"
 
 
 @dataclass(frozen=True)
@@ -99,7 +108,7 @@ def _write_images(
         how = undistort[placed.images[index].camera_id]
         shown = how(picture) if how is not None else picture
         colours.add(index, shown)
-        far.add(index, shown)
+        far.add(index, shown, views[index].mask)
         return shown
 
     done = 0
@@ -132,15 +141,31 @@ def _write_images(
         return far.result(), replace(cloud, rgb=colours.rgb())
 
 
+def _write_masks(folder: Path, names: Sequence[str], views: Sequence[PosedCamera]) -> None:
+    """Write a mask for each image, white where there is none.
+
+    Trainers look for `masks/NAME.png` beside `images/NAME.jpg`, and so does COLMAP where images
+    are PNG.
+    """
+    for name, view in zip(names, views, strict=True):
+        width, height = view.size
+        kept = view.mask.kept if view.mask is not None else np.ones((height, width), np.bool_)
+        file = (folder / name).with_suffix(".png")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_image(file, np.where(kept, np.uint8(255), np.uint8(0)))
+
+
 def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
     """Triangulate all tracks and write the images and the model that trainers open."""
     options, clock = run.options, run.clock
+    masked = run.inputs.masks is not None
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
         cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
         images = placed.images
-        views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+        masks = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
+        views = views_of(images, cameras, masks)
         seen, view = seen_in(tracks, placed.frames)
         dense = _dense_cloud(run, placed, views, seen, view)
         points, cloud = dense.points, dense.cloud
@@ -150,6 +175,8 @@ def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
             write_model(folder, cameras, images, cloud)
+            if masked:
+                _write_masks(partial / _MASKS, [image.name for image in images], views)
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),
@@ -163,11 +190,15 @@ def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
         }
 
     given = (options.triangulate, options.match.images.image_name)
-    return run_stage(
+    kept = run_stage(
         run.stages,
         "model",
         [posed.digest, given],
         into=run.output,
-        products=["images", "sparse"],
+        products=["images", "sparse", *([_MASKS] if masked else [])],
         make=make,
     )
+    if not masked:
+        # Those of an earlier run are of other images.
+        shutil.rmtree(run.output / _MASKS, ignore_errors=True)
+    return kept

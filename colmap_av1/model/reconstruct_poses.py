@@ -14,6 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.colmap_model import (
     ModelImage,
@@ -280,6 +281,7 @@ class PosedImages:
         take: int32 [n] their takes.
         first_frame: frame at which each take begins, see `Takes`.
         cameras: their pycolmap.Cameras, by id.
+        masks: of each, which of its pixels count; None: all.
     """
 
     images: list[ModelImage]
@@ -287,6 +289,7 @@ class PosedImages:
     take: NDArray[np.int32]
     first_frame: NDArray[np.int64]
     cameras: dict[int, Any]
+    masks: tuple[Mask | None, ...]
 
     @property
     def camera_of_image(self) -> list[Any]:
@@ -303,8 +306,8 @@ def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
     found = [posed_by_name[names[i]] for i in index]
     cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
     images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
-    frames, take = takes.images.frames[index], takes.take[index]
-    return PosedImages(images, frames, take, takes.first_frame, cameras)
+    own = takes.some(index)
+    return PosedImages(images, own.images.frames, own.take, own.first_frame, cameras, own.masks)
 
 
 def triangulate_images(

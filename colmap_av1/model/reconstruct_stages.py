@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,11 +106,16 @@ def stage_of_video(run: Run, video: int) -> str:
 def track_stage(run: Run, video: int) -> Kept:
     """Chain the motion of a video into tracks and choose the frames that are images."""
     source, clock, progress = run.sources[video], run.clock, run.progress
+    masks = run.inputs.masks_of_videos[video]
     options = chaining_for_points(run.options.match, run.options.triangulate)
     name = stage_of_video(run, video)
 
     def make(partial: Path) -> dict[str, Any]:
         tracked = track_video(source, options, one_size=True, clock=clock, progress=progress)
+        if masks is not None:
+            left = masks.on_frames(tracked.tracks, least_length(options.tracks))
+            share = masks.on_motion(tracked.inter_share)
+            tracked = replace(tracked, tracks=left, inter_share=share)
         tracks = tracked.tracks
         with clock.measure("choice"):
             is_long = not options.images.ways and tracks.num_frames > run.options.max_images
@@ -128,16 +133,12 @@ def track_stage(run: Run, video: int) -> Kept:
         tracked = refine_in_images(
             tracked, source, chosen.frames, options, clock=clock, progress=progress
         )
+        if masks is not None:
+            left = masks.on_tracks(tracked.tracks, chosen, least_length(options.tracks))
+            tracked = replace(tracked, tracks=left)
         # Of a long video no other frame is of use from here on.
         tracks = keep_frames(tracked.tracks, chosen.frames) if is_long else tracked.tracks
-        if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
-            raise ImageError(
-                f"{len(chosen.names)} of {tracks.num_frames} frames become images: a model needs "
-                f"{LEAST_IMAGES} or more"
-            )
-        unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
-        if unfit is not None:
-            raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
+        _check_chosen(run, chosen, tracks.num_frames)
         with (partial / f"{name}.npz").open("wb") as file:
             # Names are kept by np.savez as they are.
             names = np.array(chosen.names)
@@ -154,14 +155,27 @@ def track_stage(run: Run, video: int) -> Kept:
     choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
     given = (options.images, choice, options.read, options.tracks, options.refine)
     listed = digest_if_there(options.images.frame_list)
+    masked = run.inputs.masks.digest if run.inputs.masks is not None else None
     return run_stage(
         run.stages,
         name,
-        [[file_digest(file.path) for file in source.files], given, listed],
+        [[file_digest(file.path) for file in source.files], given, listed, masked],
         into=run.stages,
         products=[f"{name}.npz"],
         make=make,
     )
+
+
+def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
+    """Refuse images of a video that are too few for a model, or have names unfit for trainers."""
+    if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
+        raise ImageError(
+            f"{len(chosen.names)} of {num_frames} frames become images: a model needs "
+            f"{LEAST_IMAGES} or more"
+        )
+    unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
+    if unfit is not None:
+        raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
 
 
 def read_tracks(run: Run, video: int) -> VideoTracks:

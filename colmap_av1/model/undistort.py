@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.images.camera import is_undistorted
+from colmap_av1.images.masks import Mask, make_mask
 
 _Image = NDArray[np.uint8]
 
@@ -78,7 +80,37 @@ def on_pinhole(camera: Any, pinhole: Any, xy: NDArray[np.float32]) -> NDArray[np
     return np.asarray(rays * (fx, fy) + (cx, cy))
 
 
-def undistortion(camera: Any, pinhole: Any) -> Callable[[_Image], _Image] | None:
+def undistorted_masks(
+    masks: Sequence[Mask | None], cameras: Sequence[Any], pinholes: Mapping[int, Any]
+) -> list[Mask | None]:
+    """The masks of images as their undistorted pictures have them, of the size of these.
+
+    Args:
+        masks: the mask of each image; None: it has none.
+        cameras: the camera of each.
+        pinholes: the undistorted camera of each camera, by its id.
+    """
+
+    @functools.cache
+    def undistort(mask: Mask, camera_id: int) -> Mask:
+        pinhole = pinholes[camera_id]
+        size = (int(pinhole.width), int(pinhole.height))
+        kept = mask.kept.astype(np.uint8)
+        if mask.size != size:
+            kept = cv2.resize(kept, size, interpolation=cv2.INTER_NEAREST)
+        change = undistortion(of_id[camera_id], pinhole, cv2.INTER_NEAREST)
+        return make_mask((change(kept) if change is not None else kept) > 0)
+
+    of_id = {int(camera.camera_id): camera for camera in cameras}
+    return [
+        undistort(mask, int(camera.camera_id)) if mask is not None else None
+        for mask, camera in zip(masks, cameras, strict=True)
+    ]
+
+
+def undistortion(
+    camera: Any, pinhole: Any, interpolation: int = cv2.INTER_CUBIC
+) -> Callable[[_Image], _Image] | None:
     """A function that undistorts pictures; None without distortion."""
     if is_undistorted(camera):
         return None
@@ -91,6 +123,6 @@ def undistortion(camera: Any, pinhole: Any) -> Callable[[_Image], _Image] | None
 
     def undistort(picture: _Image) -> _Image:
         edge = cv2.BORDER_REPLICATE
-        return np.asarray(cv2.remap(picture, at, None, cv2.INTER_CUBIC, borderMode=edge), np.uint8)
+        return np.asarray(cv2.remap(picture, at, None, interpolation, borderMode=edge), np.uint8)
 
     return undistort

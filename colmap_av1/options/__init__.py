@@ -9,7 +9,7 @@ from colmap_av1.options.commands import (
     ReconstructOptions,
 )
 from colmap_av1.options.compare import CompareOptions, LearnedOptions
-from colmap_av1.options.images import ImageOptions
+from colmap_av1.options.images import ImageOptions, MaskOptions
 from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.options.model import (
     ExportOptions,
@@ -37,6 +37,7 @@ __all__ = [
     "MapOptions",
     "Mapper",
     "MapperOptions",
+    "MaskOptions",
     "MatchOptions",
     "OnExisting",
     "PairOptions",

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from colmap_av1.errors import OptionError
 from colmap_av1.options.camera import CameraOptions
 from colmap_av1.options.fields import Options, option, part
-from colmap_av1.options.images import ImageOptions
+from colmap_av1.options.images import ImageOptions, MaskOptions
 from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.options.model import MapperOptions, TriangulateOptions
 from colmap_av1.options.run import RunOptions
@@ -26,6 +26,7 @@ class MatchOptions(Options):
     title: ClassVar[str] = "database and stream"
 
     images: ImageOptions = part(ImageOptions())
+    masks: MaskOptions = part(MaskOptions())
     encode: EncodeOptions = part(EncodeOptions())
     # Its threads are the run's where it has none of its own.
     read: ReadOptions = part(ReadOptions(), unused=("num_threads",))
@@ -51,6 +52,11 @@ class MatchOptions(Options):
     reencode: bool = option(
         False, "convert an AV1 video as well where its structure is poor for matching"
     )
+
+    @property
+    def files(self) -> tuple[str | os.PathLike[str] | None, ...]:
+        """The files and folders that are read beside videos and images; None: not given."""
+        return self.images.frame_list, self.masks.mask_path
 
     @property
     def reading(self) -> ReadOptions:

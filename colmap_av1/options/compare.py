@@ -56,7 +56,7 @@ class CompareOptions(Options):
 
     match: MatchOptions = part(
         MatchOptions(),
-        unused=("density", "on_existing", "refine.refine", "camera.single_camera"),
+        unused=("density", "masks", "on_existing", "refine.refine", "camera.single_camera"),
     )
     learned: LearnedOptions = part(LearnedOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())

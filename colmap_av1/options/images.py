@@ -77,6 +77,21 @@ class ImageOptions(Options):
         check_image_pattern(self.image_name)
 
 
+@dataclass(frozen=True)
+class MaskOptions(Options):
+    """Which pixels count; black ones of masks are left out."""
+
+    title: ClassVar[str] = "masks"
+    colmap_prefix: ClassVar[str] = "ImageReader"
+
+    mask_path: str | os.PathLike[str] | None = option(
+        None,
+        "masks, whose black pixels are ignored: a PNG for all frames, or a folder with one for "
+        "every frame, or with NAME.png for every image, as COLMAP has them",
+        common=True,
+    )
+
+
 def check_image_pattern(pattern: str) -> str:
     """Refuse a pattern that cannot name images; 'frame_%06d.png' can.
 

@@ -209,6 +209,27 @@ def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
     return replace(tracks, offsets=np.flatnonzero(starts).astype(np.int64))
 
 
+def split_tracks(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
+    """The tracks with some of their observations only, cut in two where one between is left out.
+
+    Args:
+        tracks: any tracks.
+        kept: bool [num_observations].
+    """
+    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    left_out = np.cumsum(~kept)
+    begins = np.ones(int(np.count_nonzero(kept)), dtype=np.bool_)
+    begins[1:] = (np.diff(track[kept]) != 0) | (np.diff(left_out[kept]) != 0)
+    return replace(
+        tracks,
+        offsets=np.append(np.flatnonzero(begins), len(begins)).astype(np.int64),
+        frame=tracks.frame[kept],
+        xy=_rows(tracks.xy, kept),
+        sigma=tracks.sigma[kept],
+        confirmed=tracks.confirmed[kept],
+    )
+
+
 def join_tracks(a: Tracks, b: Tracks) -> Tracks:
     """All tracks of one video that two sets hold, those of the first first."""
     if len(b.offsets) == 1:

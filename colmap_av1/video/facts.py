@@ -164,6 +164,17 @@ def with_counted_packets(file: VideoFile) -> VideoFile:
     return dataclasses.replace(file, num_packets=count)
 
 
+def count_shown(video: Video) -> int:
+    """Number of frames that players show, by the container: cheap, but not of a damaged stream.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    if video.presented is not None:
+        return len(video.presented)
+    return with_counted_packets(video).num_packets or 0
+
+
 def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, int]:
     """Pixels that the container cuts off at the left, top, right and bottom."""
     if not {"mov", "matroska"} & set(container.format.name.split(",")):

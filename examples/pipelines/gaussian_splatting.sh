@@ -14,7 +14,8 @@ shift 2
 mkdir -p "$source/distorted/sparse"
 colmap-av1 match --database "$source/distorted/database.db" --video "$video" \
   --image_path "$source/input" --camera_model OPENCV \
-  --keep_stream "$source/distorted/stream.mp4" "$@"
+  --keep_stream "$source/distorted/stream.mp4" \
+  ${MASK_PATH:+--mask_path "$MASK_PATH"} "$@"
 
 # As convert.py calls it.
 colmap mapper --database_path "$source/distorted/database.db" --image_path "$source/input" \
@@ -27,6 +28,7 @@ mv "$source/distorted/sparse" "$source/distorted/mapped"
 best=${best/#"$source/distorted/sparse"/"$source/distorted/mapped"}
 mkdir "$source/distorted/sparse"
 colmap-av1 densify --model "$(dirname "$best")" --video "$video" --image_path "$source/input" \
-  --keep_stream "$source/distorted/stream.mp4" --output "$source/distorted/sparse/0"
+  --keep_stream "$source/distorted/stream.mp4" --output "$source/distorted/sparse/0" \
+  ${MASK_PATH:+--mask_path "$MASK_PATH"}
 
 python "${CONVERT:-convert.py}" -s "$source" --skip_matching

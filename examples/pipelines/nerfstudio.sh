@@ -14,7 +14,8 @@ shift 2
 mkdir -p "$data/colmap/sparse"
 colmap-av1 match --database "$data/colmap/database.db" --video "$video" \
   --image_path "$data/frames" --camera_model OPENCV \
-  --keep_stream "$data/colmap/stream.mp4" "$@"
+  --keep_stream "$data/colmap/stream.mp4" \
+  ${MASK_PATH:+--mask_path "$MASK_PATH"} "$@"
 colmap mapper --database_path "$data/colmap/database.db" --image_path "$data/frames" \
   --output_path "$data/colmap/sparse" --Mapper.ba_global_function_tolerance=1e-6
 
@@ -30,6 +31,7 @@ mv "$data/colmap/sparse" "$data/colmap/mapped"
 best=${best/#"$data/colmap/sparse"/"$data/colmap/mapped"}
 mkdir "$data/colmap/sparse"
 colmap-av1 densify --model "$best" --video "$video" --image_path "$data/frames" \
-  --keep_stream "$data/colmap/stream.mp4" --output "$data/colmap/sparse/0"
+  --keep_stream "$data/colmap/stream.mp4" --output "$data/colmap/sparse/0" \
+  ${MASK_PATH:+--mask_path "$MASK_PATH"}
 
 ns-process-data images --data "$data/frames" --output-dir "$data" --skip-colmap

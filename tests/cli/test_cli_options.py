@@ -158,6 +158,7 @@ def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixtur
         *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
         *(
             "images",
+            "mask_path",
             "image_path",
             "num_images",
             "every",

@@ -53,7 +53,7 @@ def splat_cloud(
 
     Of the points that come close to each other in an image the one that most images see stays,
     where they are of one surface. Where an image has none they are added as far away as what is
-    around; these are seen by that image and those beside it.
+    around; these are seen by that image and those beside it. What masks leave out is no hole.
 
     Args:
         points: points of tracks.
@@ -134,7 +134,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) 
     for place in _spread_order(len(keys)) * _ROUNDS:
         own = images[keys[place]]
         grid = without_gaps(np.minimum(nearest[place], nearest_depth(own, added)))
-        rows, columns = np.nonzero(np.isinf(grid))
+        rows, columns = np.nonzero(np.isinf(grid) & own.counting_cells)
         if len(rows) == 0:
             continue
         depth = _depth_of_holes(grid, usual)
@@ -150,7 +150,8 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) 
         )
         added = np.concatenate([added, xyz])
         around = (keys[place] - 1, keys[place], keys[place] + 1)
-        filled.append(_with_observations(xyz, images, [i for i in around if 0 <= i < len(images)]))
+        there = [i for i in around if 0 <= i < len(images)]
+        filled.append(_with_observations(xyz, images, there, keys[place]))
     order = np.argsort(~np.concatenate(is_first), kind="stable")
     return take_points(reduce(_joined, filled), order)
 
@@ -210,7 +211,9 @@ def _squares(
     # Cells at the edge may reach beyond it; one square of each lies within.
     first = np.arange(len(xy)) % per_cell**2 == 0
     xy[first] = np.minimum(xy[first], np.array(view.size) - 0.5)
-    inside = (xy < view.size).all(axis=1)
+    # Centres of squares are corners of pixels: all four around count.
+    around = [xy + np.array([dx, dy]) for dx in (-0.5, 0.5) for dy in (-0.5, 0.5)]
+    inside = (xy < view.size).all(axis=1) & np.all([view.keeps(at) for at in around], axis=0)
     return xy[inside], cell[inside], first[inside]
 
 
@@ -242,10 +245,14 @@ def _behind(
 
 
 def _with_observations(
-    xyz: _Floats, images: Sequence[PosedCamera], seen_by: Sequence[int]
+    xyz: _Floats, images: Sequence[PosedCamera], seen_by: Sequence[int], own: int
 ) -> ModelPoints:
-    """Points as images have them that they project into."""
-    seen = [(i, *images[i].project(xyz)[:2]) for i in seen_by]
+    """Points as images have them that they project into, in their own one wherever they are."""
+    seen = []
+    for i in seen_by:
+        index, at, _ = images[i].project(xyz)
+        kept = images[i].keeps(at) | (i == own)
+        seen.append((i, index[kept], at[kept]))
     point = np.concatenate([index for _, index, _ in seen])
     image = np.concatenate([np.full(len(index), i) for i, index, _ in seen])
     xy = np.concatenate([at for *_, at in seen])

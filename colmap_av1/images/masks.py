@@ -1,0 +1,347 @@
+"""Masks: which pixels of frames and images count; what is black in them is left out."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.files import READABLE
+from colmap_av1.images.names import natural_key, pattern_regex
+from colmap_av1.options.images import ImageOptions
+from colmap_av1.tracks.tracks import Tracks, keep_long_tracks, order_by_frame, split_tracks
+from colmap_av1.util.cpus import threads_or_cpus
+
+_SUFFIX = ".png"
+# Share of a frame's pixels below which no motion is carried over it.
+_LEAST_SHARE = 0.05
+# Masks have few edges: more effort makes them hardly smaller.
+_COMPRESSION = 1
+_LAYOUTS = (
+    "give one PNG for all frames, or a folder with a PNG for every frame or with IMAGE.png for "
+    "every image"
+)
+
+
+@dataclass(frozen=True)
+class Mask:
+    """Which pixels of a picture count.
+
+    Attributes:
+        size: (width, height) in pixels.
+        packed: a bit a pixel, row by row, compressed: a long video's masks are many.
+        share: of the pixels, those that count.
+    """
+
+    size: tuple[int, int]
+    packed: bytes
+    share: float
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """Bool [height, width] the pixels that count."""
+        width, height = self.size
+        bits = np.frombuffer(zlib.decompress(self.packed), np.uint8)
+        return np.unpackbits(bits, count=width * height).reshape(height, width).view(np.bool_)
+
+    def keeps(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.bool_]:
+        """Whether positions in a picture lie on pixels that count.
+
+        Args:
+            xy: [n, 2] pixels, the first one's centre at (0.5, 0.5).
+            size: (width, height) of the picture, which may be another than the mask's.
+        """
+        # By columns: NumPy's loops over rows of two take several times as long.
+        column, row = (
+            np.clip((along * (own / other)).astype(np.int64), 0, own - 1)
+            for along, own, other in zip((xy[:, 0], xy[:, 1]), self.size, size, strict=True)
+        )
+        return self.kept[row, column]
+
+
+def make_mask(kept: NDArray[np.bool_]) -> Mask:
+    """The mask of bool [height, width]: the pixels that count."""
+    height, width = kept.shape
+    packed = zlib.compress(np.packbits(kept).tobytes(), _COMPRESSION)
+    return Mask((width, height), packed, float(kept.mean()))
+
+
+@dataclass(frozen=True)
+class VideoMasks:
+    """The masks of a video.
+
+    Attributes:
+        place: the file or folder they come from, for messages.
+        everywhere: the one of all frames.
+        of_frames: one for each frame, in order.
+        of_images: those of images by the names of these in the video's folder, or by these without
+            an extension.
+    """
+
+    place: str
+    everywhere: Mask | None = None
+    of_frames: tuple[Mask, ...] = ()
+    of_images: Mapping[str, Mask] | None = None
+
+    def check(
+        self,
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str] | None,
+        options: ImageOptions,
+    ) -> None:
+        """Refuse masks that cannot fit a video, before the long work.
+
+        Args:
+            sizes: the (width, height) that are fit: of the images, and of the video.
+            names: names of the images where they are known.
+            options: how they are named where they are not.
+
+        Raises:
+            ImageError: a mask has another size, or none is that of an image.
+        """
+        one = [self.everywhere] if self.everywhere is not None else []
+        for mask in [*one, *self.of_frames, *(self.of_images or {}).values()]:
+            if mask.size not in sizes:
+                wanted = " or ".join("{}x{}".format(*s) for s in dict.fromkeys(sizes))
+                raise ImageError(
+                    f"{self.place}: a mask is {mask.size[0]}x{mask.size[1]}, the pictures are "
+                    f"{wanted}: give masks of that size"
+                )
+        if self.of_images is None:
+            return
+        if names is not None:
+            self._named(names)
+        elif options.frame_list is None:
+            stem = PurePosixPath(options.image_name).stem
+            named = pattern_regex(stem + _SUFFIX)
+            found = (str(PurePosixPath(n).with_suffix(_SUFFIX)) for n in self.of_images)
+            if not any(named.fullmatch(name) for name in found):
+                raise ImageError(
+                    f"{self.place}: none of its {len(self.of_images)} masks is named like an image "
+                    f"({options.image_name}{_SUFFIX}), and the video has another number of frames: "
+                    f"{_LAYOUTS}"
+                )
+
+    def on_tracks(self, tracks: Tracks, chosen: ChosenImages, min_length: int) -> Tracks:
+        """The tracks where all masks leave them, see `mask_tracks`.
+
+        Raises:
+            ImageError: an image has none.
+        """
+        return self.on_images(self.on_frames(tracks, min_length), chosen, min_length)
+
+    def on_frames(self, tracks: Tracks, min_length: int) -> Tracks:
+        """The tracks where masks of frames leave them, see `mask_tracks`."""
+        if self.everywhere is not None:
+            return mask_tracks(tracks, self.everywhere, min_length)
+        if not self.of_frames:
+            return tracks
+        return mask_tracks(tracks, dict(enumerate(self.of_frames)), min_length)
+
+    def on_motion(self, inter_share: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Shares of inter units [num_frames]: none in frames of which next to nothing is left."""
+        nothing_left = [frame for frame, m in enumerate(self.of_frames) if m.share < _LEAST_SHARE]
+        found = inter_share.copy()
+        found[[frame for frame in nothing_left if frame < len(found)]] = 0.0
+        return np.asarray(found)
+
+    def on_images(self, tracks: Tracks, chosen: ChosenImages, min_length: int) -> Tracks:
+        """The tracks where masks of images leave them, see `mask_tracks`.
+
+        Raises:
+            ImageError: an image has none.
+        """
+        if self.of_images is None:
+            return tracks
+        found = zip(chosen.frames.tolist(), self._named(chosen.names), strict=True)
+        return mask_tracks(tracks, dict(found), min_length)
+
+    def of(self, chosen: ChosenImages) -> list[Mask]:
+        """The masks of images.
+
+        Raises:
+            ImageError: one has none.
+        """
+        if self.everywhere is not None:
+            return [self.everywhere] * len(chosen.names)
+        if self.of_images is not None:
+            return self._named(chosen.names)
+        return [self.of_frames[frame] for frame in chosen.frames.tolist()]
+
+    def _named(self, names: Sequence[str]) -> list[Mask]:
+        found = [_mask_of(name, self.of_images or {}) for name in names]
+        masks = [mask for mask in found if mask is not None]
+        if len(masks) < len(names):
+            missing = next(n for n, mask in zip(names, found, strict=True) if mask is None)
+            raise ImageError(
+                f"{self.place}: holds {len(self.of_images or {})} masks, but none of "
+                f"{len(names) - len(masks)} of {len(names)} images, such as "
+                f"'{missing}{_SUFFIX}': {_LAYOUTS}"
+            )
+        return masks
+
+
+@dataclass(frozen=True)
+class Masks:
+    """The masks of videos and photos.
+
+    Attributes:
+        path: the file, or the folder.
+        everywhere: the one of all frames of all videos.
+        of_frames: for videos with one for each frame, these by the video's folder among all images.
+        of_images: all others, by path in the folder without the extension of PNG.
+        digest: digest of them all.
+    """
+
+    path: Path
+    everywhere: Mask | None
+    of_frames: Mapping[str, tuple[Mask, ...]]
+    of_images: Mapping[str, Mask]
+    digest: str
+
+    def of_video(self, label: str) -> VideoMasks | None:
+        """Those of the video whose images lie in a folder; None where it has none."""
+        if self.everywhere is not None:
+            return VideoMasks(str(self.path), self.everywhere)
+        place = str(self.path / label)
+        if label in self.of_frames:
+            return VideoMasks(place, of_frames=self.of_frames[label])
+        start = f"{label}/" if label else ""
+        own = {n.removeprefix(start): m for n, m in self.of_images.items() if n.startswith(start)}
+        return VideoMasks(place, of_images=own) if own else None
+
+    def of_photo(self, name: str, size: tuple[int, int]) -> Mask | None:
+        """That of a photo; None where it has none.
+
+        Raises:
+            ImageError: it is of another size.
+        """
+        mask = _mask_of(name, self.of_images)
+        if mask is not None and mask.size != size:
+            raise ImageError(
+                f"{self.path}: the mask of '{name}' is {mask.size[0]}x{mask.size[1]}, the photo "
+                f"{size[0]}x{size[1]}: give one of that size"
+            )
+        return mask
+
+
+def _mask_of(name: str, masks: Mapping[str, Mask]) -> Mask | None:
+    """That of an image: 'a.jpg.png' as COLMAP has it, else 'a.png' as trainers have it."""
+    return masks.get(name) or masks.get(str(PurePosixPath(name).with_suffix("")))
+
+
+def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> Masks:
+    """Read the masks of videos and photos: one for all frames, of frames, or of images.
+
+    Args:
+        path: a PNG for all frames; or a folder with one for every frame, in the order of their
+            names, of several videos in a folder for each; or with those of images in COLMAP's
+            layout, `NAME.png`, or in that of trainers, with .png for the name's extension.
+        labels: folder of each video's images among all images.
+        num_frames: frames of each video.
+
+    Raises:
+        ImageError: there is no such file or folder, a mask cannot be read, or all are black.
+    """
+    if path.is_file():
+        files = [path]
+    elif path.is_dir():
+        found = (p for p in path.rglob("*") if p.suffix.lower() == _SUFFIX and p.is_file())
+        visible = [p for p in found if not p.name.startswith(".")]
+        files = sorted(visible, key=lambda p: natural_key(p.relative_to(path).as_posix()))
+        if not files:
+            raise ImageError(f"{path}: holds no PNG: {_LAYOUTS}")
+    else:
+        raise ImageError(f"{path}: no such file or folder of masks: {_LAYOUTS}")
+    with ThreadPoolExecutor(max_workers=threads_or_cpus(None)) as executor:
+        masks = list(executor.map(_read_mask, files))
+    if not any(mask.share for mask in masks):
+        what = "the mask is" if len(masks) == 1 else f"all {len(masks)} masks are"
+        raise ImageError(
+            f"{path}: {what} black, which leaves nothing of the pictures: black is what is "
+            "ignored; invert them if it is what shall count"
+        )
+    digest = hashlib.sha256()
+    for file, mask in zip(files, masks, strict=True):
+        name = "" if file == path else file.relative_to(path).as_posix()
+        digest.update(f"{name} {mask.size} {len(mask.packed)} ".encode() + mask.packed)
+    if path.is_file():
+        return Masks(path, masks[0], {}, {}, digest.hexdigest())
+    return _in_folder(
+        path,
+        {f.relative_to(path).as_posix(): m for f, m in zip(files, masks, strict=True)},
+        dict(zip(labels, num_frames, strict=True)),
+        digest.hexdigest(),
+    )
+
+
+def _in_folder(
+    path: Path, masks: dict[str, Mask], num_frames: dict[str, int], digest: str
+) -> Masks:
+    """Tell masks of frames from those of images, by their names and number."""
+    of_frames = {}
+    for label, count in num_frames.items():
+        own = [name for name in masks if PurePosixPath(name).parent == PurePosixPath(label)]
+        for_images = any(PurePosixPath(name).with_suffix("").suffix in READABLE for name in own)
+        if len(own) == count and not for_images:
+            of_frames[label] = tuple(masks.pop(name) for name in own)
+    of_images = {name[: -len(_SUFFIX)]: mask for name, mask in masks.items()}
+    found = Masks(path, None, of_frames, of_images, digest)
+    if all(found.of_video(label) is None for label in num_frames):
+        folders = ", ".join(f"'{label}'" for label in num_frames)
+        raise ImageError(
+            f"{path}: holds no mask of a video: its images' masks lie in folders {folders}, like "
+            "the images, or one PNG is for all frames"
+        )
+    return found
+
+
+def _read_mask(path: Path) -> Mask:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        # Colours are looked at as they are: in grey the darkest would be black.
+        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except (OSError, cv2.error):
+        picture = None
+    if picture is None:
+        raise ImageError(f"{path}: is no mask that can be read: {_LAYOUTS}")
+    if picture.ndim == 3:
+        # As COLMAP, without regard to transparency.
+        picture = picture[:, :, :3].any(axis=2)
+    return make_mask(picture > 0)
+
+
+def mask_tracks(tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: int) -> Tracks:
+    """The tracks without what masks leave out: one that enters such an area ends there.
+
+    One that leaves such an area begins there, too: what was before may be of another surface.
+
+    Args:
+        tracks: any tracks.
+        masks: by frame, or one for all.
+        min_length: observations that are left of a track at least.
+    """
+    size = (tracks.width, tracks.height)
+    if isinstance(masks, Mask):
+        kept = masks.keeps(tracks.xy, size)
+    else:
+        kept = np.ones(len(tracks.frame), dtype=np.bool_)
+        order = order_by_frame(tracks.frame, tracks.num_frames)
+        bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+        for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
+            if frame in masks and first < last:
+                own = order[first:last]
+                kept[own] = masks[frame].keeps(tracks.xy[own], size)
+    if kept.all():
+        return tracks
+    return keep_long_tracks(split_tracks(tracks, kept), min_length)

@@ -1,0 +1,269 @@
+"""Masks: which pixels of frames and images count."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import Encode, make_frames
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_av1.cli import main
+from colmap_av1.database.reading import image_ids_from_pair_id
+from colmap_av1.errors import ColmapAv1Error, ImageError
+from colmap_av1.images.masks import Mask, make_mask, mask_tracks, read_masks
+from colmap_av1.match import match
+from colmap_av1.options import ImageOptions, LinkOptions, MaskOptions, MatchOptions
+from colmap_av1.tracks.tracks import Tracks
+
+WIDTH, HEIGHT, NUM_FRAMES = 192, 128, 16
+# Most of the left half is left out.
+LEFT = np.full((HEIGHT, WIDTH), 255, np.uint8)
+LEFT[:100, :90] = 0
+
+
+def options(path: Path, **images: object) -> MatchOptions:
+    return MatchOptions(masks=MaskOptions(mask_path=path), images=ImageOptions(**images))
+
+
+def write(path: Path, mask: NDArray[np.uint8]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), mask)
+    return path
+
+
+def positions(database: Path) -> dict[str, NDArray[np.int64]]:
+    """The pixels of the keypoints of each image."""
+    with pycolmap.Database.open(database) as opened:
+        return {
+            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.int64)
+            for image in opened.read_all_images()
+        }
+
+
+def num_on_black(xy: NDArray[np.int64], mask: NDArray[np.uint8]) -> int:
+    return int(np.count_nonzero(mask[xy[:, 1], xy[:, 0]] == 0))
+
+
+@pytest.fixture(scope="module")
+def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, NDArray[np.int64]]:
+    """Keypoints without any mask."""
+    database = tmp_path_factory.mktemp("whole") / "a.db"
+    match(database, clip)
+    return positions(database)
+
+
+def test_one_mask_is_for_all_frames(
+    clip: Path, whole: dict[str, NDArray[np.int64]], tmp_path: Path
+) -> None:
+    mask = write(tmp_path / "mask.png", LEFT)
+    match(tmp_path / "a.db", clip, options=options(mask))
+    found = positions(tmp_path / "a.db")
+    assert found.keys() == whole.keys()
+    for name, xy in found.items():
+        assert num_on_black(whole[name], LEFT) > 50
+        assert num_on_black(xy, LEFT) == 0
+        # Only tracks that cross the edge are lost beside what is black.
+        assert len(xy) > 0.8 * (len(whole[name]) - num_on_black(whole[name], LEFT))
+
+
+def test_masks_of_images_in_both_layouts(clip: Path, tmp_path: Path) -> None:
+    """COLMAP's, and that of trainers, which have .png for the image's extension."""
+    names = [f"frame_{i:06d}.jpg" for i in range(0, NUM_FRAMES, 3)]
+    found = []
+    for layout in ("colmap", "trainers"):
+        for i, name in enumerate(names):
+            file = f"{name}.png" if layout == "colmap" else Path(name).with_suffix(".png")
+            write(tmp_path / layout / file, LEFT if i == 2 else LEFT * 0 + 1)
+        how = options(tmp_path / layout, every=3, image_name="frame_%06d.jpg")
+        match(tmp_path / f"{layout}.db", clip, options=how)
+        found.append(positions(tmp_path / f"{layout}.db"))
+    assert list(found[0]) == names
+    for i, name in enumerate(names):
+        assert (num_on_black(found[0][name], LEFT) == 0) == (i == 2)
+        assert np.array_equal(found[0][name], found[1][name])
+
+
+def test_masks_of_frames_end_tracks_between_images(clip: Path, tmp_path: Path) -> None:
+    """A frame that is no image has its say: no track crosses one that is all black."""
+    for i in range(NUM_FRAMES):
+        write(tmp_path / "masks" / f"{i + 1}.png", LEFT * 0 if i == 7 else LEFT * 0 + 255)
+    how = replace(options(tmp_path / "masks", every=5), links=LinkOptions(links="none"))
+    match(tmp_path / "a.db", clip, options=how)
+    crossing = []
+    for name in ("a", "b"):
+        if name == "b":
+            match(tmp_path / "b.db", clip, options=MatchOptions(images=how.images))
+        with sqlite3.connect(tmp_path / f"{name}.db") as database:
+            pairs = [
+                image_ids_from_pair_id(i)
+                for (i,) in database.execute("SELECT pair_id FROM matches")
+            ]
+        crossing.append([(i, j) for i, j in pairs if i <= 2 < j])
+    assert crossing[0] == []
+    assert crossing[1] != []
+    report = match(tmp_path / "c.db", clip, options=options(tmp_path / "masks", every=5))
+    assert report.links.weak_gaps == ((5, 10),)
+
+
+def test_masks_of_other_pixels_change_nothing(
+    clip: Path, whole: dict[str, NDArray[np.int64]], tmp_path: Path
+) -> None:
+    """Dark colours count, and so do transparent pixels: only black is black."""
+    dark = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    dark[..., 0] = 1
+    match(tmp_path / "a.db", clip, options=options(write(tmp_path / "dark.png", dark)))
+    found = positions(tmp_path / "a.db")
+    assert all(np.array_equal(found[name], xy) for name, xy in whole.items())
+
+
+def test_links_have_no_features_on_masks(encode: Encode, tmp_path: Path) -> None:
+    """Where motion breaks off, pictures are looked at: through the masks."""
+    frames = make_frames(12)
+    frames[6:] = make_frames(24)[18:]
+    clip = encode(frames, tmp_path / "jerk.mp4")
+    mask = write(tmp_path / "mask.png", LEFT)
+    report = match(tmp_path / "a.db", clip, options=options(mask))
+    assert report.links.num_images > 0
+    assert sum(num_on_black(xy, LEFT) for xy in positions(tmp_path / "a.db").values()) == 0
+
+
+def bad_masks(kind: str, folder: Path) -> Path:
+    """Masks that fit no clip of 16 frames of 192x128."""
+    if kind == "size":
+        return write(folder / "small.png", LEFT[:64])
+    if kind == "number":
+        for i in range(NUM_FRAMES - 2):
+            write(folder / "some" / f"mask{i}.png", LEFT)
+        return folder / "some"
+    if kind == "images":
+        for i in range(NUM_FRAMES - 2):
+            write(folder / "named" / f"frame_{i:06d}.png.png", LEFT)
+        return folder / "named"
+    if kind == "black":
+        for i in range(NUM_FRAMES):
+            write(folder / "black" / f"{i}.png", LEFT * 0)
+        return folder / "black"
+    if kind == "text":
+        (folder / "text.png").write_text("no picture")
+        return folder / "text.png"
+    if kind == "cut":
+        data = write(folder / "whole.png", LEFT).read_bytes()
+        (folder / "cut.png").write_bytes(data[:40])
+        return folder / "cut.png"
+    if kind == "empty":
+        (folder / "empty").mkdir()
+        return folder / "empty"
+    return folder / "missing"
+
+
+SAID = {
+    "size": "a mask is 192x64, the pictures are 192x128",
+    "number": "holds 14 masks, but none of 16 of 16 images, such as 'frame_000000.png.png'",
+    "images": "holds 14 masks, but none of 2 of 16 images, such as 'frame_000014.png.png'",
+    "black": "all 16 masks are black",
+    "text": "is no mask that can be read",
+    "cut": "is no mask that can be read",
+    "empty": "holds no PNG",
+    "missing": "no such file or folder of masks",
+}
+
+
+@pytest.mark.parametrize("kind", SAID)
+def test_what_does_not_fit_is_one_line(
+    kind: str,
+    clip: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def long_work(*_: object, **__: object) -> None:
+        raise AssertionError("masks are refused before the long work")
+
+    monkeypatch.setattr("colmap_av1.images.preparing.track_video", long_work)
+    path = bad_masks(kind, tmp_path)
+    words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip)]
+    assert main([*words, f"--mask_path={path}"]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert str(path) in lines[0]
+    assert SAID[kind] in lines[0]
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_each_video_has_its_own(tmp_path: Path) -> None:
+    for name in ("a/1.png", "a/2.png", "b/x.jpg.png", "photos/y.png"):
+        write(tmp_path / name, LEFT)
+    masks = read_masks(tmp_path, ["a", "b", "c"], [2, 2, 2])
+    a, b = masks.of_video("a"), masks.of_video("b")
+    assert a is not None
+    assert b is not None
+    assert len(a.of_frames) == 2
+    assert list(b.of_images or {}) == ["x.jpg"]
+    assert masks.of_video("c") is None
+    assert masks.of_photo("photos/y.jpg", (WIDTH, HEIGHT)) is not None
+    assert masks.of_photo("photos/z.jpg", (WIDTH, HEIGHT)) is None
+    with pytest.raises(ImageError, match="the photo 10x10"):
+        masks.of_photo("photos/y.jpg", (10, 10))
+    with pytest.raises(ColmapAv1Error, match="no mask of a video"):
+        read_masks(tmp_path, ["d", "e"], [2, 2])
+
+
+@given(
+    st.integers(1, 40),
+    st.integers(1, 30),
+    st.integers(0, 2**31),
+)
+def test_masks_keep_their_pixels(width: int, height: int, seed: int) -> None:
+    kept = np.random.default_rng(seed).random((height, width)) < 0.5
+    mask = make_mask(kept)
+    assert np.array_equal(mask.kept, kept)
+    y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
+    xy = np.column_stack([x, y]).astype(np.float32)
+    assert np.array_equal(mask.keeps(xy, mask.size), kept.ravel())
+    assert np.array_equal(mask.keeps(2 * xy, (2 * width, 2 * height)), kept.ravel())
+    edge = np.array([[width, height]], np.float32)
+    assert mask.keeps(edge, mask.size) == kept[-1, -1]
+
+
+@given(st.lists(st.lists(st.booleans(), min_size=1, max_size=9), min_size=1, max_size=6))
+def test_tracks_end_where_a_mask_begins(tracks: list[list[bool]]) -> None:
+    """Each observation stands on a white or a black pixel; what is left are runs of white ones."""
+    flat = np.concatenate([np.array(t) for t in tracks])
+    mask = make_mask(np.array([[True, False]]))
+    n = len(flat)
+    given_tracks = Tracks(
+        num_frames=9,
+        width=2,
+        height=1,
+        offsets=np.cumsum([0, *map(len, tracks)]),
+        frame=np.concatenate([np.arange(len(t)) for t in tracks]).astype(np.int32),
+        xy=np.column_stack([np.where(flat, 0.5, 1.5), np.full(n, 0.5)]).astype(np.float32),
+        sigma=np.arange(n, dtype=np.float32),
+        confirmed=np.zeros(n, np.bool_),
+    )
+    runs, at = [], 0
+    for track in tracks:
+        run: list[int] = []
+        for white in [*track, False]:
+            if white:
+                run.append(at)
+            elif run:
+                runs.append(run)
+                run = []
+            at += 1
+        at -= 1
+    masks: list[Mask | dict[int, Mask]] = [mask, dict.fromkeys(range(9), mask)]
+    for least in (1, 2):
+        wanted = [run for run in runs if len(run) >= least or flat.all()]
+        for given_masks in masks:
+            found = mask_tracks(given_tracks, given_masks, least)
+            pieces = np.split(found.sigma.astype(int), found.offsets[1:-1])
+            assert [p.tolist() for p in pieces if len(p)] == wanted
