@@ -15,6 +15,7 @@ from colmap_av1.images.names import image_file
 from colmap_av1.model.colmap_model import MODEL_FILES, read_model
 from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
+from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import is_mapper_log, map_poses
 from colmap_av1.options import MapOptions
 from colmap_av1.util.arguments import checks_arguments
@@ -118,13 +119,14 @@ def map_database(
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
+    warnings = [model_joints(model).warning]
     far_views: FarViews | None = None
     try:
         with clock.measure("far views"):
             far_views = model_far_views(model, image_path, progress)
-        warning = far_views.warning
+        warnings.append(far_views.warning)
     except ImageError as error:  # the model stands all the same
-        warning = f"far views are not compared: {error}"
+        warnings.append(f"far views are not compared: {error}")
     return MapReport(
         output=output,
         database=database,
@@ -134,7 +136,7 @@ def map_database(
         figures=model_figures(model),
         far_views=far_views,
         seconds=clock.seconds,
-        warnings=() if warning is None else (warning,),
+        warnings=tuple(warning for warning in warnings if warning is not None),
     )
 
 

@@ -15,6 +15,7 @@ from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.preparing import check_fit
+from colmap_av1.images.takes import Takes
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -23,6 +24,7 @@ from colmap_av1.model.reconstruct_poses import (
 )
 from colmap_av1.model.reconstruct_stages import (
     Run,
+    VideoTracks,
     match_stage,
     read_links,
     read_tracks,
@@ -32,13 +34,13 @@ from colmap_av1.model.reconstruct_stages import (
 from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
-from colmap_av1.tracks.tracks import cut_tracks, join_tracks, tracks_in_a_row
+from colmap_av1.tracks.tracks import Tracks, cut_tracks, join_tracks, tracks_in_a_row
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.util.stages import open_stages
+from colmap_av1.util.stages import Kept, open_stages, run_stage
 from colmap_av1.video.facts import count_shown
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -201,19 +203,10 @@ def _run_stages(run: Run) -> ReconstructReport:
     takes = run.inputs.takes(
         [own.chosen for own in videos], [own.tracks.num_frames for own in videos]
     )
-    matched = match_stage(run, videos, takes, tracked)
-    links, broken = read_links(run.stages)
-    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
-    tracks = cut_tracks(tracks, broken.tolist())
-    keyed = takes.some(matched.facts["key_images"])
-    posed = pose_stage(run, matched, keyed)
     kept = {stage_of_video(run, video): tracked[video] for video in numbers}
-    kept |= {"matches": matched, "poses": posed}
-    if len(keyed.take) < len(takes.take):
-        kept["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
-    if run.options.mapping.adjust:
-        kept["adjustment"] = posed = adjustment_stage(run, tracks, links, takes, posed)
-    kept["model"] = model_stage(run, join_tracks(tracks, links), takes, posed)
+    posed = _mended_poses(run, videos, takes, tracked)
+    kept |= posed.stages
+    kept["model"] = model_stage(run, join_tracks(posed.tracks, posed.links), takes, posed.last)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     facts |= {"num_images": len(takes.take), "masked": takes.masked}
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
@@ -239,6 +232,96 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
 
 
+@dataclass(frozen=True)
+class _Posed:
+    """The stages that end in poses, and the tracks that agree with these.
+
+    Attributes:
+        stages: what each of them kept, by its name, in order.
+        tracks: the tracks of all videos, cut where motion is not believed.
+        links: links as tracks.
+    """
+
+    stages: dict[str, Kept]
+    tracks: Tracks
+    links: Tracks
+
+    @property
+    def last(self) -> Kept:
+        """The stage that holds the poses."""
+        return next(reversed(self.stages.values()))
+
+
+def _mended_poses(
+    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
+) -> _Posed:
+    """Estimate poses; where little holds them together, again with links in place of motion."""
+    first: list[_Posed] = []
+
+    def make(_: Path) -> dict[str, Any]:
+        first.append(_pose_stages(run, videos, takes, tracked, doubted=()))
+        return {"doubted": _unlinked_joints(run, takes, first[0].stages)}
+
+    options = run.options
+    doubted = run_stage(
+        run.stages,
+        "joints",
+        [
+            [t.digest for t in tracked],
+            takes.videos,
+            run.photo_digests,
+            options.match,
+            options.mapping,
+        ],
+        into=run.stages,
+        products=[],
+        make=make,
+    ).facts["doubted"]
+    if first and not doubted:
+        return first[0]
+    return _pose_stages(run, videos, takes, tracked, doubted=doubted)
+
+
+def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
+    """Frames after joints that hold little, and that no pictures have been matched across."""
+    if "adjustment" not in stages or run.options.match.links.links == "none":
+        return []
+    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    looked_at = stages["matches"].facts["links"]["weak_gaps"]
+    joints = [
+        (frame_of[first], frame_of[second])
+        for first, second in stages["adjustment"].facts["doubtful_joints"]
+    ]
+    return [
+        after
+        for before, after in joints
+        if not any(first <= before and after <= second for first, second in looked_at)
+    ]
+
+
+def _pose_stages(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept],
+    *,
+    doubted: Sequence[int],
+) -> _Posed:
+    """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
+    matched = match_stage(run, videos, takes, tracked, doubted)
+    links, broken = read_links(run.stages)
+    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
+    tracks = cut_tracks(tracks, broken.tolist())
+    keyed = takes.some(matched.facts["key_images"])
+    posed = pose_stage(run, matched, keyed)
+    stages = {"matches": matched, "poses": posed}
+    if len(keyed.take) < len(takes.take):
+        stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
+    if run.options.mapping.adjust:
+        stages["adjustment"] = adjustment_stage(run, tracks, links, takes, posed)
+    return _Posed(stages, tracks, links)
+
+
 def _notes(facts: dict[str, Any]) -> list[str]:
     notes = []
     if facts["num_registered"] < facts["num_images"]:
@@ -261,8 +344,8 @@ def _notes(facts: dict[str, Any]) -> list[str]:
             "rotates or the scene is flat: the depth of the points may be unreliable; film while "
             "moving sideways"
         )
-    if facts["far_views_warning"] is not None:
-        notes.append(facts["far_views_warning"])
+    told = (facts["far_views_warning"], facts.get("joints_warning"))
+    notes += [warning for warning in told if warning is not None]
     if facts["agreeing"] < LEAST_AGREEING:
         notes.append(
             f"only {facts['agreeing']:.0%} of the tracks agree with the poses, which may be wrong: "

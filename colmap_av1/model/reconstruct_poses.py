@@ -23,6 +23,7 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
+from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import adjust_model, map_poses
 from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.model.resection import interpolate_poses, resect, sightings_of
@@ -257,7 +258,12 @@ def adjustment_stage(run: Run, tracks: Tracks, links: Tracks, takes: Takes, pose
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
-        return {"poses": "adjusted"}
+        joints = model_joints(read_model(folder))
+        return {
+            "poses": "adjusted",
+            "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
+            "joints_warning": joints.warning,
+        }
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     given = (_ADJUSTED, _LOSS_SCALE, refine, *how)

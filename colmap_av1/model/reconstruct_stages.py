@@ -81,6 +81,11 @@ class Run:
         photos = [photo.state for photo in self.inputs.photos]
         return (*(file for source in self.sources for file in source.files), *photos)
 
+    @property
+    def photo_digests(self) -> list[list[str]]:
+        """Name and digest of each photo, which stages depend on."""
+        return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
+
 
 @dataclass(frozen=True)
 class VideoTracks:
@@ -95,6 +100,12 @@ class VideoTracks:
     tracks: Tracks
     chosen: ChosenImages
     inter_share: NDArray[np.float32]
+
+    def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
+        """The same, but for frames whose motion is not to be trusted, whatever the stream says."""
+        share = self.inter_share.copy()
+        share[list(frames)] = 0.0
+        return replace(self, inter_share=share)
 
 
 def stage_of_video(run: Run, video: int) -> str:
@@ -211,11 +222,27 @@ def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
 
 
 def match_stage(
-    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept],
+    doubted: Sequence[int],
 ) -> Kept:
-    """Write the database of the tracks that the poses come from, and of links."""
+    """Write the database of the tracks that the poses come from, and of links.
+
+    Args:
+        run: what every stage is given.
+        videos: the tracks of each video.
+        takes: the images.
+        tracked: what `track_stage` kept of each video.
+        doubted: frames, counted through the videos, whose motion is not to be trusted.
+    """
     options, clock = run.options, run.clock
     mapping = options.mapping
+    videos = [
+        own.doubted_at([f - first for f in doubted if 0 <= f - first < own.tracks.num_frames])
+        for own, first in zip(videos, takes.first_frame.tolist(), strict=False)
+    ]
     density = DensityOptions(
         preset="sparse",
         max_tracks_per_image=mapping.pose_tracks_per_image,
@@ -251,11 +278,13 @@ def match_stage(
 
     match = options.match
     given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
-    photos = [[photo.name, file_digest(photo.path)] for photo in run.inputs.photos]
     return run_stage(
         run.stages,
         "matches",
-        [[t.digest for t in tracked], takes.videos, photos, given, options.match.run.seed],
+        [
+            [t.digest for t in tracked],
+            *(takes.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
+        ],
         into=run.output,
         products=["database.db", f"{run.stages.name}/{_LINKS}"],
         make=make,

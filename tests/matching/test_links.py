@@ -28,13 +28,14 @@ from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.weak_gaps import weak_frames, weak_gaps
 from colmap_av1.model.colmap_model import camera_centres
 from colmap_av1.options import ImageOptions, LinkOptions, MatchOptions, ReconstructOptions
-from colmap_av1.reconstruct import reconstruct
+from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames
 
 SCENE = PROJECT / "examples" / "scene.mp4"
 TRUTH = PROJECT / "examples" / "scene_truth.npz"
 # Frames left out of the rendered clip, so that it jerks there.
 LEFT_OUT = range(24, 40)
+FAR_OUT = range(14, 46)
 
 
 def pictures(video: Path = SCENE) -> list[NDArray[np.uint8]]:
@@ -44,8 +45,11 @@ def pictures(video: Path = SCENE) -> list[NDArray[np.uint8]]:
 @pytest.fixture(scope="module")
 def jerk(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The rendered clip without some frames in its middle."""
-    kept = [image for i, image in enumerate(pictures()) if i not in LEFT_OUT]
-    return encode(np.array(kept), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
+    return encode(_without(LEFT_OUT), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
+
+
+def _without(left_out: range) -> NDArray[np.uint8]:
+    return np.array([image for i, image in enumerate(pictures()) if i not in left_out])
 
 
 def test_weak_frames_are_those_without_motion_among_others() -> None:
@@ -185,16 +189,43 @@ def test_nothing_is_decoded_where_motion_connects_all(
 @pytest.mark.slow
 def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
     made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
-    kept = [i for i in range(60) if i not in LEFT_OUT]
-    assert made.num_registered == len(kept)
     assert made.far_views is not None
     assert made.far_views < 0.6
+    _check_poses(made, LEFT_OUT, 0.005)
+
+
+@pytest.mark.slow
+def test_jerk_that_only_the_model_shows(
+    encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where few points join the images at a jerk, pictures are matched there and all is mapped."""
+    jerk = encode(_without(FAR_OUT), tmp_path / "jerk.mp4")
+    monkeypatch.setattr("colmap_av1.matching.weak_gaps._LEAST_INTER_SHARE", 0.001)
+    monkeypatch.setattr("colmap_av1.matching.weak_gaps._LEAST_OF_NEIGHBOURS", 0.0)
+    made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
+    before = FAR_OUT.start - 1
+    assert list(map(tuple, made.links["weak_gaps"])) == [(before, before + 1)]
+    assert made.warnings == ()
+    _check_poses(made, FAR_OUT, 0.0005)
+    again = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
+    assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
+    assert again.links == made.links
+
+    only_said = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
+    bent = reconstruct(jerk, tmp_path / "bent", options=only_said)
+    assert any(f"join 'frame_{before:06d}.png'" in warning for warning in bent.warnings)
+
+
+def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None:
+    """All images are where the truth has them, to a share of its extent."""
+    kept = [i for i in range(60) if i not in left_out]
+    assert made.num_registered == len(kept)
     poses = model_poses(pycolmap.Reconstruction(str(made.output / "sparse" / "0")), len(kept))
     with np.load(TRUTH) as truth:
         known = truth["cam_from_world"][kept]
     centres, found = camera_centres(known), camera_centres(poses)
     extent = np.linalg.norm(np.ptp(centres, axis=0))
-    assert alignment_error(found, centres) < 0.005 * extent
+    assert alignment_error(found, centres) < bound * extent
 
 
 def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from colmap_av1.errors import OptionError
 from colmap_av1.model.colmap_model import read_model
 from colmap_av1.model.far_views import model_far_views
 from colmap_av1.model.figures import model_figures
+from colmap_av1.model.joints import model_joints
 
 _FAILED_CHECK = 1
 
@@ -60,14 +61,11 @@ def _run(namespace: argparse.Namespace) -> int:
 
 
 def _check_model(namespace: argparse.Namespace) -> bool:
-    """Print what a model is like; whether views from far apart agree with it."""
+    """Print what a model is like; whether it holds together."""
     model = read_model(namespace.model)
     with progress_bars(namespace.quiet) as report:
         far_views = model_far_views(model, Path(namespace.image_path), report)
-    warning = far_views.warning
-    print_result(
-        namespace,
-        model_rows(model_figures(model), far_views),
-        () if warning is None else (warning,),
-    )
-    return warning is None
+    told = (far_views.warning, model_joints(model).warning)
+    warnings = tuple(warning for warning in told if warning is not None)
+    print_result(namespace, model_rows(model_figures(model), far_views), warnings)
+    return not warnings
