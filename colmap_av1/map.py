@@ -5,19 +5,31 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
 
 from colmap_av1.database.check import check
 from colmap_av1.database.file import copy_database
-from colmap_av1.database.reading import read_images
+from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
-from colmap_av1.images.files import image_size
+from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.model.colmap_model import MODEL_FILES, read_model
+from colmap_av1.model.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
 from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import is_mapper_log, map_poses
-from colmap_av1.options import MapOptions
+from colmap_av1.model.placing.placement import (
+    Placement,
+    Surroundings,
+    find_placement,
+    write_place,
+)
+from colmap_av1.model.placing.up import some_spread, vertical_lines
+from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_files, check_folder
@@ -34,6 +46,8 @@ class MapReport:
         mapper: which of COLMAP's mappers made them.
         num_images: images of the database.
         num_registered: images with a pose in each model, the most first.
+        place: where that in folder 0 lies in the world: units, axes, origin and what said so, as
+            in `place.json`.
         figures: figures of the model in folder 0.
         far_views: how far views from far apart in time disagree, by the pictures of that model;
             None where these cannot be read.
@@ -46,6 +60,7 @@ class MapReport:
     mapper: str
     num_images: int
     num_registered: tuple[int, ...]
+    place: dict[str, Any]
     figures: ModelFigures
     far_views: FarViews | None
     seconds: dict[str, float]
@@ -64,6 +79,7 @@ def map_database(
     output: str | os.PathLike[str],
     *,
     options: MapOptions | None = None,
+    place: PlaceOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> MapReport:
@@ -73,8 +89,10 @@ def map_database(
         database: a COLMAP database with verified matches.
         image_path: folder of its images, for the points' colours.
         output: new or empty folder; gets a folder for each model, numbered from the one with the
-            most images, and `mapper.log`.
+            most images, `mapper.log`, and `place.json`, which says where folder 0 lies.
         options: which mapper, and how.
+        place: where the model in folder 0 lies in the world; positions are the pose priors of the
+            database.
         progress: called with a stage's name, what is done, and of how much where known.
         overwrite: replace an output that holds models and nothing else.
 
@@ -82,9 +100,11 @@ def map_database(
         DatabaseError: the database is missing, unreadable, or nothing that mappers can use.
         ImageError: an image of the database is not in the folder, or of another size.
         ModelError: the mapper fails or finds no model; `OUTPUT.log` is what it printed.
-        OptionError: the output is not empty, or must not be replaced.
+        OptionError: the output is not empty, or must not be replaced, or the known distance is
+            none of the model.
     """
     options = options if options is not None else MapOptions()
+    place = place if place is not None else PlaceOptions()
     progress = progress if progress is not None else no_progress
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
@@ -116,10 +136,12 @@ def map_database(
                     "try the other --mapper, or give --camera_params when matching"
                 )
             log.replace(partial / "mapper.log")
+            with clock.measure("place"):
+                placement = _place(partial, database, image_path, place, options.seed)
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
-    warnings = [model_joints(model).warning]
+    warnings = [*placement.warnings, model_joints(model).warning]
     far_views: FarViews | None = None
     try:
         with clock.measure("far views"):
@@ -133,11 +155,40 @@ def map_database(
         mapper=options.mapper,
         num_images=num_images,
         num_registered=num_registered,
+        place=placement.facts,
         figures=model_figures(model),
         far_views=far_views,
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )
+
+
+def _place(
+    output: Path, database: Path, image_path: Path, options: PlaceOptions, seed: int
+) -> Placement:
+    """Place the model in folder 0 of the output, and write down where."""
+    folder = output / "0"
+    model = read_model(folder)
+    images = [*posed_images(model).values()]
+
+    def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        return [
+            vertical_lines(
+                read_image(image_file(image_path, image.name)),
+                *(model.cameras[image.camera_id], image.cam_from_world, up),
+            )
+            for image in some_spread(images)
+        ]
+
+    known = Surroundings(read_pose_priors(database), lines=lines)
+    found = find_placement(images, dict(model.cameras), known, options, seed)
+    if found.is_moved:
+        how = found.similarity
+        rotation = pycolmap.Rotation3d(how.rotation)
+        model.transform(pycolmap.Sim3d(how.scale, rotation, how.translation))
+        model.write_binary(folder)
+    write_place(output, found)
+    return found
 
 
 def _check_input(database: Path, image_path: Path) -> int:

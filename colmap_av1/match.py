@@ -18,6 +18,7 @@ from colmap_av1.errors import DatabaseError, OptionError
 from colmap_av1.images.camera import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
+from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
 from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
@@ -207,7 +208,9 @@ def match(
 
     with clock.measure("database"):
         write_matched_images(
-            database, images.takes.images.names, cameras.new, linked.matched, options.on_existing
+            *(database, images.takes.images.names, cameras.new, linked.matched),
+            on_existing=options.on_existing,
+            places=image_positions(images.takes, inputs.videos, inputs.photos).places,
         )
     videos = images.videos
     notes = inputs.with_names([own.tracked.warnings for own in videos])

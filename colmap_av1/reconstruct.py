@@ -14,8 +14,10 @@ from typing import Any
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
+from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.placing.stage import place_stage
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
@@ -73,6 +75,8 @@ class ReconstructReport:
         far_views: median distance in pixels of what the pictures of images ten and more apart show
             in common from where the poses put it; None where no such images see the same.
         far_views_largest: the 90 % quantile of it over such pairs of images.
+        place: where the model lies in the world: units, axes, origin and what said so, as in
+            `place.json`.
         focal_length: of the output's first camera, in pixels.
         mapper: which of COLMAP's mappers found the poses.
         forward_motion: the camera moves along its axis, see `MatchReport`.
@@ -102,6 +106,7 @@ class ReconstructReport:
     mean_error: float
     far_views: float | None
     far_views_largest: float | None
+    place: dict[str, Any]
     focal_length: float
     mapper: str
     forward_motion: bool
@@ -203,10 +208,13 @@ def _run_stages(run: Run) -> ReconstructReport:
     takes = run.inputs.takes(
         [own.chosen for own in videos], [own.tracks.num_frames for own in videos]
     )
+    positions = image_positions(takes, run.inputs.videos, run.inputs.photos)
+    run = replace(run, positions=positions)
     kept = {stage_of_video(run, video): tracked[video] for video in numbers}
     posed = _mended_poses(run, videos, takes, tracked)
     kept |= posed.stages
-    kept["model"] = model_stage(run, join_tracks(posed.tracks, posed.links), takes, posed.last)
+    kept["place"] = placed = place_stage(run, takes, posed.last, positions)
+    kept["model"] = model_stage(run, join_tracks(posed.tracks, posed.links), takes, placed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     facts |= {"num_images": len(takes.take), "masked": takes.masked}
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
@@ -214,6 +222,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         *run.inputs.warnings,
         *run.inputs.with_names([stage.facts["warnings"] for stage in tracked]),
         *facts["link_warnings"],
+        *facts["place_warnings"],
         *_notes(facts),
     ]
     reported: dict[str, Any] = {

@@ -60,7 +60,11 @@ def test_model(database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_p
     )
     assert database.read_bytes() == before
     assert sorted(p.name for p in database.parent.iterdir()) == ["a.db"]
-    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == ["0", "mapper.log"]
+    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == [
+        "0",
+        "mapper.log",
+        "place.json",
+    ]
     assert (report.num_images, report.num_registered) == (NUM_IMAGES, (NUM_IMAGES,))
     assert [told for told in placed if told[0] == "poses"][-1] == ("poses", NUM_IMAGES, NUM_IMAGES)
     model = read_model(report.model)

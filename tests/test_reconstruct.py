@@ -36,7 +36,7 @@ from colmap_av1.options import (
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
 
-STAGES = ("tracks", "matches", "poses", "resection", "adjustment", "model")
+STAGES = ("tracks", "matches", "poses", "resection", "adjustment", "place", "model")
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 
@@ -315,7 +315,8 @@ def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path)
     records = sorted((output / ".stages").glob("*.json"))
     assert {record.stem for record in records} == {*STAGES, "joints"}
     part = records[5].read_text()[:-40]
-    texts = ["", "[]", "7", "null", '{"key": 3, "facts": null}', part, '{"key": "", "facts": {}}']
+    texts = ["", "[]", "7", "{", "null", '{"key": 3, "facts": null}', part]
+    texts.append('{"key": "", "facts": {}}')
     for record, text in zip(records, texts, strict=True):
         record.write_text(text)
     assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()
@@ -468,7 +469,7 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     shutil.copytree(made.output, tmp_path / "plain")
     mapping = replace(OPTIONS.mapping, adjust=False)
     placed = reconstruct(SCENE, tmp_path / "plain", options=replace(OPTIONS, mapping=mapping))
-    assert placed.resumed == STAGES[:-2]
+    assert placed.resumed == STAGES[:-3]
     # All images by the mapper, none by resection.
     options = replace(OPTIONS, mapping=replace(mapping, key_images=False))
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from colmap_av1.batch.run import BatchReport
 from colmap_av1.database.check import CheckReport
@@ -76,6 +76,7 @@ def map_rows(report: MapReport) -> Rows:
     ]
     if report.far_views is not None:
         rows += far_view_rows(report.far_views.median, report.far_views.largest)
+    rows += _place_rows(report.place)
     if len(report.num_registered) > 1:
         others = ", ".join(map(str, report.num_registered[1:]))
         rows.append(("further models", f"of {others} images, beside it"))
@@ -102,12 +103,23 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *far_view_rows(report.far_views, report.far_views_largest),
         ("focal length", f"{report.focal_length:.2f} px"),
+        *_place_rows(report.place),
         *_link_rows(**report.links),
         *_gaussians_rows(report.gaussians),
     ]
     if report.resumed:
         rows.append(("finished before", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def _place_rows(place: Mapping[str, Any]) -> Rows:
+    """Where a model lies in the world, and what said so."""
+    origin = place["origin"]
+    at = ""
+    if origin is not None:
+        at = " of {latitude:.7f}, {longitude:.7f}, {altitude:.2f} m".format(**origin)
+    rows = [("coordinates", f"units {place['units']}, axes {place['axes']}{at}")]
+    return rows + ([("placed by", "; ".join(place["how"]))] if place["how"] else [])
 
 
 def far_view_rows(median: float | None, largest: float | None) -> Rows:

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sqlite3
+import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import is_new, open_database
-from colmap_av1.database.layout import MAX_NUM_IMAGES
+from colmap_av1.database.file import is_new, open_database, open_unaltered
+from colmap_av1.database.layout import MAX_NUM_IMAGES, columns
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.camera import camera_fault
 
 # A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
 # or a 2x2 affine shape.
 SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
+# COLMAP's PosePriorCoordinateSystem: latitude, longitude and altitude, or metres.
+_WGS84, _CARTESIAN = 0, 1
+_POSITION_BYTES = 24
 
 
 @dataclass(frozen=True)
@@ -106,6 +112,52 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
         if fault:
             raise DatabaseError(f"{path}: camera {camera_id} has {fault}: import the images again")
     return cameras
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Where an image was taken, as a database says.
+
+    Attributes:
+        position: float64 [3] latitude and longitude in degrees and altitude in metres, or
+            Cartesian coordinates.
+        is_cartesian: which of both.
+    """
+
+    position: NDArray[np.float64]
+    is_cartesian: bool
+
+
+def read_pose_priors(database: str | os.PathLike[str]) -> dict[str, PosePrior]:
+    """Where the images of a database were taken, by name, for those of which it says so.
+
+    Raises:
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database.
+    """
+    with open_unaltered(Path(database)) as connection:
+        rows: list[tuple[Any, ...]] = []
+        if "prior_tx" in columns(connection, "images"):  # of COLMAP 3.8 and 3.9
+            rows += connection.execute(
+                f"SELECT name, {_WGS84}, prior_tx, prior_ty, prior_tz FROM images ORDER BY image_id"
+            ).fetchall()
+        kept = columns(connection, "pose_priors")
+        if {"position", "coordinate_system"} <= kept:
+            owner = "corr_data_id" if "pose_prior_id" in kept else "image_id"
+            found = connection.execute(
+                f"SELECT name, coordinate_system, position FROM pose_priors "
+                f"JOIN images ON images.image_id = pose_priors.{owner} ORDER BY images.image_id"
+            ).fetchall()
+            rows += [(n, s, *struct.unpack("<3d", p)) for n, s, p in found if _is_position(p)]
+    return {
+        name: PosePrior(np.array(position, dtype=np.float64), system == _CARTESIAN)
+        for name, system, *position in rows
+        if system in (_WGS84, _CARTESIAN)
+        and all(isinstance(x, float) and math.isfinite(x) for x in position)
+    }
+
+
+def _is_position(blob: object) -> bool:
+    return isinstance(blob, bytes) and len(blob) == _POSITION_BYTES
 
 
 def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap.Camera]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.file import is_new, write_existing, write_new
 from colmap_av1.database.layout import columns, has_rows
 from colmap_av1.database.reading import image_ids_from_pair_id
-from colmap_av1.database.writing_frames import complete_frames
+from colmap_av1.database.writing_frames import complete_frames, write_places
 from colmap_av1.database.writing_keypoints import append_keypoints
 from colmap_av1.database.writing_pairs import append_pairs, order_pairs
 from colmap_av1.errors import DatabaseError
@@ -31,6 +31,8 @@ def write_matched_images(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
     matched: MatchedImages,
     on_existing: OnExisting = "error",
+    *,
+    places: NDArray[np.float64] | None = None,
 ) -> None:
     """Write matched images with their keypoints, matches and geometries, see `write_matches`."""
     write_matches(
@@ -42,6 +44,7 @@ def write_matched_images(
         matches=matched.matches,
         geometries=matched.geometries,
         on_existing=on_existing,
+        places=places,
     )
 
 
@@ -55,6 +58,7 @@ def write_matches(
     matches: Sequence[NDArray[np.uint32]],
     geometries: Sequence[TwoViewGeometry],
     on_existing: OnExisting = "error",
+    places: NDArray[np.float64] | None = None,
 ) -> None:
     """Write keypoints, matches and two-view geometries: all rows, or none.
 
@@ -87,6 +91,8 @@ def write_matches(
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
         geometries: for each pair, its verified geometry.
         on_existing: what becomes of rows that the images have already.
+        places: float64 [num_images, 3] latitude and longitude in degrees and altitude of each
+            image, NaN where unknown, for those that have no pose prior; None: none is known.
 
     Raises:
         DatabaseError: the file is locked, not a COLMAP database, lists other images, already
@@ -122,6 +128,8 @@ def write_matches(
         )
         if names:
             complete_frames(connection, path)
+        if places is not None:
+            write_places(connection, image_ids, places)
 
     if is_new(path):
         write_new(path, fill)

@@ -1,15 +1,31 @@
-"""Rigs and frames of images in a database, which COLMAP has since 3.12."""
+"""What a database says of images beside themselves: rigs and frames, and where they were taken.
+
+COLMAP has rigs and frames since 3.12, and pose priors since 3.10, in a layout of its own since 4.0.
+"""
 
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1.database.layout import columns, has_rows
 from colmap_av1.errors import DatabaseError
 
 # COLMAP's SensorType of a camera.
 _CAMERA_SENSOR = 0
+# COLMAP's PosePriorCoordinateSystem of latitude, longitude and altitude.
+WGS84 = 0
+# The layout of COLMAP 3.10 to 3.13, which later ones migrate and earlier ones pass over.
+_POSE_PRIORS = (
+    "CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL, position BLOB, "
+    "coordinate_system INTEGER NOT NULL, position_covariance BLOB, "
+    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)"
+)
+_UNKNOWN = np.full(9, np.nan, dtype="<f8")
 
 
 def complete_frames(connection: sqlite3.Connection, path: Path) -> None:
@@ -57,3 +73,54 @@ def complete_frames(connection: sqlite3.Connection, path: Path) -> None:
             "VALUES (?, ?, ?, ?)",
             (frame_id, image_id, camera_id, _CAMERA_SENSOR),
         )
+
+
+def write_places(
+    connection: sqlite3.Connection, image_ids: Sequence[int], places: NDArray[np.float64]
+) -> None:
+    """Write where images were taken as pose priors; images that have one keep it.
+
+    A file of COLMAP 3.8 or 3.9 gets them where these look for them, too.
+
+    Args:
+        connection: the open file.
+        image_ids: the images.
+        places: float64 [n, 3] latitude, longitude and altitude; NaN where unknown.
+    """
+    known = [(i, p) for i, p in zip(image_ids, places, strict=True) if np.isfinite(p).all()]
+    if not known:
+        return
+    if not columns(connection, "pose_priors"):
+        connection.execute(_POSE_PRIORS)
+    if "pose_prior_id" in columns(connection, "pose_priors"):
+        _write_newer(connection, known)
+    else:
+        connection.executemany(
+            "INSERT OR IGNORE INTO pose_priors (image_id, position, coordinate_system, "
+            "position_covariance) VALUES (?, ?, ?, ?)",
+            ((i, p.astype("<f8").tobytes(), WGS84, _UNKNOWN.tobytes()) for i, p in known),
+        )
+    if "prior_tx" in columns(connection, "images"):
+        connection.executemany(
+            "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? "
+            "WHERE image_id = ? AND prior_tx IS NULL",
+            ((*map(float, p), i) for i, p in known),
+        )
+
+
+def _write_newer(
+    connection: sqlite3.Connection, known: Sequence[tuple[int, NDArray[np.float64]]]
+) -> None:
+    """The same in the layout of COLMAP 4.0 and later."""
+    camera_of = dict(connection.execute("SELECT image_id, camera_id FROM images").fetchall())
+    connection.executemany(
+        "INSERT OR IGNORE INTO pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type, "
+        "position, position_covariance, gravity, coordinate_system) VALUES (?, ?, ?, ?, ?, ?, ?)",
+        (
+            (
+                *(i, camera_of[i], _CAMERA_SENSOR, p.astype("<f8").tobytes()),
+                *(_UNKNOWN.tobytes(), _UNKNOWN[:3].tobytes(), WGS84),
+            )
+            for i, p in known
+        ),
+    )

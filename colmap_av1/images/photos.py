@@ -38,6 +38,7 @@ class Photo:
             as COLMAP does.
         camera: what EXIF says of the camera; empty where it says nothing.
         focal_length: in pixels, by EXIF; None where it says nothing.
+        place: latitude and longitude in degrees, altitude in metres, by EXIF; None likewise.
         state: the state of the file when it was looked at.
     """
 
@@ -46,6 +47,7 @@ class Photo:
     size: tuple[int, int]
     camera: str
     focal_length: float | None
+    place: tuple[float, float, float] | None
     state: FileState
 
 
@@ -116,8 +118,17 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         if bitmap is None or _is_cut_short(path):
             raise ImageError(f"{path}: is damaged: copy it anew, or remove it")
         camera, focal_length = bitmap.exif_camera_model() or "", bitmap.exif_focal_length()
-        photos.append(Photo(path, name, size, camera, focal_length, file_state(path)))
+        place = _place_of(bitmap)
+        photos.append(Photo(path, name, size, camera, focal_length, place, file_state(path)))
     return photos
+
+
+def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
+    """Where a photo was taken, by EXIF; at sea level where that says no altitude."""
+    latitude, longitude = bitmap.exif_latitude(), bitmap.exif_longitude()
+    if latitude is None or longitude is None:
+        return None
+    return float(latitude), float(longitude), float(bitmap.exif_altitude() or 0)
 
 
 def _is_cut_short(path: Path) -> bool:

@@ -22,7 +22,9 @@ from colmap_av1.util.files import may_read
 
 _FILES = ("cameras", "images", "points3D")
 # Files of folders of models, as `map` and `densify` write them.
-MODEL_FILES = re.compile(r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log")
+MODEL_FILES = re.compile(
+    r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log|place\.json"
+)
 
 # Records of COLMAP's binary files, little-endian and packed.
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])

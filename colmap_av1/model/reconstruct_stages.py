@@ -20,6 +20,7 @@ from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
+from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
@@ -65,6 +66,7 @@ class Run:
         options: options of every stage.
         clock: gets the time of each stage.
         progress: called in each stage.
+        positions: where the images were taken; None before these are chosen.
     """
 
     inputs: Inputs
@@ -74,6 +76,7 @@ class Run:
     options: ReconstructOptions
     clock: Clock
     progress: Progress
+    positions: ImagePositions | None = None
 
     @property
     def files(self) -> tuple[FileState, ...]:
@@ -263,7 +266,10 @@ def match_stage(
         linked, cameras = _match_images(run, videos, sparse, keyed, images_apart=apart)
         matched = linked.matched
         with clock.measure("database"):
-            write_matched_images(partial / "database.db", keyed.images.names, cameras, matched)
+            write_matched_images(
+                *(partial / "database.db", keyed.images.names, cameras, matched),
+                places=run.positions.places[index] if run.positions is not None else None,
+            )
         _write_links(partial / run.stages.name, linked)
         of_videos = cameras[: keyed.images_of(len(videos)).start]
         return {
@@ -284,6 +290,7 @@ def match_stage(
         [
             [t.digest for t in tracked],
             *(takes.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
+            run.positions.digest if run.positions is not None else None,
         ],
         into=run.output,
         products=["database.db", f"{run.stages.name}/{_LINKS}"],

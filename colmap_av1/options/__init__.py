@@ -18,6 +18,7 @@ from colmap_av1.options.model import (
     MapperOptions,
     TriangulateOptions,
 )
+from colmap_av1.options.place import PlaceOptions
 from colmap_av1.options.run import RunOptions
 from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
 from colmap_av1.options.video import EncodeOptions, ReadOptions
@@ -41,6 +42,7 @@ __all__ = [
     "MatchOptions",
     "OnExisting",
     "PairOptions",
+    "PlaceOptions",
     "ReadOptions",
     "ReconstructOptions",
     "RefineOptions",

@@ -12,6 +12,7 @@ from colmap_av1.options.fields import Options, option, part
 from colmap_av1.options.images import ImageOptions, MaskOptions
 from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.options.model import MapperOptions, TriangulateOptions
+from colmap_av1.options.place import PlaceOptions
 from colmap_av1.options.run import RunOptions
 from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
 from colmap_av1.options.video import EncodeOptions, ReadOptions
@@ -78,6 +79,7 @@ class ReconstructOptions(Options):
     )
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
+    place: PlaceOptions = part(PlaceOptions())
     max_images: int = option(
         300,
         "images of a video with more frames, spread evenly in parallax and as close together as "

@@ -149,6 +149,29 @@ def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
     return found if np.all(np.diff(found) > 0) else None
 
 
+def picture_times(video: Video) -> NDArray[np.float64] | None:
+    """Presentation times of all pictures of a video of any codec, those hidden by edits, too.
+
+    Returns:
+        float64 [n] seconds, ascending, up to a damage; None where the container gives none.
+
+    Raises:
+        VideoError: the file cannot be opened.
+    """
+    times: list[float] = []
+    with (
+        open_container(video.path) as container,
+        contextlib.suppress(av.error.FFmpegError, OSError),
+    ):
+        for packet in container.demux(container.streams[video.index]):
+            if packet.size and packet.pts is None:
+                return None
+            if packet.size:
+                times.append(float(packet.pts * packet.time_base))
+    # Where pictures are coded out of order, packets come in another order than pictures.
+    return np.sort(np.array(times)) if times else None
+
+
 def with_counted_packets(file: VideoFile) -> VideoFile:
     """The same facts, with the packets counted where the container does not say their number.
 

@@ -18,7 +18,7 @@ from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.reports import map_rows
 from colmap_av1.cli.terminal import progress_bars
 from colmap_av1.map import map_database
-from colmap_av1.options import MapOptions
+from colmap_av1.options import MapOptions, PlaceOptions
 
 
 def add_map(commands: Any) -> None:
@@ -36,7 +36,7 @@ def add_map(commands: Any) -> None:
     )
     add_output(command, "new folder for the models; 0 is the one with the most images")
     add_overwrite(command, ONLY_MODELS)
-    add_options(command, MapOptions)
+    add_options(command, MapOptions, PlaceOptions)
     add_quiet(command)
 
 
@@ -48,6 +48,7 @@ def _run(namespace: argparse.Namespace) -> None:
             namespace.image_path,
             namespace.output,
             options=options,
+            place=given(namespace, PlaceOptions),
             progress=report,
             overwrite=namespace.overwrite,
         )

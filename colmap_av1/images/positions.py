@@ -1,0 +1,101 @@
+"""Where images were taken, as the containers of their videos and the EXIF data of photos say."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.images.photos import Photo
+from colmap_av1.images.takes import Takes
+from colmap_av1.video.facts import Video, picture_times
+from colmap_av1.video.positions import Positions, are_places, interpolate, read_positions
+
+
+@dataclass(frozen=True)
+class ImagePositions:
+    """What is known of where images were taken, and how the camera was held.
+
+    Attributes:
+        places: float64 [num_images, 3] latitude and longitude in degrees, altitude in metres
+            (WGS 84); NaN where unknown.
+        gravity: float64 [num_images, 3] direction of gravity in axes of the camera, see
+            `Positions`; NaN where unknown.
+        place: the one position of a whole video; None: none is said, or there are others.
+    """
+
+    places: NDArray[np.float64]
+    gravity: NDArray[np.float64]
+    place: tuple[float, float, float] | None
+
+    @property
+    def digest(self) -> str:
+        """Identifies them."""
+        arrays = self.places.tobytes() + self.gravity.tobytes()
+        return hashlib.sha256(arrays + repr(self.place).encode()).hexdigest()
+
+
+def image_positions(
+    takes: Takes, videos: Sequence[Video], photos: Sequence[Photo]
+) -> ImagePositions:
+    """Find where images were taken: those of videos by time, between positions that are said.
+
+    Args:
+        takes: the images.
+        videos: the videos, of any codec.
+        photos: the photos.
+
+    Raises:
+        VideoError: a file cannot be read.
+    """
+    places = np.full((len(takes.take), 3), np.nan)
+    gravity = np.full_like(places, np.nan)
+    one: list[tuple[float, float, float]] = []
+    for number, video in enumerate(videos):
+        found = read_positions(video)
+        if found is None:
+            continue
+        one += [found.place] if found.place is not None else []
+        if not (len(found.times) or len(found.gravity_times)):
+            continue
+        images, frames = takes.images_of(number), takes.of_video(number).frames
+        times = _times_since_start(video)
+        if times is not None and len(frames) and frames[-1] < len(times):
+            own = slice(images.start, images.stop)
+            places[own] = _places(found, times[frames])
+            gravity[own] = _gravity(found, times[frames])
+    first = len(takes.take) - len(photos)
+    for index, photo in enumerate(photos, start=first):
+        if photo.place is not None and are_places(np.array([photo.place]))[0]:
+            places[index] = photo.place
+    no_path = not np.isfinite(places).any() and one
+    return ImagePositions(places, gravity, one[0] if no_path else None)
+
+
+def _times_since_start(video: Video) -> NDArray[np.float64] | None:
+    """Seconds of the frames that players show after the first picture; None where unknown."""
+    times = picture_times(video)
+    if times is None:
+        return None
+    since: NDArray[np.float64] = times - times[0]
+    if video.presented is None:
+        return since
+    return np.asarray(since[video.presented[video.presented < len(since)]])
+
+
+def _places(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Both sides of the date line are one neighbourhood.
+    east = np.unwrap(found.places[:, 1], period=360.0)
+    places = np.column_stack([found.places[:, 0], east, found.places[:, 2]])
+    between = interpolate(times, found.times, places)
+    between[:, 1] = (between[:, 1] + 180) % 360 - 180
+    return between
+
+
+def _gravity(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    between = interpolate(times, found.gravity_times, found.gravity)
+    length = np.linalg.norm(between, axis=1, keepdims=True)
+    return np.asarray(between / np.where(length > 0, length, np.nan))

@@ -1,0 +1,206 @@
+"""Similarities, and the one that brings a camera path onto positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
+
+# Positions of receivers scatter by this much within minutes, in metres; others have jumped.
+_MAX_ERROR = 3.0
+# A path that spans less, as a root mean square in metres, is one of a receiver at rest.
+_LEAST_SPREAD = 1.0
+_LEAST_POSITIONS = 3
+# Share of positions that have not jumped, and error of the scale, that a path is placed with.
+_LEAST_SHARE = 0.6
+_LARGEST_SCALE_ERROR = 0.1
+# Length in metres of the posts that stand on the path for what is up: as one that is 10 degrees
+# off moves a post's end by less than an error, a wide path of good positions still decides.
+_POST = 12.0
+_NUM_TRIALS = 10_000
+_ITERATIONS = 10
+# Error of positions, in metres, that no agreement of them makes less.
+_LEAST_ERROR = 0.1
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The map x -> scale * rotation @ x + translation.
+
+    Attributes:
+        scale: above 0.
+        rotation: float64 [3, 3].
+        translation: float64 [3].
+    """
+
+    scale: float
+    rotation: _Floats
+    translation: _Floats
+
+    def apply(self, points: _Floats) -> _Floats:
+        """Where points [n, 3] come to lie."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def apply_to_poses(self, cam_from_world: _Floats) -> _Floats:
+        """Poses [n, 3, 4] of the same cameras in the world that it maps to."""
+        rotation = cam_from_world[:, :, :3] @ self.rotation.T
+        translation = self.scale * cam_from_world[:, :, 3] - rotation @ self.translation
+        return np.concatenate([rotation, translation[:, :, None]], axis=2)
+
+
+@dataclass(frozen=True)
+class Up:
+    """What is up in a model.
+
+    Attributes:
+        direction: float64 [3] unit vector.
+        error: how far it may be off, in radians.
+    """
+
+    direction: _Floats
+    error: float
+
+
+@dataclass(frozen=True)
+class PathFit:
+    """A path that fits positions.
+
+    Attributes:
+        similarity: brings it there.
+        num_used: positions that agree.
+        error: root mean square of their distances to the path, in metres.
+        scale_error: standard error of the scale, as a fraction of it.
+    """
+
+    similarity: Similarity
+    num_used: int
+    error: float
+    scale_error: float
+
+
+def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | str:
+    """Bring a camera path onto positions, some of which may have jumped.
+
+    A straight path leaves open how far it is turned around itself: posts that stand upright on it
+    say so, in the same estimation (LO-RANSAC, Chum et al. 2003).
+
+    Args:
+        path: float64 [n, 3] camera centres.
+        positions: float64 [n, 3] where they were, in metres, z up.
+        up: what is roughly up in the path's world.
+        seed: of the random samples.
+
+    Returns:
+        The fit; in words why there is none.
+    """
+    if len(path) < _LEAST_POSITIONS:
+        return f"only {len(path)} images have one"
+    distinct = len(np.unique(positions.round(2), axis=0))
+    spread = _spread(positions)
+    if distinct < _LEAST_POSITIONS or spread < _LEAST_SPREAD:
+        return f"they stand still, within {spread:.1f} m"
+    rough = _rough_scale(path, positions)
+    if rough is None:
+        return "the camera does not move"
+    post = _POST / rough
+    pycolmap.set_random_seed(seed)
+    found = pycolmap.estimate_sim3d_robust(
+        np.concatenate([path, path + post * up.direction]),
+        np.concatenate([positions, positions + _POST * _UP]),
+        pycolmap.RANSACOptions(max_error=_MAX_ERROR, max_num_trials=_NUM_TRIALS),
+    )
+    if found is None:
+        return "the camera's path has another shape"
+    best = found["tgt_from_src"]
+    rough_fit = Similarity(
+        float(best.scale), np.asarray(best.rotation.matrix()), np.asarray(best.translation)
+    )
+    similarity, used = _refined(path, positions, up, rough_fit)
+    away = np.linalg.norm(similarity.apply(path) - positions, axis=1)
+    if used.mean() < _LEAST_SHARE:
+        return f"{np.mean(~used):.0%} of them are {_MAX_ERROR:.0f} m and more from the path"
+    error = float(np.sqrt(np.mean(away[used] ** 2)))
+    # Images between two positions say nothing of their own.
+    num_distinct = len(np.unique(positions[used].round(2), axis=0))
+    scale_error = error / (_spread(positions[used]) * np.sqrt(num_distinct))
+    if scale_error > _LARGEST_SCALE_ERROR:
+        return f"they scatter by {error:.1f} m over a path of {spread:.1f} m"
+    return PathFit(similarity, int(used.sum()), error, float(scale_error))
+
+
+def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Floats:
+    """Metres east, north and up of an origin, in the plane that touches the ellipsoid there.
+
+    Args:
+        places: float64 [n, 3] latitude and longitude in degrees, altitude in metres (WGS 84).
+        origin: likewise.
+    """
+    to_ecef = pycolmap.GPSTransform().ellipsoid_to_ecef
+    away = np.asarray(to_ecef(places)) - np.asarray(to_ecef(np.array([origin])))
+    latitude, longitude = np.deg2rad(origin[:2])
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    axes = np.array(
+        [
+            [-sin_lon, cos_lon, 0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
+    return np.asarray(away @ axes.T)
+
+
+def _refined(
+    path: _Floats, positions: _Floats, up: Up, start: Similarity
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """The similarity of least squares of the positions that agree and of what is up.
+
+    Scale and translation come from the positions alone (Umeyama 1991); to the rotation what is up
+    adds one more direction, by its own accuracy.
+
+    Returns:
+        The similarity, and the positions that agree.
+    """
+    found = start
+    for _ in range(_ITERATIONS):
+        away = np.linalg.norm(found.apply(path) - positions, axis=1)
+        used = away <= _MAX_ERROR
+        if used.sum() < _LEAST_POSITIONS:
+            return found, used
+        error = max(float(np.sqrt(np.mean(away[used] ** 2))), _LEAST_ERROR)
+        # Images between two positions say nothing of their own.
+        share = len(np.unique(positions[used].round(2), axis=0)) / int(used.sum())
+        here, there = (
+            path[used] - path[used].mean(axis=0),
+            positions[used] - positions[used].mean(axis=0),
+        )
+        moment = found.scale * share / error**2 * there.T @ here
+        moment += np.outer(_UP, up.direction) / up.error**2
+        u, _, vt = np.linalg.svd(moment)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        scale = float((there * (here @ rotation.T)).sum() / (here**2).sum())
+        if scale <= 0:
+            return found, used
+        mean = scale * rotation @ path[used].mean(axis=0)
+        found = Similarity(scale, rotation, positions[used].mean(axis=0) - mean)
+    return found, used
+
+
+def _spread(points: _Floats) -> float:
+    return float(np.sqrt(np.mean(((points - np.median(points, axis=0)) ** 2).sum(axis=1))))
+
+
+def _rough_scale(path: _Floats, positions: _Floats) -> float | None:
+    """Metres to the path's unit: the median over pairs of images far apart."""
+    half = max(len(path) // 2, 1)
+    there = np.linalg.norm(positions[half:] - positions[:-half], axis=1)
+    here = np.linalg.norm(path[half:] - path[:-half], axis=1)
+    moved = here > 1e-9 * max(float(np.abs(path).max()), 1e-9)
+    if not moved.any() or not (there[moved] > 0).any():
+        return None
+    return float(np.median(there[moved] / here[moved])) or None

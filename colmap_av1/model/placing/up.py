@@ -1,0 +1,158 @@
+"""What is up in a model: by gravity, by vertical lines in its pictures, or by how it was filmed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
+_Item = TypeVar("_Item")
+
+# How much further from the mean of the images' own up a direction is taken that turns less
+# with them: cameras are pitched up and down more than they are rolled.
+_PITCH_WEIGHT = 0.005
+# Lines that stand within this angle of what is up by the cameras alone, and their least number.
+_LARGEST_LEAN = np.sin(np.deg2rad(20))
+_LEAST_LINES = 20
+# Angle of a line to the vertical from which on it counts less.
+_LINE_SCALE = np.sin(np.deg2rad(1))
+_ITERATIONS = 20
+# Shortest line, as a share of the image's shorter side, and pixels of that in which lines are
+# looked for.
+_SHORTEST_LINE = 0.06
+_LINE_PICTURE = 720
+_NUM_PICTURES = 12
+# Directions of gravity of which the axes of the recorder are found, in degrees at the most apart.
+_LARGEST_SCATTER = 10.0
+
+
+def up_of_cameras(cam_from_world: _Floats) -> _Floats:
+    """Unit vector that is up, as the cameras [n, 3, 4] were held: rolled little.
+
+    It is across the images' horizontal axes; where these have one direction only, as near to the
+    images' own up as that allows.
+    """
+    across, down = cam_from_world[:, 0, :3], cam_from_world[:, 1, :3]
+    mean = -down.mean(axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    rolled = across.T @ across / len(across)
+    pitched = _PITCH_WEIGHT * (np.eye(3) - np.outer(mean, mean))
+    found = np.linalg.eigh(rolled + pitched)[1][:, 0]
+    return np.asarray(found if found @ mean >= 0 else -found)
+
+
+def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, float] | None:
+    """What is up by the direction of gravity in axes of a recorder that may be any of the camera's.
+
+    Makers count these axes differently, and turn them with the picture: of all 48 orders and
+    signs, those are right by which gravity has one direction while the camera turns, and points
+    down in the images.
+
+    Args:
+        cam_from_world: float64 [n, 3, 4].
+        gravity: float64 [n, 3] vectors; NaN where unknown.
+
+    Returns:
+        The unit vector, and the scatter of single images in degrees; None where gravity is
+        unknown, or has no one direction by any axes.
+    """
+    known = np.isfinite(gravity).all(axis=1)
+    if not known.any():
+        return None
+    rotation, gravity = cam_from_world[known, :, :3], gravity[known]
+    gravity = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
+    best: tuple[float, _Floats, float] | None = None
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            seen = gravity[:, order] * signs
+            world = np.einsum("nij,ni->nj", rotation, seen)
+            mean = world.mean(axis=0)
+            length = max(float(np.linalg.norm(mean)), 1e-12)
+            scatter = 1 - length
+            # Down in the images is +y; what is off by less than a right angle is no objection.
+            score = scatter + 0.02 * (1 - float(np.mean(seen[:, 1])))
+            if best is None or score < best[0]:
+                spread = np.rad2deg(np.arccos(np.clip(world @ mean / length, -1, 1)))
+                best = score, -mean / length, float(np.median(spread))
+    assert best is not None
+    return (best[1], best[2]) if best[2] <= _LARGEST_SCATTER else None
+
+
+def vertical_lines(
+    picture: NDArray[np.uint8], camera: object, pose: _Floats, up: _Floats
+) -> _Floats:
+    """Planes through the camera and lines in its picture that may be vertical.
+
+    Args:
+        picture: uint8 [height, width, 3].
+        camera: its pycolmap.Camera.
+        pose: float64 [3, 4] cam_from_world.
+        up: unit vector that is roughly up.
+
+    Returns:
+        float64 [n, 3] unit normals of the planes in the world; what is up is across each.
+    """
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    shrink = min(1.0, _LINE_PICTURE / min(grey.shape))
+    small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    found = cv2.createLineSegmentDetector().detect(small)[0]
+    if found is None:
+        return np.empty((0, 3))
+    ends = found.reshape(-1, 2, 2).astype(np.float64)
+    long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _SHORTEST_LINE * min(small.shape)
+    # OpenCV counts from the centre of the first pixel.
+    pixels = (ends[long].reshape(-1, 2) + 0.5) / shrink
+    rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])  # type: ignore[attr-defined]
+    rays = rays.reshape(-1, 2, 3) @ pose[:, :3]
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 0] / length[length > 0, None]
+    return np.asarray(normals[np.abs(normals @ up) < _LARGEST_LEAN])
+
+
+def some_spread(items: Sequence[_Item]) -> list[_Item]:
+    """As many of some items, evenly spread, as lines are looked for in pictures of."""
+    few = np.unique(np.linspace(0, len(items) - 1, _NUM_PICTURES).round().astype(int))
+    return [items[i] for i in few]
+
+
+def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
+    """The direction that most lines have: iteratively reweighted least squares, Cauchy's loss.
+
+    Args:
+        normals: what `vertical_lines` gives of each picture.
+        up: unit vector that is roughly up.
+
+    Returns:
+        The unit vector; None where the lines are few, or few of them agree.
+    """
+    planes = np.concatenate([np.empty((0, 3)), *normals])
+    if len(planes) < _LEAST_LINES:
+        return None
+    found, scale = up, float(_LARGEST_LEAN)
+    for _ in range(_ITERATIONS):
+        weight = 1 / (1 + (planes @ found / scale) ** 2)
+        turned = np.linalg.eigh((weight[:, None] * planes).T @ planes)[1][:, 0]
+        found = turned if turned @ found >= 0 else -turned
+        scale = max(scale / 1.5, float(_LINE_SCALE))
+    agree = np.abs(planes @ found) < 2 * _LINE_SCALE
+    if agree.sum() < _LEAST_LINES or found @ up < np.cos(np.arcsin(_LARGEST_LEAN)):
+        return None
+    return np.asarray(found)
+
+
+def rotation_to_up(up: _Floats) -> _Floats:
+    """The smallest rotation [3, 3] that turns a unit vector to +z."""
+    target = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(up, target)
+    cosine = float(up @ target)
+    if cosine < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))

@@ -1,0 +1,126 @@
+"""GoPro's telemetry (GPMF) in the packets of a container: positions and the direction of gravity.
+
+A payload is a tree of items: a key of four letters, a type, the size of an element, their number,
+and the elements, padded to 32 bits, all big-endian (https://github.com/gopro/gpmf-parser). PyAV
+gives the packets, and of hundreds of streams three matter here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_HEADER = struct.Struct(">4sBBH")
+_NESTED = 0
+_COMPLEX = ord("?")
+# Types of numbers, by GPMF's letters.
+_NUMBERS = {
+    **{"b": "i1", "B": "u1", "s": ">i2", "S": ">u2", "l": ">i4", "L": ">u4"},
+    **{"f": ">f4", "d": ">f8", "j": ">i8", "J": ">u8"},
+}
+_LEAST_FIX = 2  # GPSF and the last number of GPS9: 0 without a lock, else its dimensions
+_METRES = 3  # latitude, longitude, altitude
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What a packet holds.
+
+    Attributes:
+        positions: float64 [n, 3] latitude and longitude in degrees, altitude in metres, NaN
+            without a fix; evenly spread over the packet's time.
+        gravity: float64 [m, 3] direction of gravity in axes of the camera, spread likewise.
+        read_out: time in seconds from the first row of a picture to the last; None: not said.
+    """
+
+    positions: NDArray[np.float64]
+    gravity: NDArray[np.float64]
+    read_out: float | None
+
+
+def read_payload(data: bytes) -> Payload:
+    """Read a packet; what is damaged or cut off is left out."""
+    positions, gravity = np.empty((0, 3)), np.empty((0, 3))
+    read_out: float | None = None
+    for stream in _streams(data):
+        named = dict(stream)
+        for key, values in stream:
+            if key == "GPS5":
+                positions = _with_fix(_scaled(values, named)[:, :_METRES], named)
+            elif key == "GPS9":
+                scaled = _scaled(values, named)
+                positions = scaled[:, :_METRES].copy()
+                positions[scaled[:, -1] < _LEAST_FIX] = np.nan
+            elif key == "GRAV":
+                gravity = _scaled(values, named)
+            elif key == "SROT" and values.size:  # milliseconds
+                read_out = float(values.flat[0]) / 1000
+    return Payload(positions, gravity, read_out)
+
+
+_Stream = list[tuple[str, NDArray[np.float64]]]
+
+
+def _streams(data: bytes) -> Iterator[_Stream]:
+    """The numbers of each innermost item that holds others, in their order."""
+    found: _Stream = []
+    type_of: str | None = None
+    for key, kind, size, body in _items(data):
+        if kind == _NESTED:
+            yield from _streams(body)
+        elif key == "TYPE":  # of the elements of the complex item after it
+            type_of = body.rstrip(b"\0").decode("latin1")
+        else:
+            letters = type_of if kind == _COMPLEX else chr(kind)
+            values = _numbers(body, letters, size)
+            if values is not None:
+                found.append((key, values))
+    if found:
+        yield found
+
+
+def _items(data: bytes) -> Iterator[tuple[str, int, int, bytes]]:
+    """Key, type, size of an element, and content of each item up to the first that is cut off."""
+    at = 0
+    while at + _HEADER.size <= len(data):
+        key, kind, size, count = _HEADER.unpack_from(data, at)
+        at += _HEADER.size
+        if at + size * count > len(data):
+            return
+        yield key.decode("latin1"), kind, size, data[at : at + size * count]
+        at += -(-size * count // 4) * 4
+
+
+def _numbers(body: bytes, letters: str | None, size: int) -> NDArray[np.float64] | None:
+    """Float64 [n, k] elements of k numbers; None where they are no numbers."""
+    if not letters or size == 0 or any(letter not in _NUMBERS for letter in letters):
+        return None
+    kinds = [np.dtype(_NUMBERS[letter]) for letter in letters]
+    width = sum(kind.itemsize for kind in kinds)
+    if width == 0 or size % width:
+        return None
+    element = np.dtype([(f"f{i}", kind) for i, kind in enumerate(kinds * (size // width))])
+    rows: Any = np.frombuffer(body, dtype=element)
+    columns: Sequence[NDArray[Any]] = [
+        rows[name].astype(np.float64) for name in element.names or ()
+    ]
+    return np.column_stack(columns)
+
+
+def _scaled(values: NDArray[np.float64], named: dict[str, NDArray[np.float64]]) -> Any:
+    """The numbers in their units: divided by SCAL, one for all or one for each."""
+    scale = named.get("SCAL", np.ones(1)).ravel()
+    if len(scale) not in (1, values.shape[1]) or not scale.all():
+        return np.empty((0, values.shape[1]))
+    return values / scale
+
+
+def _with_fix(positions: NDArray[np.float64], named: dict[str, NDArray[np.float64]]) -> Any:
+    fix = named.get("GPSF")
+    has_fix = fix is None or (fix.size > 0 and fix.flat[-1] >= _LEAST_FIX)
+    return positions if has_fix else np.full_like(positions, np.nan)
