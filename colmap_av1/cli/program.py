@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
+from colmap_av1.cli.addresses import videos_at_hand
 from colmap_av1.cli.commands.batch import add_batch
 from colmap_av1.cli.commands.check import add_check
 from colmap_av1.cli.commands.compare import add_compare
@@ -58,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings_as_lines(), ending_in_order():
             words = sys.argv[1:] if arguments is None else arguments
             namespace = _parse([underscored(word) for word in words])
-            status: int | None = namespace.run(namespace)
+            with videos_at_hand(namespace):
+                status: int | None = namespace.run(namespace)
     except ColmapAv1Error as error:
         print_error(error)
         return BAD_INPUT

@@ -211,7 +211,9 @@ def write_images(
     report(0)
     if not wanted:
         return 0
-    for parent in {path.parent for path in wanted.values()}:
+    parents = {path.parent for path in wanted.values()}
+    made = [parent for parent in parents if not parent.exists()]
+    for parent in parents:
         try:
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -230,6 +232,9 @@ def write_images(
     except VideoError:  # images of two videos would be kept as those of one
         for path in wanted.values():
             path.unlink(missing_ok=True)
+        for parent in made:
+            with contextlib.suppress(OSError):  # it holds what was not written here
+                parent.rmdir()
         raise
     return len(wanted)
 

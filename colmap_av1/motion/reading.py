@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.errors import BitstreamError, LimitError
+from colmap_av1.errors import BitstreamError, LimitError, OptionError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import ReadOptions
 from colmap_av1.util.arguments import checks_arguments
@@ -80,6 +80,7 @@ def read_motion(
         BitstreamError: the stream is damaged before its first frame is complete; with
             `options.strict`, it is damaged anywhere or a tile ends otherwise than specified.
         LimitError: a frame is larger than `options.max_frame_size`.
+        OptionError: the stream does not have `options.operating_point`.
         VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
     """
     options = options if options is not None else ReadOptions()
@@ -141,6 +142,12 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
                     shown.append(decoded)
     except BitstreamError:
         pass
+    sequence = parser.sequence_header()
+    if sequence is not None:
+        point, last = options.operating_point, sequence["operating_points_cnt_minus_1"]
+        if point > last:
+            points = f"points 0 to {last}" if last else "point 0 alone"
+            raise OptionError(f"{video}: has no operating_point {point}: the stream has {points}")
     return _Index(shown, groups, num_units)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Container, Generator, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import BitstreamError
+from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.video.container import reason_of
 from colmap_av1.video.display import Display, shown_picture
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.stored_frames import decode
@@ -39,7 +41,7 @@ def decode_frames(
 
     Raises:
         BitstreamError: the stream is damaged; the frames before have been given.
-        VideoError: as `read_video`.
+        VideoError: as `read_video`, or the stream names colours that there are none of.
     """
     video = read_video(video, operating_point)
     how = display if display is not None else video.display
@@ -50,7 +52,7 @@ def decode_frames(
     def shown(number: int, frame: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         index = number if index_of is None else index_of.get(number)
         if index is not None and (wanted is None or index in wanted):
-            yield index, shown_picture(frame.to_ndarray(format="bgr24"), how)
+            yield index, shown_picture(_in_colours(frame, video.path), how)
 
     count = 0
     try:
@@ -64,3 +66,14 @@ def decode_frames(
         for number, frame in enumerate(decode(video, operating_point, 1)):
             if number >= count:
                 yield from shown(number, frame)
+
+
+def _in_colours(frame: Any, path: Path) -> NDArray[np.uint8]:
+    try:
+        return np.asarray(frame.to_ndarray(format="bgr24"))
+    except OSError as error:
+        raise VideoError(
+            f"{path}: pictures of format {frame.format.name} with colour matrix "
+            f"{int(frame.colorspace)} cannot be converted: {reason_of(error)}: name the right "
+            "colours with 'ffmpeg -i VIDEO -c copy -bsf:v av1_metadata=matrix_coefficients=1 NEW'"
+        ) from error

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import Encode, make_frames
+from conftest import PROJECT, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.database.hloc import read_hloc
@@ -22,6 +22,7 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.encode import stream_of
 
+LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
 posix = pytest.mark.skipif(os.name != "posix", reason="there are no such files or users")
 
 
@@ -46,14 +47,6 @@ def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     words = ["match", "--database", database, "--video", str(clip), "--frame_list", pipe]
     assert "is no regular file: copy it to one first" in told(words, capsys)
     assert os.listdir(tmp_path) == ["pipe"]
-
-
-def test_addresses(capsys: pytest.CaptureFixture[str]) -> None:
-    for address in ("http://example.org/a b.mp4", "s3://bucket/v.mp4", "https://x:8/y?z#1"):
-        error = told(["info", "--video", address], capsys)
-        assert error == (
-            f"colmap-av1: error: {address}: is no file: fetch it first, and give its path\n"
-        )
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -91,6 +84,29 @@ def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str])
     for command in (["info"], ["match", "--database", "a.db"], ["reconstruct", "--output", "out"]):
         error = told([*command, "--video", "none.mp4", "--operating_point", "99"], capsys)
         assert error == "colmap-av1: error: operating_point is 99: give 0 to 31\n"
+
+
+def test_operating_points_that_this_stream_has_not(
+    clip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for video, point, points in ((clip, 1, "point 0 alone"), (LAYERS, 2, "points 0 to 1")):
+        error = told(["info", "--video", str(video), "--operating_point", str(point)], capsys)
+        assert f"{video}: has no operating_point {point}: the stream has {points}\n" in error
+
+
+def test_colours_that_there_are_none_of(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Motion is read all the same; a matrix that is reserved says nothing of colours."""
+    reserved = ffmpeg(
+        *("-i", clip, "-c", "copy", "-bsf:v", "av1_metadata=matrix_coefficients=3"),
+        tmp_path / "v.mp4",
+    )
+    words = ["match", "--quiet", "--video", str(reserved), "--database"]
+    assert main([*words, str(tmp_path / "a.db")]) == 0
+    with_images = [*words, str(tmp_path / "b.db"), "--image_path", str(tmp_path / "images")]
+    assert "colour matrix 3 cannot be converted" in told(with_images, capsys)
+    assert sorted(os.listdir(tmp_path)) == ["a.db", "v.mp4"]
 
 
 def test_one_frame(encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

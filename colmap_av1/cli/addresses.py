@@ -1,0 +1,63 @@
+"""Videos that are given by a URL: fetched before a command, gone after it."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote, urlsplit
+
+from colmap_av1.batch.files import absolute, fetch, is_url
+from colmap_av1.batch.jobs import Source
+from colmap_av1.cli.terminal import print_note
+from colmap_av1.errors import OptionError
+from colmap_av1.options import BatchOptions
+
+
+@contextmanager
+def videos_at_hand(namespace: argparse.Namespace) -> Iterator[None]:
+    """Put files in place of URLs among the videos of a command.
+
+    fsspec reads the URLs; it is no dependency of the package, but comes with an extra.
+
+    Raises:
+        OptionError: fsspec, or what it needs for such a URL, is missing; or it knows none such.
+        VideoError: there is no such file.
+        OSError: it cannot be read, or stands still, or there is no room for it.
+    """
+    given = getattr(namespace, "video", None)
+    videos = given if isinstance(given, list) else [given]
+    if not any(_is_elsewhere(video) for video in videos):
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="colmap-av1-") as folder:
+        found = [
+            _fetched(video, Path(folder) / str(number), namespace.quiet)
+            if _is_elsewhere(video)
+            else video
+            for number, video in enumerate(videos)
+        ]
+        namespace.video = found if isinstance(given, list) else found[0]
+        yield
+
+
+def _is_elsewhere(video: str | None) -> bool:
+    return video is not None and is_url(video) and not Path(video).exists()
+
+
+def _fetched(url: str, folder: Path, quiet: bool) -> str:
+    """A copy of a video under the name it has there, by which its images may be named."""
+    address = absolute(url)
+    if not is_url(address):
+        return address
+    folder.mkdir()
+    if not quiet:
+        print_note(f"fetching {url}")
+    try:
+        copy = fetch(Source(address), folder, BatchOptions().stall)
+    except OptionError as error:
+        raise OptionError(f"{error}; or fetch it first, and give its path") from error
+    name = PurePosixPath(unquote(urlsplit(url).path)).name
+    return str(copy.rename(folder / name) if name else copy)

@@ -1,0 +1,103 @@
+"""Videos given by a URL."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from colmap_av1.cli import main
+from colmap_av1.database.reading import read_images
+from colmap_av1.errors import VideoError
+from colmap_av1.video.container import open_container
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(clip: Path, tmp_path: Path) -> Iterator[str]:
+    """A web server with the clip, under a name with a space in it."""
+    folder = tmp_path / "served"
+    folder.mkdir()
+    (folder / "a clip.mp4").write_bytes(clip.read_bytes())
+    handler = functools.partial(_Quiet, directory=str(folder))
+    web = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    web.daemon_threads = True
+    threading.Thread(target=web.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{web.server_port}"
+    web.shutdown()
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files, which must be empty at the end."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def test_a_url_is_as_good_as_its_file(
+    server: str, clip: Path, tmp_path: Path, scratch: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    url = f"{server}/a%20clip.mp4"
+    for video, name in ((url, "a.db"), (str(clip), "b.db"), (clip.as_uri(), "c.db")):
+        assert main(["match", "--database", str(tmp_path / name), "--video", video]) == 0
+    assert f"colmap-av1: fetching {url}\n" in capsys.readouterr().err
+    fetched = (tmp_path / "a.db").read_bytes()
+    assert fetched == (tmp_path / "b.db").read_bytes() == (tmp_path / "c.db").read_bytes()
+
+    other = tmp_path / "other.mp4"
+    other.write_bytes(clip.read_bytes() + b"\0\0\0\x08free")
+    several = ["--quiet", "--links", "none", "--video", url, "--video", str(other)]
+    main(["match", "--database", str(tmp_path / "d.db"), *several])
+    folders = {image.name.partition("/")[0] for image in read_images(tmp_path / "d.db")}
+    assert folders == {"a_clip", "other"}
+    assert os.listdir(scratch) == []
+
+
+def test_urls_that_cannot_be_read(
+    server: str, scratch: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    for address, said in (
+        (f"{server}/none.mp4", "no such file: give the path of a video"),
+        ("nothing://x/v.mp4", "Protocol not known: nothing: give a path, or a URL that fsspec"),
+    ):
+        assert main(["info", "--quiet", "--video", address]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"colmap-av1: error: {address}: {said}")
+        assert error.count("\n") == 1
+    assert os.listdir(scratch) == []
+
+
+def test_without_fsspec(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    address = "s3://bucket/v.mp4"
+    assert main(["info", "--quiet", "--video", address]) == 2
+    assert capsys.readouterr().err == (
+        f"colmap-av1: error: {address}: needs the package fsspec: pip install "
+        "'colmap-av1[remote]'; or fetch it first, and give its path\n"
+    )
+
+
+def test_python_takes_files() -> None:
+    for address in ("http://example.org/a b.mp4", "https://x:8/y?z#1"):
+        with (
+            pytest.raises(VideoError, match="is no file: fetch it first"),
+            open_container(Path(address)),
+        ):
+            pass
