@@ -221,6 +221,8 @@ def dense_points(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
 
 
+# Error of camera centres, in per cent of their extent, up to which a model is straight.
+STRAIGHT = 0.5
 # The steps of `end_to_end.py`, and the one that each is compared with.
 SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
 SIFT_MODEL = "SIFT sequential: model"
@@ -342,6 +344,48 @@ def end_to_end_summary(rows: list[Row]) -> str:
     return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'sequence')}"
 
 
+def jerks(rows: list[Row]) -> str:
+    """Models of clips whose camera jerks, by sequence and way."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in sorted(rows, key=lambda row: (row["sequence"], row["way"])):
+        groups.setdefault((row["sequence"], row["way"]), []).append(row)
+
+    def errors(own: list[Row]) -> list[float]:
+        return sorted(float(row["ate"]) for row in own if row["ate"])
+
+    def straight(row: Row) -> bool:
+        return bool(row["ate"]) and float(row["ate"]) <= STRAIGHT
+
+    def whole(row: Row) -> bool:
+        return row["registered"] == row["images"]
+
+    def count(heading: str, test: Callable[[Row], bool]) -> Column:
+        return Column(heading, lambda row: str(sum(map(test, groups[key_of(row)]))))
+
+    def key_of(row: Row) -> tuple[str, str]:
+        return row["sequence"], row["way"]
+
+    def error(heading: str, place: float) -> Column:
+        def cell(row: Row) -> str:
+            found = errors(groups[key_of(row)])
+            return f"{found[int(place * (len(found) - 1))]:.2f} %" if found else ""
+
+        return Column(heading, cell)
+
+    columns = [
+        words("sequence, way", "sequence", "way"),
+        count("clips", lambda _: True),
+        count("whole and straight", lambda row: whole(row) and straight(row)),
+        count("parts straight, said", lambda row: not whole(row) and straight(row)),
+        count("bent, or none, said", lambda row: not straight(row) and bool(row["said"])),
+        count("bent, not said", lambda row: not straight(row) and not row["said"]),
+        error("median error of centres", 0.5),
+        error("largest", 1.0),
+    ]
+    firsts = [own[0] for own in groups.values()]
+    return f"{markdown(columns, firsts)}\n{measured_at(rows, 'sequence')}"
+
+
 def read_motion(rows: list[Row], threads: str) -> str:
     """Times of reading motion and of decoding: CPU time of one thread, real time of more."""
     rows = [row for row in rows if row["threads"] == threads]
@@ -435,6 +479,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "dense_points": dense_points,
     "phone_to_folder": phone_to_folder,
     "phone_to_folder.steps": phone_to_folder_steps,
+    "jerks": jerks,
     "end_to_end": end_to_end,
     "end_to_end.summary": end_to_end_summary,
     "read_motion": read_motion,

@@ -1,0 +1,332 @@
+"""Leave out frames where the camera then jerks, and measure whether models stay straight.
+
+python examples/benchmarks/jerks.py --cache benchmark_jerks --places 50
+
+Each place is a clip of its own: up to three gaps are cut into a sequence, at each of which 60 to
+200 px and at most 12 degrees lie between two frames; in every second clip the frames on either side
+are blurred along the motion. `reconstruct` maps the clip as it does any, and `match` fills a
+database that COLMAP's mapper maps. Camera centres are compared with those of the whole
+sequence: the true ones, or those of SIFT's model of it. A model is bent whose centres are off by
+more than half a per cent of their extent; what is said of it, and images left out, are counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import clips as ruler
+import cv2
+import imageio_ffmpeg
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import render
+from numpy.typing import NDArray
+from results import add_results, read_rows, save
+from rich.console import Console
+
+from colmap_av1 import (
+    ColmapAv1Error,
+    ImageOptions,
+    MapOptions,
+    MatchOptions,
+    ReconstructOptions,
+    map_database,
+    match,
+    reconstruct,
+)
+from colmap_av1.evaluate import (
+    measure_mapper,
+    model_poses,
+    pose_errors,
+    prepare_footage,
+    read_sequence,
+    run_frontend,
+    run_measured,
+)
+from colmap_av1.model.colmap_model import read_model
+from colmap_av1.options import CameraOptions
+from colmap_av1.video.decoding import decode_frames
+
+SEQUENCES = ("log_building", "ditch", "street", "holiday_display", "kitchen")
+WAYS = ("reconstruct", "match, mapper")
+PIXELS = (60.0, 200.0)
+DEGREES = 12.0
+MOST_GAPS = 3
+# Frames that stay at either end and between two gaps: a model of each part can be made.
+ROOM = 10
+# Lengths in pixels of the blur, of every second clip.
+BLURS = (9, 17, 25)
+# Points of an image that say how far the picture moves.
+POINTS = 3000
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A sequence as it is.
+
+    Attributes:
+        name: its name.
+        pictures: its frames.
+        camera: what is known of its camera.
+        forward_motion: see `MapOptions`.
+        model: SIFT's model of it, by which places are chosen.
+        poses: float64 [num_frames, 3, 4] true poses, or the model's; NaN where there is none.
+    """
+
+    name: str
+    pictures: list[Image]
+    camera: CameraOptions
+    forward_motion: bool
+    model: Any
+    poses: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Frames that are left out between two others.
+
+    Attributes:
+        before: the last frame before them.
+        after: the first frame after them.
+        pixels: how far the picture moves between these, by the median of the points.
+        degrees: how far the camera turns.
+    """
+
+    before: int
+    after: int
+    pixels: float
+    degrees: float
+
+    def __str__(self) -> str:
+        return f"{self.before}-{self.after}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one way made of one clip; `ate` in per cent of the extent, None without a model."""
+
+    place: int
+    sequence: str
+    way: str
+    gaps: str
+    pixels: float
+    degrees: float
+    blur: int
+    images: int
+    registered: int
+    ate: float | None
+    said: str
+
+
+def main() -> int:
+    """Try the places, and keep and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for models and clips")
+    parser.add_argument("--places", type=int, default=50, help="how many are tried")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    add_results(parser, "jerks")
+    arguments = parser.parse_args()
+    console = Console(stderr=True)
+    cache = arguments.cache.resolve()
+    whole: Whole | None = None
+    places = range(arguments.first, arguments.first + arguments.places)
+    # By sequence, so that the pictures of one are held at a time.
+    for place in sorted(places, key=lambda place: (place % len(SEQUENCES), place)):
+        name = SEQUENCES[place % len(SEQUENCES)]
+        if not ruler.is_there(name):
+            continue
+        if whole is None or whole.name != name:
+            whole = whole_sequence(name, cache / name, console)
+        for row in try_place(whole, place, cache / "place", console):
+            save(arguments.results, [asdict(row)], ("place", "way"))
+    print(render.jerks(read_rows(arguments.results)), end="")
+    return 0
+
+
+def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
+    """A sequence of ../shared with SIFT's model of it."""
+    sequence = read_sequence(ruler.SEQUENCES / name)
+    video = ruler.as_shot(sequence, folder / "source")
+    known = sequence.camera is not None
+    camera = ruler.camera_options(sequence.camera) if known else CameraOptions()
+    case = next((case for case in ruler.CASES if case.name == name), ruler.Case(name))
+    footage = prepare_footage(
+        video,
+        folder / "footage",
+        num_frames=sequence.num_frames,
+        image_step=case.image_step,
+        camera=camera,
+    )
+    console.print(f"{name}: SIFT's model of the whole", markup=False)
+    database = run_frontend("sift-sequential", footage, folder / "sift").database
+    settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
+    mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
+    if mapped.model is None:
+        raise ColmapAv1Error(f"{name}: SIFT makes no model: see {folder / 'model'}")
+    model = read_model(mapped.model)
+    poses = sequence.cam_from_world
+    if poses is None:
+        poses = model_poses(model, sequence.num_frames)
+    pictures = [picture for _, picture in decode_frames(video)]
+    return Whole(name, pictures, camera, case.forward_motion, model, poses)
+
+
+def try_place(whole: Whole, place: int, folder: Path, console: Console) -> list[Row]:
+    """A clip with gaps by both ways."""
+    rng = np.random.default_rng(place)
+    gaps = gaps_of(whole, rng)
+    blur = int(rng.choice(BLURS)) if place % 2 else 0
+    left_out = {frame for gap in gaps for frame in range(gap.before + 1, gap.after)}
+    kept = [frame for frame in range(len(whole.pictures)) if frame not in left_out]
+    console.print(f"{place}: {whole.name} without {', '.join(map(str, gaps))}", markup=False)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    clip = folder / "clip.mp4"
+    edges = {frame for gap in gaps for frame in (gap.before, gap.after)} if blur else set()
+    write_clip(
+        clip,
+        [
+            blurred(whole.pictures[frame], blur) if frame in edges else whole.pictures[frame]
+            for frame in kept
+        ],
+    )
+    rows = []
+    for way in WAYS:
+        made, said = way_of(way, whole, clip, folder)
+        num_registered, ate = figures(whole, made, kept)
+        row = Row(
+            place=place,
+            sequence=whole.name,
+            way=way,
+            gaps=" ".join(map(str, gaps)),
+            pixels=max((gap.pixels for gap in gaps), default=0.0),
+            degrees=max((gap.degrees for gap in gaps), default=0.0),
+            blur=blur,
+            images=len(kept),
+            registered=num_registered,
+            ate=ate,
+            said="; ".join(said),
+        )
+        rows.append(row)
+    return rows
+
+
+def gaps_of(whole: Whole, rng: np.random.Generator) -> list[Gap]:
+    """One to three gaps with room between them, in the order of their frames."""
+    posed = {number(image.name): image for image in whole.model.images.values() if image.has_pose}
+    frames = sorted(posed)
+    wanted = int(rng.integers(1, MOST_GAPS + 1))
+    gaps: list[Gap] = []
+    for before in rng.permutation(frames[ROOM:-ROOM]).tolist():
+        least = rng.uniform(*PIXELS)
+        gap = next(
+            (
+                found
+                for after in frames[frames.index(before) + 2 :]
+                for found in [gap_between(whole.model, posed, before, after)]
+                if found.pixels >= least
+            ),
+            None,
+        )
+        fits = gap is not None and gap.pixels <= 1.1 * PIXELS[1] and gap.degrees <= DEGREES
+        if gap is None or not fits or gap.after + ROOM > frames[-1]:
+            continue
+        if all(gap.before > own.after + ROOM or gap.after + ROOM < own.before for own in gaps):
+            gaps.append(gap)
+        if len(gaps) == wanted:
+            break
+    return sorted(gaps, key=lambda gap: gap.before)
+
+
+def gap_between(model: Any, posed: dict[int, Any], before: int, after: int) -> Gap:
+    """How far picture and camera move from one frame to another, by a model."""
+    first, second = posed[before], posed[after]
+    seen = [point for point in first.points2D if point.has_point3D()][:POINTS]
+    xy = np.array([point.xy for point in seen]).reshape(-1, 2)
+    xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
+    local = np.asarray(second.cam_from_world() * xyz)
+    ahead = local[:, 2] > 0
+    moved = np.asarray(model.cameras[second.camera_id].img_from_cam(local[ahead])) - xy[ahead]
+    pixels = float(np.median(np.hypot(*moved.T))) if len(moved) else np.inf
+    turn = (second.cam_from_world() * first.cam_from_world().inverse()).rotation
+    return Gap(before, after, pixels, float(np.degrees(turn.angle())))
+
+
+def number(name: str) -> int:
+    """The frame of an image, by its name."""
+    return int(Path(name).stem.rpartition("_")[2])
+
+
+def blurred(picture: Image, length: int) -> Image:
+    """The picture as of a camera that moves sideways meanwhile."""
+    line = np.full((1, length), 1 / length, np.float32)
+    return np.asarray(cv2.filter2D(picture, -1, line), np.uint8)
+
+
+def write_clip(path: Path, pictures: Sequence[Image]) -> None:
+    """Pictures as H.264 that loses next to nothing."""
+    height, width = pictures[0].shape[:2]
+    words = f"-v error -y -f rawvideo -pix_fmt bgr24 -s {width}x{height} -r 25 -i -".split()
+    words += ["-c:v", "libx264", "-preset", "veryfast", "-crf", "14", "-pix_fmt", "yuv420p"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *words, str(path)]
+    subprocess.run(command, input=b"".join(p.tobytes() for p in pictures), check=True)
+
+
+def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None, list[str]]:
+    """The model that a way makes of a clip, if any, and what it says of it."""
+    output = folder / way.partition(",")[0]
+    run = run_reconstruct if way == "reconstruct" else run_match
+    try:
+        given = (clip, output, whole.camera, whole.forward_motion)
+        said = run_measured(run, *given, log=folder / "log").result
+    except ColmapAv1Error as error:
+        return None, [str(error)]
+    model = "sparse/0" if way == "reconstruct" else "models/0"
+    return read_model(output / model), said
+
+
+def run_reconstruct(clip: Path, output: Path, camera: CameraOptions, _: bool) -> list[str]:
+    """The folder for trainers, as by the command with its defaults."""
+    images = ImageOptions(every=1)
+    options = ReconstructOptions(match=MatchOptions(camera=camera, images=images))
+    return about_the_model(reconstruct(clip, output, options=options).warnings)
+
+
+def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) -> list[str]:
+    """A database, mapped by COLMAP's incremental mapper."""
+    output.mkdir()
+    options = MatchOptions(camera=camera, images=ImageOptions(every=1))
+    matched = match(output / "a.db", clip, image_path=output / "images", options=options)
+    settings = MapOptions(refine_intrinsics=camera.camera_params is None, forward_motion=forward)
+    mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
+    others = [f"a further model of {n} images" for n in mapped.num_registered[1:]]
+    return about_the_model([*matched.warnings, *mapped.warnings, *others])
+
+
+def about_the_model(warnings: Sequence[str]) -> list[str]:
+    """What is said of models that fall apart or bend, and of images that are left out."""
+    signs = ("no pose", "further model", "join '", "far apart in time", "nothing connects")
+    return [warning for warning in warnings if any(sign in warning for sign in signs)]
+
+
+def figures(whole: Whole, model: Any | None, kept: list[int]) -> tuple[int, float | None]:
+    """Images with a pose, and the error of their centres in per cent of the true ones' extent."""
+    if model is None:
+        return 0, None
+    errors = pose_errors(model_poses(model, len(kept)), whole.poses[kept])
+    ate = None if errors is None else 100 * errors.ate / errors.extent
+    return model.num_reg_images(), ate
+
+
+if __name__ == "__main__":
+    sys.exit(main())
