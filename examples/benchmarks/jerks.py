@@ -309,13 +309,14 @@ def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) ->
     matched = match(output / "a.db", clip, image_path=output / "images", options=options)
     settings = MapOptions(refine_intrinsics=camera.camera_params is None, forward_motion=forward)
     mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
-    others = [f"a further model of {n} images" for n in mapped.num_registered[1:]]
-    return about_the_model([*matched.warnings, *mapped.warnings, *others])
+    missing = mapped.num_images - mapped.num_registered[0]
+    parts = [f"{missing} images have no pose in folder 0"] if missing else []
+    return about_the_model([*matched.warnings, *mapped.warnings, *parts])
 
 
 def about_the_model(warnings: Sequence[str]) -> list[str]:
     """What is said of models that fall apart or bend, and of images that are left out."""
-    signs = ("no pose", "further model", "join '", "far apart in time", "nothing connects")
+    signs = ("no pose", "join '", "far apart in time", "nothing connects")
     return [warning for warning in warnings if any(sign in warning for sign in signs)]
 
 
