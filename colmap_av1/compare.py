@@ -33,6 +33,7 @@ from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
+from colmap_av1.video.spherical import check_is_plane
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"
@@ -117,6 +118,7 @@ def compare(
     check_folder(output, [video, image_path, options.match.images.frame_list, *files])
     _check_reference(output, reference)
     video = read_video(video, options.match.read.operating_point)
+    check_is_plane(video.path, video.projection, video.picture_size[0])
     with open_stages(output, "compare"), _writing(output):
         footage = choose_footage(
             video,

@@ -19,6 +19,9 @@ from colmap_av1.options.camera import (
 # Models that a pinhole camera is a first guess of, and those of them without distortion.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# First guesses of the focal length, in longer sides of an image: COLMAP's own, which spans 45
+# degrees, and one for fisheye lenses, which span 115.
+_GUESS, _FISHEYE_GUESS = 1.2, 0.5
 # Sides of an image in pixels that no camera and no image format has.
 _LONGEST_SIDE = 1 << 20
 # Encoders that scale pictures round their display size: a few tenths of a percent.
@@ -35,7 +38,8 @@ def make_camera(
     """Make the camera of new images.
 
     Without parameters it is COLMAP's first guess, without a focal length prior: focal length
-    1.2 times the longer side, principal point in the centre, no distortion. Where pixels are
+    1.2 times the longer side (of fisheye models half of it), principal point in the centre, no
+    distortion. Where pixels are
     not square, this holds for the picture as it is shown. Given parameters, and a focal length
     that is known otherwise, count as a prior.
 
@@ -56,7 +60,8 @@ def make_camera(
         name = square if is_square(pixel_aspect) else DEFAULT_MODEL_OF_OBLONG_PIXELS
     is_known = focal_length is not None or options.camera_params is not None
     if focal_length is None:
-        focal_length = 1.2 * max(width * pixel_aspect, height)
+        guess = _FISHEYE_GUESS if is_fisheye(name) else _GUESS
+        focal_length = guess * max(width * pixel_aspect, height)
     camera = camera_of_model(name, focal_length, width, height)
     if has_two_focal_lengths(camera):
         params = camera.params
@@ -87,6 +92,11 @@ def is_undistorted(camera: Any) -> bool:
 def is_nearly_pinhole(model: str | None) -> bool:
     """Whether a pinhole camera can initialise the named model; so it is without a name."""
     return model is None or model in _RECTILINEAR
+
+
+def is_fisheye(model: str | None) -> bool:
+    """Whether the named model is one of COLMAP's fisheye models, which are nearly equidistant."""
+    return model is not None and "FISHEYE" in model
 
 
 def has_two_focal_lengths(camera: Any) -> bool:

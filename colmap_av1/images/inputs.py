@@ -19,6 +19,7 @@ from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
+from colmap_av1.video.spherical import check_is_plane, hint
 from colmap_av1.video.unchanged import FileState
 
 _Path = str | os.PathLike[str]
@@ -132,7 +133,7 @@ def read_inputs(
         flat: names of photos are made fit for trainers, see `read_photos`.
 
     Raises:
-        VideoError: a video cannot be read, or is given twice.
+        VideoError: a video cannot be read, is given twice, or shows all directions.
         BitstreamError: no frame of a video can be decoded.
         ImageError: the photos or masks cannot be read, or do not fit.
         OptionError: an option does not fit.
@@ -144,6 +145,8 @@ def read_inputs(
     _check_options(len(paths), folder, options)
     files, warning = photo_files(folder) if folder is not None else ([], None)
     videos = tuple(read_video(path, options.read.operating_point) for path in paths)
+    for own in videos:
+        check_is_plane(own.path, own.projection, own.picture_size[0])
     _check_different(videos)
     places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
     if folder is not None:
@@ -152,7 +155,8 @@ def read_inputs(
     found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
     _check_one_camera(videos, found, options)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
-    notes = (warning,) if warning is not None else ()
+    hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
+    notes = (*hints, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
     if options.masks.mask_path is None:
         return inputs

@@ -17,6 +17,9 @@ _Floats = NDArray[np.float64]
 
 # Focal lengths that are tried, in longer sides of the image: fields of view from 127 to 18 degrees.
 _SHORTEST, _LONGEST, _NUM_TRIED = 0.25, 3.2, 17
+# Of a fisheye picture, how far from the centre matches count, in longer sides: beyond, errors of
+# a pixel are several on a plane; and the widest angle to the axis, in radians.
+_MIDDLE, _WIDEST = 0.35, 1.4
 # Pairs that are looked at, one of each part of the video, and matches of each; about so many
 # matches show which pair of a part has the widest parallax.
 _NUM_PAIRS = 40
@@ -45,6 +48,7 @@ def estimate_focal_length(
     size: tuple[int, int],
     *,
     pixel_aspect: float = 1.0,
+    fisheye: bool = False,
     seed: int = 0,
 ) -> float | None:
     """Estimate the focal length that all images share.
@@ -52,7 +56,8 @@ def estimate_focal_length(
     For each of a range of focal lengths relative poses are fitted to pairs of wide parallax; the
     robust loss of their epipolar errors, its geometric mean over the pairs, is least at the true
     one. A single pair says little, many together do. The principal point counts as the centre, the
-    lens as free of distortion: a first guess for the mapper, a few per cent off.
+    lens as free of distortion, or as an equidistant fisheye lens, of which the picture's middle is
+    looked at: a first guess for the mapper, a few per cent off.
 
     Args:
         keypoints: the images' keypoints.
@@ -60,6 +65,7 @@ def estimate_focal_length(
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
         size: (width, height) of the images in pixels.
         pixel_aspect: width of a pixel over its height.
+        fisheye: the lens is one.
         seed: the random seed.
 
     Returns:
@@ -76,6 +82,12 @@ def estimate_focal_length(
         i, j = pairs[pair]
         xa = keypoints[i].xy[rows[:, 0]].astype(np.float64) * shape - centre
         xb = keypoints[j].xy[rows[:, 1]].astype(np.float64) * shape - centre
+        if fisheye:
+            near = np.hypot(*xa.T), np.hypot(*xb.T)
+            middle = np.maximum(*near) <= _MIDDLE * 2 * max(centre)
+            xa, xb = xa[middle], xb[middle]
+            if len(xa) < _MIN_MATCHES:
+                continue
         views.append((xa, xb))
     if len(views) < _MIN_PAIRS:
         return None
@@ -86,7 +98,10 @@ def estimate_focal_length(
         for row in rows:
             for k in columns:
                 if np.isnan(loss[row, k]):
-                    pose_loss = _loss(*views[row], float(tried[k]), seed)
+                    xa, xb = views[row]
+                    if fisheye:
+                        xa, xb = (_as_pinhole(x, float(tried[k])) for x in (xa, xb))
+                    pose_loss = _loss(xa, xb, float(tried[k]), seed)
                     loss[row, k] = math.log(pose_loss + _LEAST_LOSS)
 
     # Half of the pairs show roughly where to look with all of them, until the lowest loss of all
@@ -112,6 +127,13 @@ def estimate_focal_length(
     if not risen or abs(np.diff(np.array(halves, dtype=np.float64))[0]) > math.log(_MAX_FACTOR):
         return None
     return math.exp(found)
+
+
+def _as_pinhole(x: _Floats, focal_length: float) -> _Floats:
+    """Where a pinhole camera sees what an equidistant lens of its focal length sees at x."""
+    away = np.hypot(*x.T)
+    angle = np.minimum(away / focal_length, _WIDEST)
+    return np.asarray(x * (focal_length * np.tan(angle) / np.maximum(away, 1e-9))[:, None])
 
 
 def _widest_pairs(

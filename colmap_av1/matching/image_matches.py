@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import check_pixel_aspect, is_nearly_pinhole, make_camera
+from colmap_av1.images.camera import (
+    check_pixel_aspect,
+    is_fisheye,
+    is_nearly_pinhole,
+    make_camera,
+)
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.takes import Takes
@@ -168,7 +173,8 @@ def shared_focal_length(
         In heights of a pixel; None where parameters are given or the motion does not determine it.
     """
     camera = options.camera
-    if camera.camera_params is not None or not is_nearly_pinhole(camera.camera_model):
+    fisheye = is_fisheye(camera.camera_model)
+    if camera.camera_params is not None or not (fisheye or is_nearly_pinhole(camera.camera_model)):
         return None
     with clock.measure("focal length"):
         return estimate_focal_length(
@@ -177,6 +183,7 @@ def shared_focal_length(
             paired.matches,
             size,
             pixel_aspect=pixel_aspect,
+            fisheye=fisheye,
             seed=options.run.seed,
         )
 

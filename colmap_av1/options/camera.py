@@ -34,8 +34,8 @@ class CameraOptions(Options):
     camera_params: str | None = option(
         None,
         "its parameters in COLMAP's order, such as 'f,cx,cy,k'; None: the focal length estimated "
-        "from the tracks, else 1.2 times the longer side, to be refined; principal point in the "
-        "centre",
+        "from the tracks, else 1.2 times the longer side, 0.5 times with fisheye models, to be "
+        "refined; principal point in the centre",
         common=True,
     )
     single_camera: bool | None = option(

@@ -27,6 +27,7 @@ from colmap_av1.video.container import (
     open_stream,
 )
 from colmap_av1.video.display import Display, shown_size, turn_of_matrix
+from colmap_av1.video.spherical import projection_of
 from colmap_av1.video.stored_frames import decode_stream
 from colmap_av1.video.unchanged import file_state
 
@@ -45,11 +46,14 @@ class Video(VideoFile):
             frames of the stream, where an edit list hides some, as of a trimmed clip; None: all
             of them. The others are frames all the same: motion runs through them. A frame that
             an edit list shows several times counts once.
+        projection: how pictures of all directions lie in the plane, as `projection_of` numbers it;
+            None: these are of a plane.
     """
 
     picture_size: tuple[int, int]
     display: Display
     presented: NDArray[np.int32] | None
+    projection: int | None
 
 
 def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video:
@@ -86,6 +90,7 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
         picture_size=shown_size((frame.width, frame.height), display),
         display=display,
         presented=_presented_frames(path, num_entries) if "mov" in file.container else None,
+        projection=projection_of(frame.side_data),
     )
 
 

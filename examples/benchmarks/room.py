@@ -1,0 +1,127 @@
+"""A furnished room seen by any camera, with a pose for each row: fisheye lenses, rolling shutters.
+
+Rays are cast at axis-aligned boxes, whose faces have seeded textures: simpler than
+`examples/render_scene.py`, but a frame of 480x360 takes a third of a second, and a ray may start
+anywhere. The world is in metres, z up; cameras look along +z with x right and y down, and the
+image's top-left corner is (0, 0).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_TEXELS = 512  # of a face's texture, which repeats every _PERIOD metres
+_PERIOD = 4.0
+_SEED = 5
+# The room from inside, and what stands in it: least and largest corners in metres.
+ROOM = np.array([[-5.0, -4.0, 0.0], [5.0, 6.0, 3.4]])
+BOXES = np.array(
+    [
+        [[-2.6, 2.4, 0.0], [-1.4, 3.6, 1.5]],
+        [[0.2, 3.2, 0.0], [1.6, 4.2, 0.9]],
+        [[2.4, 1.8, 0.0], [3.2, 2.8, 2.2]],
+        [[-0.7, 4.6, 0.0], [-0.2, 5.2, 2.6]],
+        [[-4.2, 4.0, 0.0], [-3.0, 5.4, 2.0]],
+        [[1.2, 2.0, 0.0], [1.7, 2.5, 0.6]],
+    ]
+)
+
+
+def rays_of(camera: pycolmap.Camera, samples: int = 2) -> Floats:
+    """Float64 [height, width, samples**2, 3] rays of a camera's pixels, z = 1."""
+    s = samples
+    x, y = (np.arange(n * s) + 0.5 for n in (camera.width, camera.height))
+    grid = np.stack(np.meshgrid(x / s, y / s), -1).reshape(-1, 2)
+    flat = np.asarray(camera.cam_from_img(grid)).reshape(camera.height, s, camera.width, s, 2)
+    flat = flat.transpose(0, 2, 1, 3, 4).reshape(camera.height, camera.width, s * s, 2)
+    return np.concatenate([flat, np.ones((*flat.shape[:3], 1))], axis=3)
+
+
+def render(rays: Floats, cam_from_world: Floats, textures: list[NDArray[np.float32]]) -> Any:
+    """A picture, uint8 [height, width, 3].
+
+    Args:
+        rays: as `rays_of` gives them.
+        cam_from_world: float64 [height, 3, 4] pose of each row.
+        textures: as `make_textures` gives them.
+    """
+    rotation = cam_from_world[:, :, :3]
+    origin = -np.einsum("nij,ni->nj", rotation, cam_from_world[:, :, 3])
+    direction = np.einsum("nij,nwsi->nwsj", rotation, rays).astype(np.float32)
+    start = origin[:, None, None, :].astype(np.float32)
+    with np.errstate(divide="ignore"):
+        step = 1 / direction
+    best, face = _leave(start, step)
+    for number, box in enumerate(BOXES.astype(np.float32)):
+        near, axis = _enter(start, step, box)
+        closer = near < best
+        best = np.where(closer, near, best)
+        face = np.where(closer, 3 * (number + 1) + axis, face)
+    hit = start + best[..., None] * direction
+    axis, texture = face % 3, face % len(textures)
+    u = np.where(axis == 0, hit[..., 1], hit[..., 0])
+    v = np.where(axis == 2, hit[..., 1], hit[..., 2])
+    columns, rows = (w % _PERIOD * (_TEXELS / _PERIOD) for w in (u, v))
+    rows += texture * (_TEXELS + 1)  # each lies below the one before, with its first row repeated
+    shape = (best.shape[0], -1)
+    atlas = np.concatenate([np.pad(t, ((0, 1), (0, 1), (0, 0)), mode="wrap") for t in textures])
+    seen = cv2.remap(
+        atlas,
+        columns.reshape(shape).astype(np.float32),
+        rows.reshape(shape).astype(np.float32),
+        cv2.INTER_LINEAR,
+    )
+    picture = seen.reshape(*best.shape, 3).mean(axis=2)
+    return np.clip(picture.round(), 0, 255).astype(np.uint8)
+
+
+def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
+    """Textures of several scales, float32 [_TEXELS, _TEXELS, 3], that repeat without a seam."""
+    rng = np.random.default_rng(_SEED)
+    made = []
+    for _ in range(count):
+        total = np.zeros((_TEXELS, _TEXELS, 3), np.float32)
+        for size, share in ((8, 1.0), (32, 0.9), (96, 0.8), (256, 0.5)):
+            noise = rng.normal(0, 1, (size, size, 3)).astype(np.float32)
+            wrapped = np.pad(noise, ((2, 2), (2, 2), (0, 0)), mode="wrap")
+            scale = _TEXELS / size
+            large = cv2.resize(wrapped, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+            edge = round(2 * scale)
+            total += share * large[edge : edge + _TEXELS, edge : edge + _TEXELS]
+        grey = total.mean(axis=2, keepdims=True)
+        made.append(128 + 38 * (grey + 0.3 * (total - grey)))
+    return made
+
+
+def _leave(start: Any, step: Any) -> tuple[Any, Any]:
+    """Where rays meet the room's walls from inside: distance along them, and the axis."""
+    low, high = ROOM.astype(np.float32)
+    far = np.maximum((low - start) * step, (high - start) * step)
+    axis = far.argmin(axis=-1)
+    return far.min(axis=-1), axis
+
+
+def _enter(start: Any, step: Any, box: Any) -> tuple[Any, Any]:
+    """Where rays enter a box, infinite where they miss it, and the axis."""
+    one, two = (box[0] - start) * step, (box[1] - start) * step
+    near, far = np.minimum(one, two), np.maximum(one, two)
+    first, last = near.max(axis=-1), far.min(axis=-1)
+    met = (first < last) & (first > 0)
+    return np.where(met, first, np.inf), near.argmax(axis=-1)
+
+
+def look(centre: Floats, target: Floats) -> Floats:
+    """Poses [n, 3, 4] of level cameras at centres [n, 3] that look at targets [n, 3]."""
+    z = target - centre
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    return np.concatenate([rotation, -np.einsum("nij,nj->ni", rotation, centre)[..., None]], 2)
