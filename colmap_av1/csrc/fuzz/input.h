@@ -1,12 +1,21 @@
-// The fuzzers' input: bytes that say how to run, then temporal units.
+// What the fuzzers share: their input, bytes that say how to run and then temporal units, and the
+// check of what is promised.
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
 #include <span>
 
 namespace colmap_av1::fuzz {
+
+inline void check(bool promise, const char* what) {
+  if (promise) return;
+  std::fprintf(stderr, "broken promise: %s\n", what);
+  std::abort();
+}
 
 class Input {
  public:

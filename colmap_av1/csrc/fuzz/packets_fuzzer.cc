@@ -5,8 +5,6 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <cstdio>
-#include <cstdlib>
 #include <memory>
 #include <optional>
 #include <span>
@@ -24,6 +22,7 @@ using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
 using colmap_av1::av1::RestartPoint;
+using colmap_av1::fuzz::check;
 
 using Packet = std::vector<std::uint8_t>;
 using Events = std::vector<std::unique_ptr<Event>>;
@@ -37,12 +36,6 @@ struct Group {
   std::size_t first_packet = 0;
   std::optional<RestartPoint> start;  // none at the start of the stream
 };
-
-void check(bool promise, const char* what) {
-  if (promise) return;
-  std::fprintf(stderr, "broken promise: %s\n", what);
-  std::abort();
-}
 
 // Parses a packet and moves its events out; false where the stream is damaged there.
 bool parse(Parser& parser, const Packet& packet, Events& events) {

@@ -3,8 +3,6 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <cstdio>
-#include <cstdlib>
 #include <memory>
 #include <span>
 #include <vector>
@@ -20,16 +18,11 @@ using colmap_av1::av1::Event;
 using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
+using colmap_av1::fuzz::check;
 
 // A few bytes ask for a whole frame; these bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 512 * 512;
 constexpr std::size_t kMaxEvents = 32;
-
-void check(bool promise, const char* what) {
-  if (promise) return;
-  std::fprintf(stderr, "broken promise: %s\n", what);
-  std::abort();
-}
 
 void check_event(const Event& event, const ParserOptions& options) {
   const auto& header = event.header;

@@ -4,8 +4,6 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
-#include <cstdio>
-#include <cstdlib>
 #include <limits>
 #include <map>
 #include <memory>
@@ -26,6 +24,7 @@ using colmap_av1::av1::Event;
 using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
+using colmap_av1::fuzz::check;
 using colmap_av1::fuzz::Input;
 using colmap_av1::tracks::FrameMotion;
 using colmap_av1::tracks::TrackArrays;
@@ -35,12 +34,6 @@ using colmap_av1::tracks::TrackBuilderOptions;
 // They bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 256 * 256;
 constexpr std::size_t kMaxFrames = 24;
-
-void check(bool promise, const char* what) {
-  if (promise) return;
-  std::fprintf(stderr, "broken promise: %s\n", what);
-  std::abort();
-}
 
 // Fields of a frame, owned.
 struct Frame {
