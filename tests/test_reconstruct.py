@@ -6,10 +6,12 @@ import json
 import os
 import re
 import shutil
+import sqlite3
 import struct
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -475,6 +477,8 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)
     assert plain.resumed == STAGES[:1]
     assert plain.num_key_images == plain.num_registered == NUM_IMAGES
+    # The lens is estimated from all images all the same.
+    assert cameras_of(plain.database) == cameras_of(made.database)
     mapped = read_model(plain.output / ".stages" / "poses" / "0")
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
     np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
@@ -483,6 +487,11 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     # With a loss that counts errors of half a pixel nearly in full it would be 0.44 and 0.59.
     assert errors.ate < 0.4 * before.ate
     assert errors.rotation < 0.45 * before.rotation
+
+
+def cameras_of(database: Path) -> list[tuple[int, bytes]]:
+    with closing(sqlite3.connect(database)) as opened:
+        return opened.execute("SELECT model, params FROM cameras").fetchall()
 
 
 def test_folder_of_others(tmp_path: Path) -> None:

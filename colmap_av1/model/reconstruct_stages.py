@@ -24,6 +24,7 @@ from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
+    PairedImages,
     new_cameras,
     pair_images,
     pairs_of_takes,
@@ -246,24 +247,16 @@ def match_stage(
         own.doubted_at([f - first for f in doubted if 0 <= f - first < own.tracks.num_frames])
         for own, first in zip(videos, takes.first_frame.tolist(), strict=False)
     ]
-    density = DensityOptions(
-        preset="sparse",
-        max_tracks_per_image=mapping.pose_tracks_per_image,
-        spacing=mapping.pose_spacing,
-    )
+    density = _pose_density(run)
 
     def make(partial: Path) -> dict[str, Any]:
         with clock.measure("pairs"):
             index = _key_images(run, videos, takes)
-            keyed = takes.some(index)
-            sparse = [
-                select_tracks(
-                    keep_frames(pose_tracks(run, own.tracks), keyed.of_video(video).frames), density
-                )
-                for video, own in enumerate(videos)
-            ]
+        keyed = takes.some(index)
+        paired = _paired_images(run, videos, keyed)
+        cameras = _cameras(run, videos, takes, index, paired)
         apart = len(takes.take) / len(keyed.take)
-        linked, cameras = _match_images(run, videos, sparse, keyed, images_apart=apart)
+        linked = _match_images(run, videos, paired, cameras, keyed, images_apart=apart)
         matched = linked.matched
         with clock.measure("database"):
             write_matched_images(
@@ -277,7 +270,7 @@ def match_stage(
             "link_warnings": list(linked.report.warnings),
             "key_images": index,
             "num_key_images": len(index),
-            "num_pose_tracks": sum(len(own.offsets) - 1 for own in sparse),
+            "num_pose_tracks": len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
             "guessed": not all(camera.has_prior_focal_length for camera in of_videos),
             **_pair_facts(matched),
         }
@@ -340,47 +333,84 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[i
     return index + list(range(takes.images_of(len(videos)).start, len(takes.take)))
 
 
+def _pose_density(run: Run) -> DensityOptions:
+    """Which tracks the poses come from."""
+    mapping = run.options.mapping
+    return DensityOptions(
+        preset="sparse",
+        max_tracks_per_image=mapping.pose_tracks_per_image,
+        spacing=mapping.pose_spacing,
+    )
+
+
+def _paired_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> PairedImages:
+    """Some images of all takes, matched along a spread selection of tracks for poses."""
+    options, density = run.options.match, _pose_density(run)
+    paired = []
+    for video, own in enumerate(videos):
+        chosen = takes.of_video(video)
+        with run.clock.measure("pairs"):
+            sparse = select_tracks(
+                keep_frames(pose_tracks(run, own.tracks), chosen.frames), density
+            )
+        linked_anyway = may_link(own.inter_share, chosen.frames, options.links)
+        paired.append(
+            pair_images(
+                *(run.sources[video].pictures.path, sparse, chosen, options),
+                needed=takes.num_takes == 1 and not linked_anyway,
+                clock=run.clock,
+                progress=run.progress,
+            )
+        )
+    return pairs_of_takes(paired, takes)
+
+
+def _cameras(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    index: Sequence[int],
+    paired: PairedImages,
+) -> list[Any]:
+    """The cameras of the key images, that are some of all images.
+
+    What is estimated comes from all images: a few that lie far apart mislead.
+    """
+    options, photos = run.options.match, run.inputs.photos
+    opened = [source.pictures for source in run.sources]
+    shapes = [(file.picture_size, file.display.pixel_aspect) for file in opened]
+    if options.camera.camera_params is not None or len(index) == len(takes.take):
+        keyed = takes.some(index)
+        return new_cameras(paired, keyed, shapes, photos, options, clock=run.clock).of_images
+    every = _paired_images(run, videos, takes)
+    cameras = new_cameras(every, takes, shapes, photos, options, clock=run.clock).of_images
+    return [cameras[i] for i in index]
+
+
 def _match_images(
     run: Run,
     videos: Sequence[VideoTracks],
-    sparse: Sequence[Tracks],
+    paired: PairedImages,
+    cameras: Sequence[Any],
     takes: Takes,
     *,
     images_apart: float,
-) -> tuple[LinkedImages, list[Any]]:
-    """The images matched along some tracks of each video and by links; and their cameras."""
+) -> LinkedImages:
+    """The images matched along some tracks of each video and by links."""
     options, clock, progress = run.options.match, run.clock, run.progress
     files = [source.pictures for source in run.sources]
-    paired = []
-    for video, (file, tracks) in enumerate(zip(files, sparse, strict=True)):
-        chosen = takes.of_video(video)
-        linked_anyway = may_link(videos[video].inter_share, chosen.frames, options.links)
-        paired.append(
-            pair_images(
-                *(file.path, tracks, chosen, options),
-                needed=takes.num_takes == 1 and not linked_anyway,
-                clock=clock,
-                progress=progress,
-            )
-        )
-    together = pairs_of_takes(paired, takes)
-    shapes = [(file.picture_size, file.display.pixel_aspect) for file in files]
-    photos = run.inputs.photos
-    cameras = new_cameras(together, takes, shapes, photos, options, clock=clock).of_images
-    matched = verify_images(together, cameras, options, clock=clock, progress=progress)
+    matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
     shares = [own.inter_share for own in videos]
-    linked = link_images(
+    photos = [photo.path for photo in run.inputs.photos]
+    return link_images(
         *(takes, matched, cameras, np.concatenate([*shares, run.inputs.no_motion])),
-        pictures_of(
-            takes, [(file, None) for file in files], [photo.path for photo in photos], options
-        ),
+        pictures_of(takes, [(file, None) for file in files], photos, options),
         name=run.inputs.name,
         images_apart=images_apart,
         options=options,
         clock=clock,
         progress=progress,
     )
-    return linked, cameras
 
 
 def _pair_facts(matched: MatchedImages) -> dict[str, Any]:
