@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_av1.database.listed import listed_cameras, listed_of_videos
+from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
-from colmap_av1.errors import DatabaseError, OptionError
+from colmap_av1.errors import DatabaseError
 from colmap_av1.images.camera import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
@@ -30,8 +30,9 @@ from colmap_av1.matching.image_matches import (
     verify_images,
 )
 from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
+from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.matching.weak_gaps import may_link
-from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.arguments import checks_arguments
@@ -66,6 +67,8 @@ class MatchReport:
         focal_length: of the first video, in heights of a pixel, where it was estimated from the
             tracks; None where it was given, or the motion does not determine it and the camera has
             COLMAP's first guess.
+        read_outs: of each video, the time in milliseconds in which the shutter reads the rows of a
+            picture, where keypoints were corrected for it; None: they were not.
         num_pairs: image pairs written.
         num_verified_pairs: those with a two-view geometry.
         num_matches: matches of all pairs.
@@ -93,6 +96,7 @@ class MatchReport:
     track_lengths: dict[float, int]
     num_observations: int
     focal_length: float | None
+    read_outs: tuple[float | None, ...]
     num_pairs: int
     num_verified_pairs: int
     num_matches: int
@@ -226,6 +230,7 @@ def match(
         num_written_images=num_written,
         masked=images.takes.masked,
         focal_length=cameras.focal_length,
+        read_outs=tuple(own.tracked.read_out for own in videos),
         seconds=clock.seconds,
         links=linked.report,
         warnings=(*inputs.warnings, *notes, *cameras.warnings, *linked.report.warnings),
@@ -337,10 +342,14 @@ def _with_chosen_tracks(
     prepared: PreparedImages, options: MatchOptions, clock: Clock
 ) -> PreparedImages:
     """The images with the tracks that are matched, in place of all tracks of the video."""
+    tracks, read_out = without_shutter(
+        *(prepared.tracks, prepared.display, prepared.source.pictures.frame_rate, options, clock)
+    )
     with clock.measure("pairs"):
-        frames = prepared.chosen.frames
-        tracks = select_tracks(keep_frames(prepared.tracks, frames), options.density)
-    return replace(prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks))
+        tracks = select_tracks(keep_frames(tracks, prepared.chosen.frames), options.density)
+    return replace(
+        prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks, read_out=read_out)
+    )
 
 
 def _figures(tracks: Sequence[Tracks], matched: MatchedImages) -> dict[str, Any]:
@@ -380,7 +389,7 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
             f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
         )
     if listed:
-        _check_no_camera(database, options.camera)
+        check_no_camera(database, options.camera)
     if database.exists() and database.stat().st_size:
         # Nothing is written, but the write lock is taken.
         write_matches(database, (), (), (), pairs=_NO_PAIRS, matches=(), geometries=())
@@ -389,21 +398,6 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
             f"{database}: no permission to write a database there: give another path"
         )
     return listed
-
-
-def _check_no_camera(database: Path, options: CameraOptions) -> None:
-    """Refuse options of new cameras where the images have theirs."""
-    default = CameraOptions()
-    changed = [
-        field.name
-        for field in fields(options)
-        if getattr(options, field.name) != getattr(default, field.name)
-    ]
-    if changed:
-        raise OptionError(
-            f"{database}: its images have cameras, so {changed[0]} would change nothing: leave it "
-            "out, or import the images with that camera"
-        )
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,8 @@ class ReconstructReport:
         far_views: median distance in pixels of what the pictures of images ten and more apart show
             in common from where the poses put it; None where no such images see the same.
         far_views_largest: the 90 % quantile of it over such pairs of images.
+        read_outs: of each video, the time in milliseconds in which the shutter reads the rows of a
+            picture, where tracks were corrected for it; None: they were not.
         place: where the model lies in the world: units, axes, origin and what said so, as in
             `place.json`.
         focal_length: of the output's first camera, in pixels.
@@ -106,6 +108,7 @@ class ReconstructReport:
     mean_error: float
     far_views: float | None
     far_views_largest: float | None
+    read_outs: tuple[float | None, ...]
     place: dict[str, Any]
     focal_length: float
     mapper: str
@@ -217,6 +220,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     kept["model"] = model_stage(run, join_tracks(posed.tracks, posed.links), takes, placed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     facts |= {"num_images": len(takes.take), "masked": takes.masked}
+    facts["read_outs"] = tuple(stage.facts["read_out"] for stage in tracked)
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
     notes = [
         *run.inputs.warnings,

@@ -45,6 +45,7 @@ def match_rows(report: MatchReport) -> Rows:
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
         *_mask_row(report.masked),
+        *_shutter_row(report.read_outs),
         ("tracks", str(report.num_tracks)),
         ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
         (
@@ -103,6 +104,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *far_view_rows(report.far_views, report.far_views_largest),
         ("focal length", f"{report.focal_length:.2f} px"),
+        *_shutter_row(report.read_outs),
         *_place_rows(report.place),
         *_link_rows(**report.links),
         *_gaussians_rows(report.gaussians),
@@ -110,6 +112,14 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
     if report.resumed:
         rows.append(("finished before", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def _shutter_row(read_outs: Sequence[float | None]) -> Rows:
+    """How long the shutter reads; none where nothing was corrected."""
+    if all(read_out is None for read_out in read_outs):
+        return []
+    words = (f"{r:.1f} ms" if r is not None else "none" for r in read_outs)
+    return [("rolling shutter", f"{', '.join(words)} from the first row to the last")]
 
 
 def _place_rows(place: Mapping[str, Any]) -> Rows:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.database.reading import DatabaseImage, read_cameras
-from colmap_av1.errors import DatabaseError
+from colmap_av1.errors import DatabaseError, OptionError
 from colmap_av1.images.inputs import Inputs
+from colmap_av1.options import CameraOptions
 
 
 def listed_of_videos(
@@ -61,3 +63,19 @@ def listed_cameras(
     if missing is not None:
         raise DatabaseError(f"{database}: image '{missing}' has no camera: import the images again")
     return [cameras[camera_id[name]] for name in names]
+
+
+def check_no_camera(database: Path, options: CameraOptions) -> None:
+    """Refuse options of new cameras where the images have theirs.
+
+    Raises:
+        OptionError: one differs from its default.
+    """
+    default = CameraOptions()
+    of_camera = [f.name for f in fields(options) if f.name != "rolling_shutter"]
+    changed = [name for name in of_camera if getattr(options, name) != getattr(default, name)]
+    if changed:
+        raise OptionError(
+            f"{database}: its images have cameras, so {changed[0]} would change nothing: leave it "
+            "out, or import the images with that camera"
+        )

@@ -101,8 +101,8 @@ def estimate_focal_length(
                     xa, xb = views[row]
                     if fisheye:
                         xa, xb = (_as_pinhole(x, float(tried[k])) for x in (xa, xb))
-                    pose_loss = _loss(xa, xb, float(tried[k]), seed)
-                    loss[row, k] = math.log(pose_loss + _LEAST_LOSS)
+                    of_pose = pose_loss(xa, xb, float(tried[k]), seed)
+                    loss[row, k] = math.log(of_pose + _LEAST_LOSS)
 
     # Half of the pairs show roughly where to look with all of them, until the lowest loss of all
     # and of either half lies between others.
@@ -118,7 +118,7 @@ def estimate_focal_length(
         curves = [np.where(np.isfinite(curves[0]), curve, np.nan) for curve in curves]
         best = {int(np.nanargmin(curve)) for curve in curves}
     at = np.log(tried)
-    found, *halves = (_lowest(at, curve) for curve in curves)
+    found, *halves = (lowest(at, curve) for curve in curves)
     if found is None or None in halves:
         return None
     known = np.isfinite(rough)
@@ -164,7 +164,7 @@ def _median(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((ordered[half] + ordered[-half - 1]) / 2)
 
 
-def _loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
+def pose_loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
     """Mean robust loss of the epipolar errors of a pair for one focal length."""
     camera = poselib_camera(focal_length)
     some = slice(_NUM_SEARCHED)
@@ -177,7 +177,7 @@ def _loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
     return float(refined["cost"]) / (scale * scale * len(xa))
 
 
-def _lowest(at: _Floats, value: _Floats) -> float | None:
+def lowest(at: _Floats, value: _Floats) -> float | None:
     """Where a curve is lowest, by a parabola; None at an end. Samples that are NaN are left out."""
     k = int(np.nanargmin(value))
     if k in (0, len(at) - 1):

@@ -32,6 +32,7 @@ from colmap_av1.matching.image_matches import (
 )
 from colmap_av1.matching.link_plan import images_to_link
 from colmap_av1.matching.links import LinkedImages, link_images
+from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.model.track_points import chaining_for_points
@@ -123,7 +124,7 @@ def track_stage(run: Run, video: int) -> Kept:
     source, clock, progress = run.sources[video], run.clock, run.progress
     masks = run.inputs.masks_of_videos[video]
     options = chaining_for_points(run.options.match, run.options.triangulate)
-    name = stage_of_video(run, video)
+    name, shown = stage_of_video(run, video), source.pictures
 
     def make(partial: Path) -> dict[str, Any]:
         tracked = track_video(source, options, one_size=True, clock=clock, progress=progress)
@@ -151,24 +152,25 @@ def track_stage(run: Run, video: int) -> Kept:
         if masks is not None:
             left = masks.on_tracks(tracked.tracks, chosen, least_length(options.tracks))
             tracked = replace(tracked, tracks=left)
+        tracks, read_out = without_shutter(
+            tracked.tracks, shown.display, shown.frame_rate, options, clock
+        )
         # Of a long video no other frame is of use from here on.
-        tracks = keep_frames(tracked.tracks, chosen.frames) if is_long else tracked.tracks
+        tracks = keep_frames(tracks, chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
-        with (partial / f"{name}.npz").open("wb") as file:
-            # Names are kept by np.savez as they are.
-            names = np.array(chosen.names)
-            share = tracked.inter_share
-            np.savez(file, **vars(tracks), names=names, frames=chosen.frames, inter_share=share)
+        _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
         check_unchanged(*source.files)
         return {
             "num_frames": tracks.num_frames,
             "num_tracks": len(tracks.offsets) - 1,
+            "read_out": read_out,
             "warnings": list(tracked.warnings),
         }
 
     mapping = run.options.mapping
     choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
-    given = (options.images, choice, options.read, options.tracks, options.refine)
+    shutter = shutter_settings(options.camera)
+    given = (options.images, choice, options.read, options.tracks, options.refine, shutter)
     listed = digest_if_there(options.images.frame_list)
     masked = run.inputs.masks.digest if run.inputs.masks is not None else None
     return run_stage(
@@ -191,6 +193,13 @@ def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
     unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
     if unfit is not None:
         raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
+
+
+def _write_tracks(path: Path, own: VideoTracks) -> None:
+    with path.open("wb") as file:
+        # Names are kept by np.savez as they are.
+        names, frames = np.array(own.chosen.names), own.chosen.frames
+        np.savez(file, **vars(own.tracks), names=names, frames=frames, inter_share=own.inter_share)
 
 
 def read_tracks(run: Run, video: int) -> VideoTracks:

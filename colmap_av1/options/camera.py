@@ -15,6 +15,8 @@ from colmap_av1.options.fields import Options, option
 DEFAULT_MODEL = "SIMPLE_RADIAL"
 DEFAULT_MODEL_OF_KNOWN_FOCAL_LENGTH = "RADIAL"
 DEFAULT_MODEL_OF_OBLONG_PIXELS = "OPENCV"
+# Time from the first row of a picture to the last that no camera takes, in milliseconds.
+_LONGEST_READ_OUT = 100
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,17 @@ class CameraOptions(Options):
         "photos of each camera and size",
     )
 
+    rolling_shutter: str = option(
+        "none",
+        "estimate: from the tracks, the time in which the shutter reads the rows of a picture, and "
+        "move keypoints to where they are in the middle of it, where that explains the tracks "
+        "better; or that time in milliseconds, below 0 where rows are read from the bottom; none: "
+        "all rows are taken at once",
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_shutter(self.rolling_shutter)
         if self.camera_model is not None:
             models = [self.camera_model]
         elif self.camera_params is not None:
@@ -58,6 +69,21 @@ class CameraOptions(Options):
             num_given = self.camera_params.count(",") + 1
             fitting = (c for c in cameras if len(c.params) == num_given)
             parse_camera_params(self.camera_params, next(fitting, cameras[0]))
+
+
+def _check_shutter(wanted: str) -> None:
+    """Refuse a read-out time that is none."""
+    if wanted in ("estimate", "none"):
+        return
+    try:
+        milliseconds = float(wanted)
+    except ValueError:
+        milliseconds = math.nan
+    if not abs(milliseconds) <= _LONGEST_READ_OUT:
+        raise OptionError(
+            f"rolling_shutter is {wanted!r}: give estimate, none, or milliseconds from "
+            f"{-_LONGEST_READ_OUT} to {_LONGEST_READ_OUT}"
+        )
 
 
 def camera_of_model(name: str, focal_length: float = 1.0, width: int = 1, height: int = 1) -> Any:

@@ -74,12 +74,15 @@ class TrackedVideo:
         inter_share: float32 [num_frames] share of inter units in each frame that players show; of
             frames hidden before it the least.
         warnings: what the user should know, such as damage of the stream.
+        read_out: milliseconds in which the shutter reads the rows of a picture, where the tracks
+            are corrected for it; None: they are not.
     """
 
     tracks: Tracks
     num_coded_frames: int
     inter_share: NDArray[np.float32]
     warnings: tuple[str, ...]
+    read_out: float | None = None
 
 
 @contextmanager

@@ -69,6 +69,8 @@ class VideoFile:
             not say.
         dynamic_range: name of the transfer function of high dynamic range that its pictures
             have, "HLG" or "PQ"; None where they have none.
+        tags: names, in lower case, and values of what the container says of the whole file.
+        has_telemetry: it has streams of data or subtitles, which may say where it was taken.
     """
 
     path: Path
@@ -81,6 +83,8 @@ class VideoFile:
     duration: float | None
     num_packets: int | None
     dynamic_range: str | None
+    tags: tuple[tuple[str, str], ...]
+    has_telemetry: bool
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -130,6 +134,8 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         duration=_stream_duration(container, stream) if is_timed else None,
         num_packets=stream.frames or None,
         dynamic_range=_HIGH_RANGES.get(stream.codec_context.color_trc),
+        tags=tuple((str(k).lower(), str(v)) for k, v in container.metadata.items()),
+        has_telemetry=bool(container.streams.data or container.streams.subtitles),
     )
 
 

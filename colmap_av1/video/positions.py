@@ -73,11 +73,12 @@ def read_positions(video: VideoFile) -> Positions | None:
     Raises:
         VideoError: the file cannot be opened.
     """
-    with open_container(video.path) as container:
-        place = _one_place({k.lower(): v for k, v in container.metadata.items()})
-        start = _start(container.streams[video.index])
-        found = _of_data(container, start)
-        found = found or _of_subtitles(container, start)
+    place = _one_place(dict(video.tags))
+    found: Positions | None = None
+    if video.has_telemetry:
+        with open_container(video.path) as container:
+            start = _start(container.streams[video.index])
+            found = _of_data(container, start) or _of_subtitles(container, start)
     beside = _file_beside(video.path)
     if found is None and beside is not None:
         with contextlib.suppress(VideoError), open_container(beside) as container:

@@ -467,6 +467,30 @@ def encoders(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def rolling_shutter(rows: list[Row]) -> str:
+    """Models of rolling shutters, with and without the estimated read-out time."""
+
+    def both(heading: str, name: str, spelling: str) -> Column:
+        def cell(row: Row) -> str:
+            pair = (number(row, f"{name}_{how}", spelling) for how in ("none", "estimate"))
+            return " / ".join(pair)
+
+        return Column(heading, cell)
+
+    columns = [
+        words("clip", "clip"),
+        figure("read-out", "read_out_ms", ".0f", " ms"),
+        Column(
+            "found",
+            lambda row: number(row, "found_ms", ".1f", " ms") if row["found_ms"] else "none",
+        ),
+        both("reprojection error, px", "error_px", ".3f"),
+        both("camera centres, mm", "ate_mm", ".1f"),
+        both("CPU seconds", "cpu_s", ".1f"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
 def plain(rows: list[Row]) -> str:
     """A table whose columns are those of the file, in its words."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
@@ -488,6 +512,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "encoders": encoders,
     "large_pictures": plain,
     "read_memory": plain,
+    "rolling_shutter": rolling_shutter,
     "long_video": plain,
     "batch": plain,
     "image_pairs": plain,

@@ -1,0 +1,1 @@
+"""The read-out time of a rolling shutter, from tracks."""

@@ -1,0 +1,80 @@
+"""Tracks of a video corrected for its rolling shutter, of a given or an estimated read-out time."""
+
+from __future__ import annotations
+
+from colmap_av1.images.camera import is_nearly_pinhole, is_square
+from colmap_av1.matching.shutter.estimate import estimate_read_out
+from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.options.camera import DEFAULT_MODEL, camera_of_model, parse_camera_params
+from colmap_av1.tracks.shutter import correct_tracks
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import Clock
+from colmap_av1.video.display import Display
+
+
+def without_shutter(
+    tracks: Tracks,
+    display: Display,
+    rate: float | None,
+    options: MatchOptions,
+    clock: Clock,
+) -> tuple[Tracks, float | None]:
+    """The tracks where they are in the middle of each picture's read-out, and the time of that.
+
+    Args:
+        tracks: tracks of all frames, of which neighbours say how they move.
+        display: how the pictures are shown that they are of.
+        rate: frames per second; None, where it is unknown, leaves them as they are.
+        options: those of the camera and the seed are used.
+        clock: gets the stage "shutter".
+
+    Returns:
+        The tracks, and the read-out time in milliseconds; None where nothing is corrected.
+    """
+    wanted = options.camera.rolling_shutter
+    if wanted == "none" or rate is None or tracks.num_frames == 0:
+        return tracks, None
+    with clock.measure("shutter"):
+        down = rows_down(display, (tracks.width, tracks.height))
+        if wanted != "estimate":
+            read_out = float(wanted) / 1000 * rate
+        elif is_nearly_pinhole(options.camera.camera_model) and is_square(display.pixel_aspect):
+            focal = _focal_length(options.camera)
+            found = estimate_read_out(tracks, down, focal, options.run.seed)
+            if isinstance(found, str):
+                return tracks, None
+            read_out = found.frames
+        else:
+            return tracks, None
+        return correct_tracks(tracks, read_out, down), read_out / rate * 1000
+
+
+def shutter_settings(camera: CameraOptions) -> tuple[str, ...]:
+    """What the correction of tracks depends on, of the options."""
+    lens = (str(camera.camera_model), str(camera.camera_params))
+    return (camera.rolling_shutter, *(lens if camera.rolling_shutter == "estimate" else ()))
+
+
+def rows_down(display: Display, size: tuple[int, int]) -> tuple[int, int]:
+    """How the direction in which rows are read is shown, see `row_places`.
+
+    The rows are those of the sensor, which is wider than high: a picture that is shown upright and
+    was stored so has been turned before.
+
+    Args:
+        display: how players show the pictures.
+        size: (width, height) of these.
+    """
+    (_, across), (_, down) = display.turn
+    if display == Display() and size[0] < size[1]:
+        return (1, 0)
+    return across, down
+
+
+def _focal_length(camera: CameraOptions) -> float | None:
+    """The given focal length; None where none is."""
+    if camera.camera_params is None:
+        return None
+    model = camera_of_model(camera.camera_model or DEFAULT_MODEL)
+    model.params = parse_camera_params(camera.camera_params, model)
+    return float(model.mean_focal_length())

@@ -1,0 +1,185 @@
+"""The read-out time of a rolling shutter, estimated from tracks by least epipolar errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.matching.focal import estimate_focal_length, lowest, pose_loss
+from colmap_av1.matching.pairs import ImageKeypoints, pair_matches
+from colmap_av1.tracks.shutter import at_middle_of_read_out, row_places, velocities
+from colmap_av1.tracks.tracks import Tracks
+
+_Floats = NDArray[np.float64]
+
+# Read-out times that are tried, in frames: rows may be read from the bottom, too.
+_TRIED = np.linspace(-1.0, 1.0, 17)
+# Pairs of frames that are looked at, frames between those of a pair, and matches of each.
+_NUM_PAIRS = 48
+_GAPS = (4, 8, 16)
+_NUM_MATCHES = 300
+_MIN_MATCHES, _MIN_PAIRS = 80, 12
+# Spread of the motion of a pair, in pixels, that shows parallax or a turn.
+_LEAST_SPREAD = 4.0
+# What is estimated holds where it explains the pairs better than none by so many standard errors,
+# where every second pair and the others agree on it to so much of a frame, and where it is more.
+_LEAST_SIGNIFICANCE = 4.0
+_LARGEST_DIFFERENCE = 0.15
+_LEAST_READ_OUT = 0.05
+_LEAST_LOSS = 1e-3
+
+
+@dataclass(frozen=True)
+class ReadOut:
+    """An estimated read-out time.
+
+    Attributes:
+        frames: time from the first row to the last, in frames; negative: read from the bottom.
+        error: half the difference of the estimates by every second pair and by the others.
+        significance: by how many standard errors it explains the pairs better than none.
+    """
+
+    frames: float
+    error: float
+    significance: float
+
+
+@dataclass(frozen=True)
+class _View:
+    """Matches of a pair of frames: pixels from the centre, velocities and places of rows."""
+
+    xy: tuple[_Floats, _Floats]
+    velocity: tuple[_Floats, _Floats]
+    place: tuple[_Floats, _Floats]
+
+    def corrected(self, read_out: float) -> tuple[_Floats, _Floats]:
+        a, b = (
+            np.ascontiguousarray(at_middle_of_read_out(xy, velocity, place, read_out))
+            for xy, velocity, place in zip(self.xy, self.velocity, self.place, strict=True)
+        )
+        return a, b
+
+
+def estimate_read_out(
+    tracks: Tracks, down: tuple[int, int], focal_length: float | None, seed: int = 0
+) -> ReadOut | str:
+    """Estimate the time in which a shutter reads the rows of a picture.
+
+    For each of a range of times positions are moved to the middle of the read-out by their
+    velocities, and relative poses are fitted to pairs of frames: the geometric mean of their
+    robust epipolar losses is least at the true time, as far as the motion changes along the video.
+    An even pan or walk bends all pictures alike and shows nothing.
+
+    Args:
+        tracks: tracks through all frames.
+        down: how the direction in which rows are read is shown, see `row_places`.
+        focal_length: in pixels; None: it is estimated from the tracks, too.
+        seed: the random seed.
+
+    Returns:
+        The read-out time; in words why it cannot be told.
+    """
+    views = _views(tracks, down, seed)
+    if len(views) < _MIN_PAIRS:
+        return "too few frames share enough tracks, or nothing moves"
+    found: ReadOut | str = "the focal length cannot be told from the tracks"
+    read_out = 0.0
+    for _ in range(1 if focal_length is not None else 2):
+        focal = focal_length or _focal_length(tracks, views, read_out, seed)
+        found = _least(views, focal, seed) if focal is not None else found
+        if isinstance(found, str):
+            return found
+        read_out = found.frames
+    assert isinstance(found, ReadOut)
+    if abs(found.frames) < _LEAST_READ_OUT or found.significance < _LEAST_SIGNIFICANCE:
+        return "no read-out time explains the tracks better than none"
+    if found.error > _LARGEST_DIFFERENCE / 2:
+        return "parts of the video disagree on it"
+    return found
+
+
+def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
+    """Pairs of frames all along the video, as far apart as their motion shows something."""
+    rng = np.random.default_rng(seed)
+    speed = velocities(tracks)
+    place = row_places(tracks.xy, (tracks.width, tracks.height), down)
+    centre = np.array([tracks.width, tracks.height]) / 2
+    order = np.argsort(tracks.frame, kind="stable")
+    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    number = tracks.track
+    views = []
+    last = tracks.num_frames - 1 - _GAPS[0]
+    for first in np.unique(np.linspace(0, max(last, 0), _NUM_PAIRS).astype(int)).tolist():
+        found = None
+        for gap in _GAPS:
+            if first + gap >= tracks.num_frames:
+                break
+            a, b = (order[bounds[f] : bounds[f + 1]] for f in (first, first + gap))
+            _, in_a, in_b = np.intersect1d(
+                number[a], number[b], assume_unique=True, return_indices=True
+            )
+            if len(in_a) < _MIN_MATCHES:
+                break
+            found = a[in_a], b[in_b]
+            motion = tracks.xy[found[1]] - tracks.xy[found[0]]
+            spread = np.abs(motion - np.median(motion, axis=0)).sum(axis=1)
+            if np.median(spread) >= _LEAST_SPREAD:
+                break
+        if found is None:
+            continue
+        some = rng.permutation(len(found[0]))[:_NUM_MATCHES]
+        rows = found[0][some], found[1][some]
+        views.append(
+            _View(
+                *(
+                    tuple(values[r].astype(np.float64) - shift for r in rows)  # type: ignore[arg-type]
+                    for values, shift in ((tracks.xy, centre), (speed, 0), (place, 0))
+                )
+            )
+        )
+    return views
+
+
+def _focal_length(
+    tracks: Tracks, views: Sequence[_View], read_out: float, seed: int
+) -> float | None:
+    """The focal length by the views' matches, corrected for a read-out time."""
+    size = tracks.width, tracks.height
+    centre = np.array(size) / 2
+    keypoints: list[ImageKeypoints] = []
+    for view in views:
+        for xy in view.corrected(read_out):
+            number = np.arange(len(xy), dtype=np.int64)
+            keypoints.append(
+                ImageKeypoints(len(keypoints), (xy + centre).astype(np.float32), number)
+            )
+    pairs = np.arange(len(keypoints), dtype=np.int32).reshape(-1, 2)
+    matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
+    return estimate_focal_length(keypoints, pairs, matches, size, seed=seed)
+
+
+def _least(views: Sequence[_View], focal_length: float, seed: int) -> ReadOut | str:
+    """The time of the least loss; in words why there is none."""
+    loss = np.array(
+        [
+            [
+                np.log(pose_loss(*view.corrected(float(t)), focal_length, seed) + _LEAST_LOSS)
+                for t in _TRIED
+            ]
+            for view in views
+        ]
+    )
+    found, *halves = (lowest(_TRIED, part.mean(axis=0)) for part in (loss, loss[::2], loss[1::2]))
+    if found is None or None in halves:
+        return "the tracks show no least read-out time"
+    at_best = np.array([np.interp(found, _TRIED, row) for row in loss])
+    at_none = loss[:, len(_TRIED) // 2]
+    gain = at_none - at_best
+    significance = float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12))
+    one, two = halves
+    assert one is not None
+    assert two is not None
+    return ReadOut(found, abs(one - two) / 2, significance)

@@ -1,0 +1,111 @@
+"""Tracks of a rolling shutter, which reads the rows of a picture one after another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.tracks.tracks import Tracks
+
+# Width in pixels of the cells of a picture over which velocities are averaged: those of single
+# tracks are too noisy beside what a shutter changes, and what is near moves much alike.
+_CELL = 32
+# Weights of steps to the frames one and two away in the derivative of a cubic through all five.
+_NEAR, _FAR = 2 / 3, -1 / 12
+
+
+def velocities(tracks: Tracks) -> NDArray[np.float64]:
+    """Float64 [num_observations, 2] pixels per frame at each observation; 0 of lone ones.
+
+    The derivative of a cubic through the frames up to two away, where the track has all of them: a
+    line through so many would flatten what a hand shakes. Else that of a parabola through its
+    neighbours, or the step to the one it has. These are averaged over cells of each picture.
+    """
+    one, two = (_steps(tracks, shift) for shift in (1, 2))
+    ahead, behind = one, _back(one, 1)
+    far, far_behind = two, _back(two, 2)
+    both = (ahead + behind) / 2
+    cubic = _NEAR * (ahead + behind) + _FAR * (far + far_behind)
+    found = cubic
+    for other in (both, ahead, behind, 0.0):
+        found = np.where(np.isfinite(found), found, other)
+    return _mean_of_cells(tracks, found)
+
+
+def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean of values [num_observations, 2] over all tracks in a cell of a frame."""
+    columns = -(-tracks.width // _CELL) + 2
+    rows = -(-tracks.height // _CELL) + 2
+    cell = np.clip(tracks.xy // _CELL, -1, [columns - 2, rows - 2]).astype(np.int64) + 1
+    key = (tracks.frame.astype(np.int64) * rows + cell[:, 1]) * columns + cell[:, 0]
+    count = np.bincount(key)
+    sums = [np.bincount(key, weights=values[:, k]) for k in (0, 1)]
+    mean = np.column_stack([total[key] for total in sums]) / count[key, None]
+    return np.asarray(mean)
+
+
+def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
+    """Float64 [num_observations, 2] motion to so many frames later; NaN where that is unknown."""
+    found = np.full(tracks.xy.shape, np.nan)
+    if len(tracks.frame) > shift:
+        number = tracks.track
+        own = np.flatnonzero(
+            (number[shift:] == number[:-shift])
+            & (tracks.frame[shift:] - tracks.frame[:-shift] == shift)
+        )
+        found[own] = tracks.xy[own + shift].astype(np.float64) - tracks.xy[own]
+    return found
+
+
+def _back(steps: NDArray[np.float64], shift: int) -> NDArray[np.float64]:
+    """The motion from so many frames earlier, of those to so many later."""
+    found = np.full_like(steps, np.nan)
+    found[shift:] = steps[: len(steps) - shift]
+    return found
+
+
+def at_middle_of_read_out(
+    xy: NDArray[np.floating],
+    velocity: NDArray[np.floating],
+    place: NDArray[np.floating],
+    read_out: float,
+) -> NDArray[np.float64]:
+    """Where points are in the middle of the read-out, that are seen when their row is read.
+
+    Args:
+        xy: [n, 2] pixels.
+        velocity: [n, 2] pixels per frame.
+        place: [n] of their rows in the order of read-out, -0.5 for the first, 0.5 for the last.
+        read_out: time from the first row to the last, in frames.
+    """
+    return np.asarray(xy - read_out * place[:, None] * velocity, dtype=np.float64)
+
+
+def row_places(
+    xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Places [n] of points in the order of read-out, see `at_middle_of_read_out`.
+
+    Args:
+        xy: [n, 2] pixels of shown pictures.
+        size: (width, height) of these.
+        down: how the direction in which rows are read is shown: (0, 1) is down.
+    """
+    length = size[0] if down[0] else size[1]
+    from_centre = np.asarray(xy, dtype=np.float64) - np.array(size) / 2
+    return np.asarray(from_centre @ np.array(down) / length)
+
+
+def correct_tracks(tracks: Tracks, read_out: float, down: tuple[int, int]) -> Tracks:
+    """Tracks as a shutter sees them that takes each picture at once, in the middle of its read-out.
+
+    Args:
+        tracks: tracks through all frames.
+        read_out: time from the first row to the last, in frames; negative: read from the bottom.
+        down: as `row_places` takes it.
+    """
+    place = row_places(tracks.xy, (tracks.width, tracks.height), down)
+    moved = at_middle_of_read_out(tracks.xy, velocities(tracks), place, read_out)
+    return replace(tracks, xy=moved.astype(np.float32))

@@ -1,0 +1,144 @@
+"""Rolling shutters of known read-out time: estimated from tracks, and corrected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_av1 import CameraOptions, MatchOptions, OptionError, match
+from colmap_av1.cli import main
+from colmap_av1.matching.shutter.correct import rows_down, without_shutter
+from colmap_av1.matching.shutter.estimate import ReadOut, estimate_read_out
+from colmap_av1.tracks.shutter import correct_tracks, velocities
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import Clock
+from colmap_av1.video.display import Display
+
+WIDTH, HEIGHT, FOCAL, NUM_FRAMES, RATE = 640, 480, 560.0, 60, 30.0
+POINTS = np.random.default_rng(0).uniform([-9, -5, 8], [9, 5, 18], (900, 3))
+
+
+def seen_at(frame: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels [n, 2] where points [n] are seen at times [n] in frames, by an unsteady hand."""
+    t = np.broadcast_to(frame, len(POINTS)) / RATE
+    centre = np.column_stack([1.5 * t, 0.1 * np.sin(7 * t), 0.1 * np.sin(5 * t)])
+    turn = np.column_stack(
+        [0.03 * np.sin(9 * t), 0.05 * np.sin(6 * t) + 0.01 * np.sin(19 * t), 0.01 * np.sin(8 * t)]
+    )
+    local = Rotation.from_rotvec(turn).apply(POINTS - centre)
+    return FOCAL * local[:, :2] / local[:, 2:] + np.array([WIDTH, HEIGHT]) / 2
+
+
+def tracks_of(read_out: float, noise: float = 0.1, across: bool = False) -> Tracks:
+    """Tracks of a shutter that reads in so many frames, from the left where not from the top."""
+    axis, length = (0, WIDTH) if across else (1, HEIGHT)
+    xy = np.empty((len(POINTS), NUM_FRAMES, 2))
+    for frame in range(NUM_FRAMES):
+        at = np.full(len(POINTS), float(frame))
+        for _ in range(4):  # when the row is read that shows the point
+            at = frame + read_out * (seen_at(at)[:, axis] / length - 0.5)
+        xy[:, frame] = seen_at(at)
+    xy += np.random.default_rng(1).normal(0, noise, xy.shape)
+    inside = ((xy > 0) & (xy < [WIDTH, HEIGHT])).all(axis=(1, 2))
+    count = int(inside.sum())
+    return Tracks(
+        num_frames=NUM_FRAMES,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=np.arange(count + 1, dtype=np.int64) * NUM_FRAMES,
+        frame=np.tile(np.arange(NUM_FRAMES), count).astype(np.int32),
+        xy=xy[inside].reshape(-1, 2).astype(np.float32),
+        sigma=np.zeros(count * NUM_FRAMES, np.float32),
+        confirmed=np.zeros(count * NUM_FRAMES, np.bool_),
+    )
+
+
+@pytest.mark.parametrize(("read_out", "focal"), [(0.15, FOCAL), (-0.8, FOCAL), (0.45, None)])
+def test_read_out_is_estimated(read_out: float, focal: float | None) -> None:
+    found = estimate_read_out(tracks_of(read_out), (0, 1), focal)
+    assert isinstance(found, ReadOut)
+    assert found.frames == pytest.approx(read_out, rel=0.1, abs=0.01)
+
+
+def test_pictures_taken_at_once_stay() -> None:
+    tracks = tracks_of(0.0)
+    words = "no read-out time explains the tracks better than none"
+    assert estimate_read_out(tracks, (0, 1), FOCAL) == words
+    still = replace(tracks, xy=np.repeat(tracks.xy[::NUM_FRAMES], NUM_FRAMES, axis=0))
+    assert isinstance(estimate_read_out(still, (0, 1), FOCAL), str)
+    few = replace(tracks, num_frames=4, frame=tracks.frame[:4], xy=tracks.xy[:4])
+    few = replace(few, offsets=np.array([0, 4]), sigma=few.sigma[:4], confirmed=few.confirmed[:4])
+    told = estimate_read_out(few, (0, 1), FOCAL)
+    assert told == "too few frames share enough tracks, or nothing moves"
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_tracks_are_moved_to_the_middle_of_the_read_out(across: bool) -> None:
+    seen, exact = tracks_of(0.5, 0.0, across), tracks_of(0.0, 0.0)
+    assert len(seen.xy) == len(exact.xy)
+    corrected = correct_tracks(seen, 0.5, (1, 0) if across else (0, 1))
+    before, after = (np.linalg.norm(t.xy - exact.xy, axis=1) for t in (seen, corrected))
+    assert np.sqrt(np.mean(before**2)) > 0.7
+    assert np.sqrt(np.mean(after**2)) < 0.15 * np.sqrt(np.mean(before**2))
+
+
+def test_velocities_of_what_starts_ends_or_is_alone() -> None:
+    frame = np.array([3, 0, 1, 2, 3, 4, 5, 7, 8], np.int32)
+    offsets = np.array([0, 1, 7, 9])
+    x = np.concatenate([[5], 100 * np.arange(6) ** 2 / 25 + 40, [600, 606]])
+    tracks = Tracks(
+        num_frames=9,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=offsets,
+        frame=frame,
+        xy=np.column_stack([x, np.full(9, 300.0)]).astype(np.float32),
+        sigma=np.zeros(9, np.float32),
+        confirmed=np.zeros(9, np.bool_),
+    )
+    exact = [0, 4, 8, 16, 24, 32, 36, 6, 6]  # 8 t, and the step where there is one alone
+    np.testing.assert_allclose(velocities(tracks)[:, 0], exact, atol=1e-3)
+    np.testing.assert_allclose(velocities(tracks)[:, 1], 0, atol=1e-3)
+
+
+def test_rows_are_those_of_the_sensor() -> None:
+    assert rows_down(Display(), (640, 480)) == (0, 1)
+    assert rows_down(Display(), (480, 640)) == (1, 0)  # turned by a program, who knows which way
+    assert rows_down(Display(turn=((0, -1), (1, 0))), (480, 640)) == (-1, 0)
+    assert rows_down(Display(turn=((-1, 0), (0, -1))), (640, 480)) == (0, -1)
+
+
+def test_what_is_asked_for() -> None:
+    tracks = tracks_of(0.45)
+    for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
+        options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
+        moved, read_out = without_shutter(tracks, Display(), RATE, options, Clock())
+        assert read_out == pytest.approx(found)
+        assert (moved is tracks) == (found is None)
+    options = MatchOptions(
+        camera=CameraOptions(
+            rolling_shutter="estimate",
+            camera_model="SIMPLE_PINHOLE",
+            camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
+        )
+    )
+    _, read_out = without_shutter(tracks, Display(), RATE, options, Clock())
+    assert read_out == pytest.approx(15, abs=1.5)
+    assert without_shutter(tracks, Display(), None, options, Clock()) == (tracks, None)
+    for wrong in ("soon", "101", "nan"):
+        with pytest.raises(OptionError, match="give estimate, none, or milliseconds"):
+            CameraOptions(rolling_shutter=wrong)
+
+
+def test_command(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--video", str(clip), "--rolling_shutter=12.5"]
+    assert main(["match", "--database", str(tmp_path / "a.db"), *words]) == 0
+    told = capsys.readouterr().out
+    assert "rolling shutter\t12.5 ms from the first row to the last" in told
+    report = match(tmp_path / "b.db", clip)
+    assert report.read_outs == (None,)
