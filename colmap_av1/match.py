@@ -27,6 +27,7 @@ from colmap_av1.matching.image_matches import (
     new_cameras,
     pair_images,
     pairs_of_takes,
+    shape_of,
     verify_images,
 )
 from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
@@ -428,14 +429,14 @@ def _cameras(
 ) -> _Cameras:
     """Those of the database where it lists the images, else new ones."""
     takes = images.takes
-    shapes = [(own.size, own.pixel_aspect) for own in images.videos]
+    shapes = [shape_of(v.source.pictures, v.size, v.pixel_aspect) for v in images.videos]
     if not listed:
         made = new_cameras(paired, takes, shapes, images.inputs.photos, options, clock=clock)
         return _Cameras(made.of_images, made.of_images, made.focal_length, made.warnings)
     of_images = listed_cameras(database, listed, takes.images.names)
     notes: dict[str, None] = {}
-    for video, (_, aspect) in enumerate(shapes):
-        camera = of_images[takes.images_of(video).start]
+    for video, shape in enumerate(shapes):
+        camera, aspect = of_images[takes.images_of(video).start], shape.pixel_aspect
         notes |= dict.fromkeys(
             check_pixel_aspect(camera, aspect, "import the images with one of these")
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,11 @@ from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.video.facts import Video
+from colmap_av1.video.lens import said_focal_length
+
+# Factor to which the focal lengths of tracks and containers agree, where these crop little.
+_AGREE = 1.2
 
 
 @dataclass(frozen=True)
@@ -203,10 +209,54 @@ class NewCameras:
     warnings: list[str]
 
 
+@dataclass(frozen=True)
+class Shape:
+    """The pictures of a video.
+
+    Attributes:
+        size: (width, height) of the images in pixels.
+        pixel_aspect: width of a pixel over its height.
+        focal_length: in heights of a pixel, as the container says; None where it does not.
+    """
+
+    size: tuple[int, int]
+    pixel_aspect: float
+    focal_length: float | None
+
+
+def shape_of(video: Video, size: tuple[int, int], pixel_aspect: float) -> Shape:
+    """The shape of images of a video."""
+    return Shape(size, pixel_aspect, said_focal_length(video.tags, size, pixel_aspect))
+
+
+def _focal_length_of(
+    estimated: float | None, shape: Shape, model: str | None
+) -> tuple[float | None, list[str]]:
+    """The focal length that a camera starts from, and what is to be said of it.
+
+    Tracks tell it of the very pictures; what the container says is of a lens, whose pictures may
+    have been cropped to hold them steady.
+    """
+    said = shape.focal_length
+    if said is None or not is_nearly_pinhole(model):
+        return estimated, []
+    if estimated is None:
+        return said, [
+            f"the motion does not determine the focal length: it starts from {said:.0f} px, which "
+            "the container says"
+        ]
+    if abs(math.log(estimated / said)) <= math.log(_AGREE):
+        return estimated, []
+    return estimated, [
+        f"the focal length is {estimated:.0f} px by the tracks, {said:.0f} px by the container: "
+        "that of the tracks is used, as the other does not know of crops"
+    ]
+
+
 def new_cameras(
     paired: PairedImages,
     takes: Takes,
-    shapes: Sequence[tuple[tuple[int, int], float]],
+    shapes: Sequence[Shape],
     photos: Sequence[Photo],
     options: MatchOptions,
     *,
@@ -214,13 +264,13 @@ def new_cameras(
 ) -> NewCameras:
     """Make a camera for each video, and for the photos of each camera and size.
 
-    Given intrinsics are those of videos. Others are estimated from the tracks of a video, and from
-    what EXIF says of photos.
+    Given intrinsics are those of videos. Others are estimated from the tracks of a video, else from
+    what its container says, and from what EXIF says of photos.
 
     Args:
         paired: the images.
         takes: of which video each image is, or whether it is a photo.
-        shapes: of each video, (width, height) of its images, and width of a pixel over its height.
+        shapes: of each video.
         photos: the photos.
         options: those of the camera and the seed are used.
         clock: gets the stage "focal length".
@@ -235,11 +285,15 @@ def new_cameras(
         images = [image for take in shared for image in takes.images_of(take)]
         given, aspect = options.camera, 1.0
         if shared[0] < len(shapes):
-            size, aspect = shapes[shared[0]]
+            shape = shapes[shared[0]]
+            size, aspect = shape.size, shape.pixel_aspect
             of_videos = [i for t in shared if t < len(shapes) for i in takes.images_of(t)]
             own = _of_images(paired, of_videos)
             focal_length = shared_focal_length(own, size, aspect, options, clock=clock)
             estimated.append(focal_length)
+            if given.camera_params is None:
+                focal_length, words = _focal_length_of(focal_length, shape, given.camera_model)
+                notes |= dict.fromkeys(words)
         else:
             photo = photos[shared[0] - len(shapes)]
             size, focal_length = photo.size, photo.focal_length

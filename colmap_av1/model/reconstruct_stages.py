@@ -24,10 +24,12 @@ from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
+    NewCameras,
     PairedImages,
     new_cameras,
     pair_images,
     pairs_of_takes,
+    shape_of,
     verify_images,
 )
 from colmap_av1.matching.link_plan import images_to_link
@@ -263,7 +265,8 @@ def match_stage(
             index = _key_images(run, videos, takes)
         keyed = takes.some(index)
         paired = _paired_images(run, videos, keyed)
-        cameras = _cameras(run, videos, takes, index, paired)
+        made = _cameras(run, videos, takes, index, paired)
+        cameras = made.of_images
         apart = len(takes.take) / len(keyed.take)
         linked = _match_images(run, videos, paired, cameras, keyed, images_apart=apart)
         matched = linked.matched
@@ -276,7 +279,7 @@ def match_stage(
         of_videos = cameras[: keyed.images_of(len(videos)).start]
         return {
             "links": dataclasses.asdict(linked.report),
-            "link_warnings": list(linked.report.warnings),
+            "link_warnings": [*made.warnings, *linked.report.warnings],
             "key_images": index,
             "num_key_images": len(index),
             "num_pose_tracks": len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
@@ -380,20 +383,20 @@ def _cameras(
     takes: Takes,
     index: Sequence[int],
     paired: PairedImages,
-) -> list[Any]:
+) -> NewCameras:
     """The cameras of the key images, that are some of all images.
 
     What is estimated comes from all images: a few that lie far apart mislead.
     """
     options, photos = run.options.match, run.inputs.photos
     opened = [source.pictures for source in run.sources]
-    shapes = [(file.picture_size, file.display.pixel_aspect) for file in opened]
+    shapes = [shape_of(v, v.picture_size, v.display.pixel_aspect) for v in opened]
     if options.camera.camera_params is not None or len(index) == len(takes.take):
         keyed = takes.some(index)
-        return new_cameras(paired, keyed, shapes, photos, options, clock=run.clock).of_images
+        return new_cameras(paired, keyed, shapes, photos, options, clock=run.clock)
     every = _paired_images(run, videos, takes)
-    cameras = new_cameras(every, takes, shapes, photos, options, clock=run.clock).of_images
-    return [cameras[i] for i in index]
+    made = new_cameras(every, takes, shapes, photos, options, clock=run.clock)
+    return replace(made, of_images=[made.of_images[i] for i in index])
 
 
 def _match_images(

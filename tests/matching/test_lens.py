@@ -1,0 +1,58 @@
+"""The focal length that a container says, beside that of the tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import Ffmpeg
+
+from colmap_av1 import CameraOptions, MatchOptions, match
+from colmap_av1.database.reading import read_cameras
+from colmap_av1.matching.image_matches import Shape, _focal_length_of
+from colmap_av1.video.lens import said_focal_length
+
+TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+@pytest.mark.parametrize(
+    ("said", "focal_length"),
+    [("26", 1323.8), ("26.5", 1349.2), ("0", None), ("9999", None), ("wide", None), ("", None)],
+)
+def test_equivalent_of_film(said: str, focal_length: float | None) -> None:
+    found = said_focal_length(((TAG, said),), (1920, 1080))
+    assert found == (None if focal_length is None else pytest.approx(focal_length, abs=0.1))
+    assert said_focal_length((("comment", said),), (1920, 1080)) is None
+
+
+def test_which_of_both_wins() -> None:
+    shape = Shape((1920, 1080), 1.0, 1300.0)
+    assert _focal_length_of(1400.0, shape, None) == (1400.0, [])
+    used, (told,) = _focal_length_of(1800.0, shape, None)
+    assert used == 1800.0
+    assert told.startswith("the focal length is 1800 px by the tracks, 1300 px by the container:")
+    used, (told,) = _focal_length_of(None, shape, "RADIAL")
+    assert used == 1300.0
+    assert "it starts from 1300 px, which the container says" in told
+    assert _focal_length_of(None, shape, "OPENCV_FISHEYE") == (None, [])
+    assert _focal_length_of(None, Shape((1920, 1080), 1.0, None), None) == (None, [])
+
+
+def test_where_motion_does_not_determine_it(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    tagged = ffmpeg(
+        *("-i", clip, "-c", "copy", "-movflags", "use_metadata_tags"),
+        *("-metadata", f"{TAG}=30", tmp_path / "phone.mp4"),
+    )
+    report = match(tmp_path / "a.db", tagged)
+    assert report.focal_length is None  # by the tracks
+    assert any("which the container says" in words for words in report.warnings)
+    (camera,) = read_cameras(tmp_path / "a.db").values()
+    assert camera.mean_focal_length() == pytest.approx(30 / 43.267 * 230.76, abs=0.1)
+    assert camera.has_prior_focal_length
+    options = MatchOptions(
+        camera=CameraOptions(camera_model="SIMPLE_PINHOLE", camera_params="200,96,64")
+    )
+    report = match(tmp_path / "b.db", tagged, options=options)
+    assert not any("container says" in words for words in report.warnings)
+    (camera,) = read_cameras(tmp_path / "b.db").values()
+    assert camera.mean_focal_length() == 200
