@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.images.masks import Mask
+from colmap_av1.video.coded_size import usual_downscale
 
 # Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from
 # far apart share; with it there are several times as many.
@@ -38,9 +39,16 @@ class Features:
 
 
 class FeatureExtractor:
-    """Extracts SIFT features by pycolmap, on one thread."""
+    """Extracts SIFT features by pycolmap, on one thread.
+
+    Args:
+        max_num_features: about so many at most, those of the largest scale.
+        effort: light: those of large scales, of large pictures in smaller ones, where they are the
+            same; full: all.
+    """
 
     def __init__(self, max_num_features: int, effort: Literal["light", "full"] = "light") -> None:
+        self._effort = effort
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.num_threads = 1
@@ -55,9 +63,14 @@ class FeatureExtractor:
 
     def extract(self, picture: NDArray[np.uint8]) -> Features:
         """The features of a picture: uint8 [height, width, 3], BGR."""
-        grey = np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-        keypoints, found = self._extractor.extract_from_uint8_array(grey)
+        grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        factor = usual_downscale(grey.shape[::-1]) if self._effort == "light" else 1
+        if factor > 1:
+            size = tuple(length // factor for length in grey.shape[::-1])
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        keypoints, found = self._extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         xy = np.array([(k.x, k.y) for k in keypoints], dtype=np.float32).reshape(-1, 2)
+        xy *= np.array(picture.shape[1::-1], dtype=np.float32) / grey.shape[::-1]
         descriptors = np.asarray(found.data, dtype=np.float32).reshape(-1, _NUM_DIMENSIONS)
         length = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(xy, descriptors / np.maximum(length, 1e-6))

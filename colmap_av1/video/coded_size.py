@@ -15,8 +15,12 @@ def with_downscale(options: EncodeOptions, size: tuple[int, int]) -> EncodeOptio
     """The same options, with what pictures of a (width, height) are downscaled by."""
     if options.downscale is not None:
         return options
-    largest = math.isqrt(size[0] * size[1] // _LEAST_PIXELS)
-    return replace(options, downscale=float(max(1, largest)))
+    return replace(options, downscale=float(usual_downscale(size)))
+
+
+def usual_downscale(size: tuple[int, int]) -> int:
+    """The largest whole factor by which pictures of a (width, height) stay large enough."""
+    return max(1, math.isqrt(size[0] * size[1] // _LEAST_PIXELS))
 
 
 def coded_size(size: tuple[int, int], options: EncodeOptions) -> tuple[int, int]:
