@@ -59,6 +59,7 @@ class TrackBuilderOptions:
     bridge: float | None
     cells: int
     seeding: int
+    observed: list[int] | None
     def __init__(self) -> None: ...
 
 class TrackBuilder:

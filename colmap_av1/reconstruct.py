@@ -24,11 +24,10 @@ from colmap_av1.model.reconstruct_poses import (
     pose_stage,
     resection_stage,
 )
-from colmap_av1.model.reconstruct_stages import (
+from colmap_av1.model.reconstruct_stages import match_stage, read_links
+from colmap_av1.model.reconstruct_tracks import (
     Run,
     VideoTracks,
-    match_stage,
-    read_links,
     read_tracks,
     stage_of_video,
     track_stage,

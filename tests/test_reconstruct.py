@@ -245,15 +245,22 @@ def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
 
 
 def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
-    """Of 60 frames about as many as asked for become images, unless an option says which."""
+    """Of 60 frames about as many as asked for become images, unless an option says which.
+
+    Of many more frames every n-th is looked at.
+    """
 
     def stop(stage: str, *_: object) -> None:
         if stage == "pairs":
             raise KeyboardInterrupt
 
     chosen = []
-    for name, images in (("few", ImageOptions()), ("all", ImageOptions(every=1))):
-        options = ReconstructOptions(match=MatchOptions(images=images), max_images=25)
+    for name, images, most in (
+        ("few", ImageOptions(), 25),
+        ("all", ImageOptions(every=1), 25),
+        ("fewer", ImageOptions(), 10),
+    ):
+        options = ReconstructOptions(match=MatchOptions(images=images), max_images=most)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
         with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
@@ -262,6 +269,8 @@ def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
             assert file["names"][1] == f"frame_{chosen[-1][1]:06d}.png"
     assert 25 <= len(chosen[0]) <= 30
     assert (chosen[0][0], chosen[0][-1], len(chosen[1])) == (0, 59, 60)
+    assert 10 <= len(chosen[2]) <= 12
+    assert set(chosen[2].tolist()) <= set(range(0, 60, 3))
 
 
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:

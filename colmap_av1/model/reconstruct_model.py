@@ -18,9 +18,10 @@ from colmap_av1.model.colmap_model import ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
-from colmap_av1.model.reconstruct_stages import Run
+from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.track_points import (
     Colours,
+    by_camera,
     cloud_of,
     mean_error,
     seen_in,
@@ -74,13 +75,9 @@ def _on_pinholes(
     image: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Pixels of observations [n, 2] by images [n] in the undistorted pictures of these."""
-    found = np.empty(xy.shape)
-    camera_ids = np.array([own.camera_id for own in placed.images])
     pinholes = {int(own.camera.camera_id): own.camera for own in views}
-    for camera_id, camera in placed.cameras.items():
-        own = camera_ids[image] == camera_id
-        found[own] = on_pinhole(camera, pinholes[camera_id], xy[own])
-    return found
+    change = {i: partial(on_pinhole, camera, pinholes[i]) for i, camera in placed.cameras.items()}
+    return by_camera(xy, np.array([own.camera_id for own in placed.images]), image, change)
 
 
 def _write_images(

@@ -25,7 +25,7 @@ from colmap_av1.model.colmap_model import (
 )
 from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import adjust_model, map_poses
-from colmap_av1.model.reconstruct_stages import LEAST_IMAGES, Run, pose_tracks
+from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.model.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.model.triangulate import TriangulatedPoints

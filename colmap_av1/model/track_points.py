@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,15 +30,27 @@ _LUMA = np.array([299, 587, 114])
 # Width in pixels of the squares that hold one track each: tracks that come near each other show
 # two points as long as they do not come nearer than this.
 _CELL = 2
+# Observations worked on at a time; bounds memory.
+_CHUNK = 1 << 18
 
 
-def chaining_for_points(options: MatchOptions, triangulate: TriangulateOptions) -> MatchOptions:
-    """The options with more tracks, for points: short ones, and those that lie near another."""
+def chaining_for_points(
+    options: MatchOptions, triangulate: TriangulateOptions, *, is_downscaled: bool = False
+) -> MatchOptions:
+    """The options with more tracks, for points: short ones, and those that lie near another.
+
+    Args:
+        options: those of chaining are changed where they leave the choice.
+        triangulate: how many observations a point has.
+        is_downscaled: motion is searched in smaller pictures, whose tracks are corrected. There
+            the squares of motion are as fine in them as a trainer needs points: more tracks would
+            leave fewer of them corrected, at three times the time and twice the memory.
+    """
     tracks = options.tracks
     if tracks.min_length is None:
         min_length = min(_TRACK_LENGTH, triangulate.min_observations)
         tracks = replace(tracks, min_length=min_length)
-    if tracks.cell is None:
+    if tracks.cell is None and not is_downscaled:
         tracks = replace(tracks, cell=min(_CELL, tracks.seeding))
     return replace(options, tracks=tracks)
 
@@ -66,11 +78,12 @@ def triangulate_tracks(
 
     Errors are in pixels of each image's pinhole camera, else of its own.
     """
-    rays = np.full((len(view), 2), np.nan)
-    camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
-    for camera in {int(camera.camera_id): camera for camera in cameras}.values():
-        own = camera_of_view[view] == int(camera.camera_id)
-        rays[own] = np.asarray(camera.cam_from_img(tracks.xy[own].astype(np.float64)))
+    rays = by_camera(
+        tracks.xy,
+        np.array([int(camera.camera_id) for camera in cameras]),
+        view,
+        {int(c.camera_id): c.cam_from_img for c in cameras},
+    )
     shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = len(tracks.offsets) - 1
@@ -81,6 +94,25 @@ def triangulate_tracks(
         num_threads=num_threads,
         progress=lambda done: progress("points", done, num_tracks),
     )
+
+
+def by_camera(
+    xy: NDArray[np.float32],
+    camera_of_view: NDArray[np.int64],
+    view: NDArray[np.int64],
+    change: Mapping[int, Callable[[NDArray[np.float64]], Any]],
+) -> NDArray[np.float64]:
+    """Positions [n, 2] in views [n], changed by what is given for the camera of each view."""
+    found = np.empty(xy.shape)
+    # Part by part: what is made on the way is several times as large.
+    for start in range(0, len(xy), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        camera = camera_of_view[view[part]]
+        for camera_id, changed in change.items():
+            own = camera == camera_id
+            if own.any():
+                found[part][own] = np.asarray(changed(xy[part][own].astype(np.float64)))
+    return found
 
 
 class Colours:

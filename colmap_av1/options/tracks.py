@@ -83,8 +83,8 @@ class TrackOptions(Options):
     cell: int | None = option(
         None,
         "width in pixels of the squares of a frame that hold one track each: where two tracks "
-        "meet in one, the longer is kept. None: 4, or 2 for points of a dense model, or that of "
-        "seeding where it is less",
+        "meet in one, the longer is kept. None: 4, or 2 for points of a dense model where motion "
+        "is searched in pictures of full size, or that of seeding where it is less",
         among=_CELLS,
         unit="pixels",
     )

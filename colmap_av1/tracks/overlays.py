@@ -55,10 +55,13 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     step /= frame - tracks.frame[to - 1]
     count = np.bincount(frame, minlength=tracks.num_frames)
     by_frame = np.split(step[order_by_frame(frame, tracks.num_frames)], np.cumsum(count)[:-1])
+    # Frames since the last one that any observation is kept in.
+    observed = np.flatnonzero(np.bincount(tracks.frame))
+    since = dict(zip(observed[1:].tolist(), np.diff(observed).tolist(), strict=True))
     motion = np.zeros(tracks.num_frames)
-    for index in np.flatnonzero(count):
+    for index in np.flatnonzero(count).tolist():
         middle = len(by_frame[index]) // 2
-        motion[index] = np.partition(by_frame[index], middle)[middle]
+        motion[index] = np.partition(by_frame[index], middle)[middle] * since[index]
     return motion
 
 

@@ -62,6 +62,8 @@ def build_tracks(
     motion: Iterable[FrameMotion],
     options: TrackOptions | None = None,
     progress: Callable[[int], None] | None = None,
+    *,
+    frames: NDArray[np.int32] | None = None,
 ) -> Tracks:
     """Chain the motion of a video into point tracks.
 
@@ -81,11 +83,14 @@ def build_tracks(
         motion: the coded frames of one video, in bitstream order.
         options: how to chain; the defaults of TrackOptions if None.
         progress: called after each coded frame with the number of frames so far.
+        frames: int32 [n] display indices of the frames whose observations are kept, which bounds
+            memory; None: those of all.
 
     Returns:
         Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their seeds
         (display order of the frame, then raster order). Where frames differ in size,
-        positions are in pixels of the first shown frame's size.
+        positions are in pixels of the first shown frame's size. With `frames` they are the same
+        tracks, without those that fewer than two of these see.
 
     Raises:
         VideoError: no frame is shown.
@@ -93,7 +98,10 @@ def build_tracks(
             each other.
     """
     options = options if options is not None else TrackOptions()
-    builder = _core.TrackBuilder(_core_options(options))
+    core_options = _core_options(options)
+    if frames is not None:
+        core_options.observed = frames.tolist()
+    builder = _core.TrackBuilder(core_options)
     for count, frame in enumerate(motion, start=1):
         if not isinstance(frame, FrameMotion):
             raise TypeError(
@@ -173,6 +181,19 @@ def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
     wanted = np.zeros(tracks.num_frames, dtype=np.bool_)
     wanted[frames] = True
     return keep_observations(tracks, wanted[tracks.frame])
+
+
+def in_frames_alone(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
+    """The tracks as of a video that shows some frames only, and no others between them.
+
+    Args:
+        tracks: any tracks.
+        frames: int32 [n] display indices, ascending.
+    """
+    number = np.full(tracks.num_frames, -1, dtype=np.int32)
+    number[frames] = np.arange(len(frames), dtype=np.int32)
+    seen = keep_frames(tracks, frames)
+    return replace(seen, num_frames=len(frames), frame=number[seen.frame])
 
 
 def keep_tracks_of(tracks: Tracks, frames: NDArray[np.int32], fewest: int) -> Tracks:

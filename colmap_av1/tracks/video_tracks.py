@@ -32,7 +32,7 @@ from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import EncodeReport, encode, stream_of
-from colmap_av1.video.facts import Video, frame_times, read_video
+from colmap_av1.video.facts import Video, frame_times, read_video, with_counted_packets
 from colmap_av1.video.unchanged import FileState
 
 _Image = NDArray[np.uint8]
@@ -57,6 +57,11 @@ class VideoSource:
     pictures: Video
     is_kept: bool = True
     conversion: str | None = None
+
+    @property
+    def is_downscaled(self) -> bool:
+        """Whether the stream's pictures are smaller than those that become images."""
+        return self.stream.picture_size != self.pictures.picture_size
 
     @property
     def files(self) -> tuple[FileState, ...]:
@@ -183,6 +188,7 @@ def track_video(
     options: MatchOptions,
     *,
     one_size: bool,
+    frames: NDArray[np.int32] | None = None,
     clock: Clock,
     progress: Progress,
 ) -> TrackedVideo:
@@ -192,6 +198,7 @@ def track_video(
         source: the video.
         options: those of reading, chaining and refinement are used.
         one_size: refuse shown frames of several sizes, as refinement does.
+        frames: int32 [n] the frames, as players show them, whose observations are kept; None: all.
         clock: gets the stages "motion" and "tracks", with refinement "decoding" and
             "refinement".
         progress: called for the stages "motion" and "refinement".
@@ -213,11 +220,13 @@ def track_video(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with clock.measure("tracks"):
-            tracks = build_tracks(motion, options.tracks, count)
+            presented = source.pictures.presented
+            stored = frames if frames is None or presented is None else presented[frames]
+            tracks = build_tracks(motion, options.tracks, count, frames=stored)
             num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
             tracks = remove_overlays(tracks)
             share_over_picture = 1 - len(tracks.offsets) / num_tracks
-            tracks = show_tracks(tracks, source.stream.display, source.pictures.presented)
+            tracks = show_tracks(tracks, source.stream.display, presented)
             num_pixels = num_frames * tracks.width * tracks.height
             if source.stream is not source.pictures:
                 tracks = scale_tracks(tracks, source.pictures.picture_size)
@@ -239,7 +248,7 @@ def track_video(
     # Of the whole file, so a rate that is found low is even lower.
     bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels
     notes += _notes(source, share_over_picture, structure.reasons(bits_per_pixel))
-    inter_share = _inter_share(structure, num_frames, source.pictures.presented)
+    inter_share = _inter_share(structure, num_frames, presented)
     return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
 
 
@@ -276,6 +285,13 @@ def _inter_share(
     starts = np.concatenate([presented[:1], presented[:-1] + 1])
     ends = presented + 1
     return np.array([share[a:b].min() for a, b in zip(starts, ends, strict=True)], np.float32)
+
+
+def count_frames(source: VideoSource) -> int:
+    """Frames that players show of a video, as its containers say."""
+    if source.pictures.presented is not None:
+        return len(source.pictures.presented)
+    return with_counted_packets(source.stream).num_packets or 0
 
 
 def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
@@ -321,8 +337,7 @@ def refine_in_images(
     Raises:
         BitstreamError: the video is damaged, and strict.
     """
-    is_smaller = source.stream.picture_size != source.pictures.picture_size
-    if not is_smaller or options.refine.refine != "none":
+    if not source.is_downscaled or options.refine.refine != "none":
         return tracked
     with clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

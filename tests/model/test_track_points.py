@@ -68,6 +68,10 @@ def test_points_come_from_short_tracks_too(
     ).tracks
     assert (tracks.min_length, tracks.cell) == (min_length, cell)
     assert replace(tracks, min_length=given.min_length, cell=given.cell) == given
+    smaller = chaining_for_points(
+        options, TriangulateOptions(min_observations=min_observations), is_downscaled=True
+    ).tracks
+    assert (smaller.min_length, smaller.cell) == (min_length, given.cell)
 
 
 def test_views_are_places_among_the_frames() -> None:

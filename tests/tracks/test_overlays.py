@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import colmap_av1
 from colmap_av1.tracks.overlays import remove_overlays
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames
 
 SCENE = PROJECT / "examples" / "scene.mp4"
 
@@ -57,6 +57,16 @@ def test_only_what_stands_still_before_a_moving_picture_goes(
         np.testing.assert_array_equal(kept.xy, expected.xy)
     elif step * (length - 1) < 3.99:
         assert kept is tracks
+
+
+def test_the_way_between_kept_frames_counts() -> None:
+    """Where observations of every fifth frame are kept, the picture moves as far as in all."""
+    paths = [(0, np.full((21, 2), 50.0)), (0, moving(0.25, 21)), (0, moving(0.25, 21))]
+    tracks = make_tracks(paths, 21)
+    some = keep_frames(tracks, np.arange(0, 21, 5, dtype=np.int32))
+    kept = remove_overlays(some)
+    assert len(kept.offsets) == 3
+    np.testing.assert_array_equal(kept.xy, some.xy[5:])
 
 
 def test_no_tracks() -> None:

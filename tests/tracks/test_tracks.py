@@ -18,7 +18,13 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import TrackOptions
-from colmap_av1.tracks.tracks import Tracks, build_tracks, keep_long_tracks
+from colmap_av1.tracks.tracks import (
+    Tracks,
+    build_tracks,
+    in_frames_alone,
+    keep_frames,
+    keep_long_tracks,
+)
 
 BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32 = 0, 3, 6, 9
 NEWMV, GLOBALMV = 16, 15
@@ -902,6 +908,32 @@ def test_any_motion_gives_valid_tracks(motion: list[FrameMotion], options: Track
     again = build_tracks(iter(motion), options)
     for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
         assert getattr(tracks, name).tobytes() == getattr(again, name).tobytes()
+
+
+@given(motion=random_video(), options=any_options, every=st.integers(1, 4))
+@settings(max_examples=100, deadline=None)
+def test_observations_of_some_frames_are_those_of_the_same_tracks(
+    motion: list[FrameMotion], options: TrackOptions, every: int
+) -> None:
+    if all(f.display_index < 0 for f in motion):
+        return
+    frames = np.arange(1, len(motion) + 3, every, dtype=np.int32)
+    tracks = build_tracks(motion, options)
+    seen = keep_long_tracks(keep_frames(tracks, frames[frames < tracks.num_frames]), 2)
+    some = build_tracks(motion, options, frames=frames)
+    assert some.num_frames == tracks.num_frames
+    for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
+        assert getattr(some, name).tobytes() == getattr(seen, name).tobytes()
+
+
+def test_frames_alone_are_counted_through() -> None:
+    tracks = build_tracks(low_delay([(1.0, 0.0)] * 8), OPEN)
+    alone = in_frames_alone(tracks, np.array([1, 4, 7], dtype=np.int32))
+    assert alone.num_frames == 3
+    lasting = np.flatnonzero(np.diff(alone.offsets) == 3)[0]
+    own = slice(*alone.offsets[lasting : lasting + 2])
+    assert alone.frame[own].tolist() == [0, 1, 2]
+    np.testing.assert_allclose(np.diff(alone.xy[own], axis=0), [[-3, 0]] * 2, atol=1e-5)
 
 
 def test_progress_counts_coded_frames() -> None:

@@ -4,6 +4,7 @@
 
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
 
 #ifdef __GLIBC__
 #include <malloc.h>
@@ -86,7 +87,8 @@ void bind_options(nb::module_& m) {
       .def_rw("interpolation", &TrackBuilderOptions::interpolation)
       .def_rw("bridge", &TrackBuilderOptions::bridge)
       .def_rw("cells", &TrackBuilderOptions::cells)
-      .def_rw("seeding", &TrackBuilderOptions::seeding);
+      .def_rw("seeding", &TrackBuilderOptions::seeding)
+      .def_rw("observed", &TrackBuilderOptions::observed);
 }
 
 }  // namespace

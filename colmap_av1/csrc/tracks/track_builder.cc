@@ -12,7 +12,7 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
     : options_(options),
       grid_(options.cells),
       chainer_(options, grid_),
-      store_(options.min_length) {
+      store_(options.min_length, options.observed) {
   const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
   if (!is_part(options.cells) || !is_part(options.seeding) || options.seeding > options.cells) {
     throw std::invalid_argument("cells and seeding are 1, 2 or 4, seeding not above cells");

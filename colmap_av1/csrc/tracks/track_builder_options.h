@@ -1,8 +1,10 @@
 // What can be chosen about tracks.
 #pragma once
 
+#include <cstdint>
 #include <cstdlib>
 #include <optional>
+#include <vector>
 
 namespace colmap_av1::tracks {
 
@@ -21,6 +23,8 @@ struct TrackBuilderOptions {
   std::optional<double> bridge;
   int cells = 1;    // along either side of a unit
   int seeding = 1;  // along either side of a square of them that a track starts in; divides cells
+  // Display indices of the frames whose observations are kept; without a value those of all.
+  std::optional<std::vector<std::int32_t>> observed;
 
   bool is_within_reach(int interval) const {
     return !max_interval || std::abs(interval) <= *max_interval;

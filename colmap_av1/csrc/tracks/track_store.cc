@@ -4,8 +4,19 @@
 #include <cmath>
 #include <limits>
 #include <stdexcept>
+#include <utility>
 
 namespace colmap_av1::tracks {
+
+TrackStore::TrackStore(int min_length, std::optional<std::vector<std::int32_t>> observed)
+    : min_length_(min_length), observed_(std::move(observed)) {
+  if (observed_) std::sort(observed_->begin(), observed_->end());
+}
+
+bool TrackStore::is_observed(const ChainedFrame& frame) const {
+  return !observed_ ||
+         std::binary_search(observed_->begin(), observed_->end(), frame.motion.display_index);
+}
 
 void TrackStore::set_size(int width, int height) {
   width_ = width;
@@ -26,26 +37,33 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
   Track& track = tracks_[index];
   track.frames = 1;
   frame.cells[cell].track = index;
-  if (frame.is_shown()) observe(track, frame, frame.cells[cell]);
+  if (frame.is_shown()) {
+    ++track.length;
+    if (is_observed(frame)) record(track, frame, frame.cells[cell]);
+  }
   return index;
 }
 
 void TrackStore::observe(const ChainedFrame& frame) {
+  const bool is_kept = is_observed(frame);
   for (const Cell& cell : frame.cells) {
-    if (cell.track >= 0) observe(tracks_[cell.track], frame, cell);
+    if (cell.track < 0) continue;
+    Track& track = tracks_[cell.track];
+    ++track.length;
+    if (is_kept) record(track, frame, cell);
   }
 }
 
-void TrackStore::observe(Track& track, const ChainedFrame& frame, const Cell& cell) {
+void TrackStore::record(Track& track, const ChainedFrame& frame, const Cell& cell) {
   const float scale_x = static_cast<float>(width_) / frame.motion.width;
   const float scale_y = static_cast<float>(height_) / frame.motion.height;
-  const int place = track.length % kStretch;
+  const int place = track.observed % kStretch;
   if (place == 0) start_stretch(track);
   stretches_[track.last_stretch].observations[place] = {
       frame.motion.display_index,
       {cell.position.x * scale_x, cell.position.y * scale_y},
       std::sqrt(cell.variance) * scale_y};
-  ++track.length;
+  ++track.observed;
 }
 
 void TrackStore::start_stretch(Track& track) {
@@ -64,6 +82,7 @@ void TrackStore::start_stretch(Track& track) {
 }
 
 void TrackStore::release(ChainedFrame& frame) {
+  const int least_observed = observed_ ? 2 : 1;
   for (std::size_t i = 0; i < frame.cells.size(); ++i) {
     const Cell& cell = frame.cells[i];
     if (cell.track == kSeed && length(frame, cell) >= min_length_) start(frame, i);
@@ -71,7 +90,7 @@ void TrackStore::release(ChainedFrame& frame) {
     Track& track = tracks_[cell.track];
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
-    if (track.length >= min_length_) keep(cell.track);
+    if (track.length >= min_length_ && track.observed >= least_observed) keep(cell.track);
     for (std::int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
       free_stretches_.push_back(s);
     }
@@ -81,8 +100,8 @@ void TrackStore::release(ChainedFrame& frame) {
 void TrackStore::keep(std::int32_t index) {
   const Track& track = tracks_[index];
   const auto first = static_cast<std::ptrdiff_t>(done_.frame.size());
-  kept_.push_back({serials_[index], first, track.length});
-  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.length);
+  kept_.push_back({serials_[index], first, track.observed});
+  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.observed);
   done_.frame.resize(size);
   done_.xy.resize(2 * size);
   done_.sigma.resize(size);
@@ -90,7 +109,7 @@ void TrackStore::keep(std::int32_t index) {
   auto xy = done_.xy.end();
   auto sigma = done_.sigma.end();
   std::int32_t stretch = track.last_stretch;
-  for (int i = track.length - 1; i >= 0; --i) {
+  for (int i = track.observed - 1; i >= 0; --i) {
     const Observation& observation = stretches_[stretch].observations[i % kStretch];
     *--frame = observation.frame;
     *--xy = observation.position.y;

@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <deque>
+#include <optional>
 #include <vector>
 
 #include "tracks/chained_frame.h"
@@ -22,10 +23,13 @@ struct TrackArrays {
   std::vector<float> sigma;
 };
 
-// Memory: the observations of tracks that are alive or long enough to keep.
+// Memory: the observations of tracks that are alive or long enough to keep, in the frames whose
+// observations are wanted.
 class TrackStore {
  public:
-  explicit TrackStore(int min_length) : min_length_(min_length) {}
+  // `observed`: display indices of these frames; without a value all are, else a track that only
+  // one of them sees is not kept.
+  TrackStore(int min_length, std::optional<std::vector<std::int32_t>> observed);
 
   // Size of the pictures that positions are given in.
   void set_size(int width, int height);
@@ -63,8 +67,9 @@ class TrackStore {
   struct Track {
     std::int32_t last_seen = -1;  // order of the frame
     std::int32_t last_stretch = -1;
-    std::int32_t length = 0;
-    std::int32_t frames = 0;  // that hold it
+    std::int32_t length = 0;    // shown frames that have seen it
+    std::int32_t observed = 0;  // observations that are kept of it
+    std::int32_t frames = 0;    // that hold it
   };
   struct Observation {
     std::int32_t frame = 0;
@@ -88,11 +93,13 @@ class TrackStore {
     std::int32_t length = 0;
   };
 
-  void observe(Track& track, const ChainedFrame& frame, const Cell& cell);
+  void record(Track& track, const ChainedFrame& frame, const Cell& cell);
+  bool is_observed(const ChainedFrame& frame) const;
   void start_stretch(Track& track);
   void keep(std::int32_t index);
 
   int min_length_;
+  std::optional<std::vector<std::int32_t>> observed_;  // ascending
   int width_ = 0;
   int height_ = 0;
   std::vector<Track> tracks_;

@@ -22,7 +22,7 @@ from colmap_av1.model.placing.placement import (
 )
 from colmap_av1.model.placing.up import some_spread, vertical_lines
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images
-from colmap_av1.model.reconstruct_stages import Run
+from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.undistort import pinhole_camera
 from colmap_av1.util.stages import Kept, run_stage
 
