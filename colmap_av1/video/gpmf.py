@@ -23,6 +23,8 @@ _NUMBERS = {
     **{"b": "i1", "B": "u1", "s": ">i2", "S": ">u2", "l": ">i4", "L": ">u4"},
     **{"f": ">f4", "d": ">f8", "j": ">i8", "J": ">u8"},
 }
+# Items within items: cameras write a device that holds streams.
+_DEEPEST = 8
 _LEAST_FIX = 2  # GPSF and the last number of GPS9: 0 without a lock, else its dimensions
 _METRES = 3  # latitude, longitude, altitude
 
@@ -66,13 +68,15 @@ def read_payload(data: bytes) -> Payload:
 _Stream = list[tuple[str, NDArray[np.float64]]]
 
 
-def _streams(data: bytes) -> Iterator[_Stream]:
+def _streams(data: bytes, depth: int = 0) -> Iterator[_Stream]:
     """The numbers of each innermost item that holds others, in their order."""
+    if depth > _DEEPEST:
+        return
     found: _Stream = []
     type_of: str | None = None
     for key, kind, size, body in _items(data):
         if kind == _NESTED:
-            yield from _streams(body)
+            yield from _streams(body, depth + 1)
         elif key == "TYPE":  # of the elements of the complex item after it
             type_of = body.rstrip(b"\0").decode("latin1")
         else:

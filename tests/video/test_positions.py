@@ -127,3 +127,10 @@ def test_images_lie_between_positions(clip: Path, tmp_path: Path) -> None:
     assert np.isfinite(found.places).all(axis=1).tolist() == known.tolist()
     expected = np.interp(times[known], [0.1, 0.2, 0.3], PLACES[1:4, 1])
     np.testing.assert_allclose(found.places[known, 1], expected, atol=1e-7)
+
+
+def test_items_within_items_without_end() -> None:
+    # Each of 5,000 items holds all that follow.
+    data = b"".join(b"DEVC\0\1" + (8 * rest).to_bytes(2, "big") for rest in range(4999, -1, -1))
+    payload = read_payload(data)
+    assert len(payload.positions) == len(payload.gravity) == 0
