@@ -13,12 +13,14 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.inputs import paths_of, read_inputs
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.placing.stage import place_stage
 from colmap_av1.model.reconstruct_model import model_stage
+from colmap_av1.model.reconstruct_moving import moving_stage, read_moving, without_moving
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
     pose_stage,
@@ -61,6 +63,8 @@ class ReconstructReport:
         num_frames: shown frames of the videos.
         num_images: frames chosen as images, and photos.
         masked: share of the images' pixels that masks leave out; None without masks.
+        moving: share of the images' pixels that move by themselves and have no points; None where
+            that was not looked for.
         num_key_images: those of them that were mapped; the others are placed between them.
         num_registered: images with a pose; only these are written.
         registered: those of each of several videos, by its name.
@@ -95,6 +99,7 @@ class ReconstructReport:
     num_frames: int
     num_images: int
     masked: float | None
+    moving: float | None
     num_key_images: int
     num_registered: int
     registered: dict[str, int]
@@ -216,8 +221,10 @@ def _run_stages(run: Run) -> ReconstructReport:
     posed = _mended_poses(run, videos, takes, tracked)
     kept |= posed.stages
     kept["place"] = placed = place_stage(run, takes, posed.last, positions)
-    kept["model"] = model_stage(run, join_tracks(posed.tracks, posed.links), takes, placed)
+    tracks = join_tracks(posed.tracks, posed.links)
+    kept["model"] = model_stage(run, tracks, takes, posed.moving, placed)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
+    facts = {"moving": None} | facts
     facts |= {"num_images": len(takes.take), "masked": takes.masked}
     facts["read_outs"] = tuple(stage.facts["read_out"] for stage in tracked)
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
@@ -252,11 +259,13 @@ class _Posed:
         stages: what each of them kept, by its name, in order.
         tracks: the tracks of all videos, cut where motion is not believed.
         links: links as tracks.
+        moving: by the names of images, masks that leave out what moves by itself.
     """
 
     stages: dict[str, Kept]
     tracks: Tracks
     links: Tracks
+    moving: dict[str, Mask]
 
     @property
     def last(self) -> Kept:
@@ -329,9 +338,15 @@ def _pose_stages(
     stages = {"matches": matched, "poses": posed}
     if len(keyed.take) < len(takes.take):
         stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
+    moving: dict[str, Mask] = {}
+    if run.options.moving != "keep":
+        stages["moving"] = posed = moving_stage(run, tracks, takes, posed)
+        moving = read_moving(run.stages)
     if run.options.mapping.adjust:
+        # On all tracks: its loss is robust, and what still stands beside what moves is of use.
         stages["adjustment"] = adjustment_stage(run, tracks, links, takes, posed)
-    return _Posed(stages, tracks, links)
+    tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
+    return _Posed(stages, tracks, links, moving)
 
 
 def _notes(facts: dict[str, Any]) -> list[str]:

@@ -344,12 +344,28 @@ def _bounds(scene: Scene, frame: int, surface: Surface) -> tuple[float, float, f
 
 def _cast(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
     """[n] depth along the camera's z axis of what is seen at positions ``xy`` [n, 2]."""
+    return cast(scene, frame, xy)[0]
+
+
+def cast(scene: Scene, frame: int, xy: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """What is seen at image positions.
+
+    Args:
+        scene: the scene.
+        frame: frame index.
+        xy: [n, 2] positions in pixels, corner (0, 0); they may lie between pixels.
+
+    Returns:
+        [n] depth along the camera's z axis, inf where nothing is seen, and [n] index of the
+        surface.
+    """
     pose = scene.cam_from_world[frame]
     centre = -pose[:, :3].T @ pose[:, 3]
     rays = _rays(scene, frame, xy)
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
     depth = np.full(len(xy), np.inf)
-    for surface in scene.surfaces:
+    seen = np.full(len(xy), -1, dtype=np.int64)
+    for serial, surface in enumerate(scene.surfaces):
         box = _bounds(scene, frame, surface)
         if box is None:
             continue
@@ -357,8 +373,9 @@ def _cast(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
         near = rays[at]
         with np.errstate(divide="ignore", invalid="ignore"):
             t = _intersect(surface, centre.dot, near.dot)[0]
-        depth[at] = np.minimum(depth[at], t)
-    return depth
+        nearer = t < depth[at]
+        depth[at[nearer]], seen[at[nearer]] = t[nearer], serial
+    return depth, seen
 
 
 def _rays(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
@@ -1125,9 +1142,14 @@ def _tone(linear: FloatArray) -> FloatArray:
     return np.asarray(np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055))
 
 
+def paint(scene: Scene, first: int = 0) -> list[_Texture]:
+    """Textures of the surfaces, from one on, in the scene's light."""
+    return [_texture(scene, k) for k in range(first, len(scene.surfaces))]
+
+
 def render(scene: Scene) -> Iterator[NDArray[np.uint8]]:
     """All frames in order, uint8 [height, width, 3] RGB."""
-    textures = [_texture(scene, k) for k in range(len(scene.surfaces))]
+    textures = paint(scene)
     for frame in range(len(scene.cam_from_world)):
         yield render_frame(scene, textures, frame)
 

@@ -38,7 +38,7 @@ from colmap_av1.options import (
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
 
-STAGES = ("tracks", "matches", "poses", "resection", "adjustment", "place", "model")
+STAGES = ("tracks", "matches", "poses", "resection", "moving", "adjustment", "place", "model")
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 
@@ -295,6 +295,7 @@ def contents(output: Path) -> dict[str, bytes]:
         ("database.db", "matches"),
         (".stages/poses/0/images.bin", "poses"),
         (".stages/placed/images.bin", "resection"),
+        (".stages/moving.npz", "moving"),
         ("images/frame_000006.png", "model"),
         ("sparse/0/points3D.bin", "model"),
     ],

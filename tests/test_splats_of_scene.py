@@ -114,7 +114,8 @@ def test_reconstruct_makes_splats_after_a_survey(made: ReconstructReport, tmp_pa
     shutil.copytree(made.output, output)
     options = replace(OPTIONS, triangulate=TriangulateOptions())
     report = reconstruct(SCENE, output, options=options)
-    assert report.resumed == ("tracks", "matches", "poses", "resection", "adjustment", "place")
+    stages = ("tracks", "matches", "poses", "resection", "moving", "adjustment", "place")
+    assert report.resumed == stages
     assert report.coverage > 0.99 > made.coverage
     assert report.num_points < made.num_points
     model = pycolmap.Reconstruction(output / "sparse" / "0")

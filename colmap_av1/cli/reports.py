@@ -95,6 +95,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
             "frames in the video",
         ),
         *_mask_row(report.masked),
+        *_moving_row(report.moving),
         *((f"images of {name}", f"{n} with a pose") for name, n in report.registered.items()),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
@@ -157,6 +158,10 @@ def _conversion_row(conversion: str | None) -> Rows:
 
 def _mask_row(masked: float | None) -> Rows:
     return [] if masked is None else [("masks", f"{masked:.1%} of the images are left out")]
+
+
+def _moving_row(moving: float | None) -> Rows:
+    return [] if moving is None else [("moving by itself", f"{moving:.1%} of the images")]
 
 
 def _link_rows(

@@ -76,6 +76,17 @@ def make_mask(kept: NDArray[np.bool_]) -> Mask:
     return Mask((width, height), packed, float(kept.mean()))
 
 
+def joined_masks(a: Mask | None, b: Mask | None) -> Mask | None:
+    """The mask of what counts by both, of the size of the first; None: all does."""
+    if a is None or b is None:
+        return a if b is None else b
+    other = b.kept
+    if b.size != a.size:
+        resized = cv2.resize(other.astype(np.uint8), a.size, interpolation=cv2.INTER_NEAREST)
+        other = resized > 0
+    return make_mask(a.kept & other)
+
+
 @dataclass(frozen=True)
 class VideoMasks:
     """The masks of a video.
@@ -321,7 +332,9 @@ def _read_mask(path: Path) -> Mask:
     return make_mask(picture > 0)
 
 
-def mask_tracks(tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: int) -> Tracks:
+def mask_tracks(
+    tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: int, *, scaled: bool = True
+) -> Tracks:
     """The tracks without what masks leave out: one that enters such an area ends there.
 
     One that leaves such an area begins there, too: what was before may be of another surface.
@@ -330,6 +343,8 @@ def mask_tracks(tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: in
         tracks: any tracks.
         masks: by frame, or one for all.
         min_length: observations that are left of a track at least.
+        scaled: masks may be of another size than the pictures; else each is of its picture's, which
+            need not be alike.
     """
     size = (tracks.width, tracks.height)
     if isinstance(masks, Mask):
@@ -341,7 +356,8 @@ def mask_tracks(tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: in
         for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
             if frame in masks and first < last:
                 own = order[first:last]
-                kept[own] = masks[frame].keeps(tracks.xy[own], size)
+                mask = masks[frame]
+                kept[own] = mask.keeps(tracks.xy[own], size if scaled else mask.size)
     if kept.all():
         return tracks
     return keep_long_tracks(split_tracks(tracks, kept), min_length)

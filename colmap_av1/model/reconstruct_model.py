@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.files import read_image, write_image, write_images
+from colmap_av1.images.masks import Mask, joined_masks
 from colmap_av1.images.takes import Takes
-from colmap_av1.model.colmap_model import ModelPoints, points_seen, write_model
+from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
@@ -138,31 +139,52 @@ def _write_images(
         return far.result(), replace(cloud, rgb=colours.rgb())
 
 
-def _write_masks(folder: Path, names: Sequence[str], views: Sequence[PosedCamera]) -> None:
+def _write_masks(
+    folder: Path,
+    images: Sequence[ModelImage],
+    cameras: Mapping[int, Any],
+    masks: Sequence[Mask | None],
+) -> None:
     """Write a mask for each image, white where there is none.
 
     Trainers look for `masks/NAME.png` beside `images/NAME.jpg`, and so does COLMAP where images
     are PNG.
     """
-    for name, view in zip(names, views, strict=True):
-        width, height = view.size
-        kept = view.mask.kept if view.mask is not None else np.ones((height, width), np.bool_)
-        file = (folder / name).with_suffix(".png")
+    for image, mask in zip(images, masks, strict=True):
+        camera = cameras[image.camera_id]
+        shape = (int(camera.height), int(camera.width))
+        kept = mask.kept if mask is not None else np.ones(shape, np.bool_)
+        file = (folder / image.name).with_suffix(".png")
         file.parent.mkdir(parents=True, exist_ok=True)
         write_image(file, np.where(kept, np.uint8(255), np.uint8(0)))
 
 
-def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
-    """Triangulate all tracks and write the images and the model that trainers open."""
+def model_stage(
+    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], posed: Kept
+) -> Kept:
+    """Triangulate all tracks and write the images and the model that trainers open.
+
+    Args:
+        run: what every stage is given.
+        tracks: the tracks of all takes, without those of what moves by itself.
+        takes: all images.
+        moving: by the names of images, masks that leave out what moves.
+        posed: the stage that holds the poses.
+    """
     options, clock = run.options, run.clock
-    masked = run.inputs.masks is not None
+    masked = run.inputs.masks is not None or options.moving == "mask"
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
         cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
         images = placed.images
-        masks = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
-        views = views_of(images, cameras, masks)
+        given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
+        joined = [
+            joined_masks(mask, moving.get(image.name))
+            for mask, image in zip(placed.masks, images, strict=True)
+        ]
+        counting = undistorted_masks(joined, placed.camera_of_image, cameras)
+        views = views_of(images, cameras, counting)
         seen, view = seen_in(tracks, placed.frames)
         dense = _dense_cloud(run, placed, views, seen, view)
         points, cloud = dense.points, dense.cloud
@@ -173,7 +195,8 @@ def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
             folder.mkdir(parents=True)
             write_model(folder, cameras, images, cloud)
             if masked:
-                _write_masks(partial / _MASKS, [image.name for image in images], views)
+                shown = counting if options.moving == "mask" else given
+                _write_masks(partial / _MASKS, images, cameras, shown)
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),
@@ -186,11 +209,11 @@ def model_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
             "agreeing": points.num_agreeing / max(points.num_tracks, 1),
         }
 
-    given = (options.triangulate, options.match.images.image_name)
+    how = (options.triangulate, options.match.images.image_name, options.moving)
     kept = run_stage(
         run.stages,
         "model",
-        [posed.digest, given],
+        [posed.digest, how],
         into=run.output,
         products=["images", "sparse", *([_MASKS] if masked else [])],
         make=make,

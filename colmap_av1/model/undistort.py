@@ -92,13 +92,17 @@ def undistorted_masks(
     """
 
     @functools.cache
+    def change_of(camera_id: int) -> Callable[[_Image], _Image] | None:
+        return undistortion(of_id[camera_id], pinholes[camera_id], cv2.INTER_NEAREST)
+
+    @functools.cache
     def undistort(mask: Mask, camera_id: int) -> Mask:
         pinhole = pinholes[camera_id]
         size = (int(pinhole.width), int(pinhole.height))
         kept = mask.kept.astype(np.uint8)
         if mask.size != size:
             kept = cv2.resize(kept, size, interpolation=cv2.INTER_NEAREST)
-        change = undistortion(of_id[camera_id], pinhole, cv2.INTER_NEAREST)
+        change = change_of(camera_id)
         return make_mask((change(kept) if change is not None else kept) > 0)
 
     of_id = {int(camera.camera_id): camera for camera in cameras}

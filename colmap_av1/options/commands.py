@@ -80,6 +80,12 @@ class ReconstructOptions(Options):
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
     place: PlaceOptions = part(PlaceOptions())
+    moving: Literal["keep", "drop", "mask"] = option(
+        "drop",
+        "what moves by itself, such as people and cars: drop: it gets no points; mask: nor does it "
+        "in the masks written for trainers; keep: it is not looked for",
+        common=True,
+    )
     max_images: int = option(
         300,
         "images of a video with more frames, spread evenly in parallax and as close together as "

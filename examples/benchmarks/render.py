@@ -491,6 +491,23 @@ def rolling_shutter(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def movers(rows: list[Row]) -> str:
+    """Models of a scene that people walk through."""
+    columns = [
+        words("people cover", "people"),
+        words("`--moving`", "moving"),
+        figure("images", "registered", ".0f"),
+        figure("ATE", "ate_mm", ".2f", " mm"),
+        figure("points", "points", ",.0f"),
+        figure("on people", "points_on_people", ".2%"),
+        figure("IoU of masks", "iou", ".2f"),
+        figure("of people", "covered", ".1%"),
+        figure("of what stands still", "static_lost", ".1%"),
+        figure("CPU s", "cpu_s", ".1f"),
+    ]
+    return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'people')}"
+
+
 def plain(rows: list[Row]) -> str:
     """A table whose columns are those of the file, in its words."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
@@ -511,6 +528,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "verification": verification,
     "encoders": encoders,
     "large_pictures": plain,
+    "movers": movers,
     "read_memory": plain,
     "rolling_shutter": rolling_shutter,
     "long_video": plain,

@@ -1,0 +1,197 @@
+"""What moves by itself, in tracks of a made-up scene and in a clip."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import Encode
+from numpy.typing import NDArray
+
+from colmap_av1.model.coverage import PosedCamera
+from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
+from colmap_av1.model.moving.regions import moving_cells
+from colmap_av1.model.triangulate import Observations, Views, triangulate
+from colmap_av1.options import (
+    CameraOptions,
+    ImageOptions,
+    MatchOptions,
+    ReconstructOptions,
+    TriangulateOptions,
+)
+from colmap_av1.reconstruct import reconstruct
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.video.decoding import decode_frames
+
+WIDTH, HEIGHT, FOCAL, CELL = 320, 240, 300.0, 8
+CAMERA = pycolmap.Camera(
+    camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, 160, 120]
+)
+NUM_IMAGES = 24
+WALL, BOX = 6.0, 4.0
+
+
+@dataclass(frozen=True)
+class Made:
+    placed: PlacedTracks
+    views: list[PosedCamera]
+    moves: NDArray[np.bool_]
+
+
+def cameras(rng: np.random.Generator) -> list[PosedCamera]:
+    """A camera that goes to the right, with an unsteady hand."""
+    step = np.arange(NUM_IMAGES)
+    centres = np.column_stack([0.08 * step, 0.05 * np.sin(step / 2), 0.03 * np.cos(step / 3)])
+    poses = []
+    for centre in centres:
+        rotation = cv2.Rodrigues(0.002 * rng.standard_normal(3))[0]
+        poses.append(np.column_stack([rotation, -rotation @ centre]))
+    return [PosedCamera(CAMERA, pose) for pose in poses]
+
+
+def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> Made:
+    """Tracks of a wall, a box before it and, with a velocity in metres an image, a walker.
+
+    Each point is seen where nothing nearer hides it; a part of the tracks drifts.
+    """
+    rng = np.random.default_rng(3)
+    views = cameras(rng)
+    start = np.array([0.5, 0.0, 3.0])
+    low, high = np.array([-0.25, -0.7]), np.array([0.25, 0.9])
+
+    def grid(x: tuple[float, float], y: tuple[float, float], z: float) -> NDArray[np.float64]:
+        across, down = np.meshgrid(np.arange(*x, CELL * z / FOCAL), np.arange(*y, CELL * z / FOCAL))
+        return np.column_stack([across.ravel(), down.ravel(), np.full(across.size, z)])
+
+    still = np.concatenate([grid((-4, 6), (-3, 3), WALL), grid((-0.9, -0.3), (0, 0.8), BOX)])
+    walker = grid((low[0], high[0]), (low[1], high[1]), 0.0 + start[2]) - [0, 0, start[2]]
+    walker = walker if velocity is not None else walker[:0]
+    speed = np.array(velocity if velocity is not None else (0, 0, 0))
+    found: list[list[tuple[int, float, float]]] = [[] for _ in range(len(still) + len(walker))]
+    for number, view in enumerate(views):
+        # Nobody walks as steadily as a camera on rails: steps alone tell that it is no point.
+        there = start + speed * (number + 3 * np.sin(number / 2))
+        xyz = np.concatenate([still, walker + there])
+        index, xy, depth = view.project(xyz)
+        ray = xyz[index] - view.centre
+        hit = view.centre + ray * ((there[2] - view.centre[2]) / ray[:, 2])[:, None] - there
+        behind_walker = (hit[:, :2] > low).all(axis=1) & (hit[:, :2] < high).all(axis=1)
+        behind_walker &= (index < len(still)) & (len(walker) > 0)
+        at_box = view.centre + ray * ((BOX - view.centre[2]) / ray[:, 2])[:, None]
+        behind_box = (at_box[:, 0] > -0.9) & (at_box[:, 0] < -0.3)
+        behind_box &= (at_box[:, 1] > 0) & (at_box[:, 1] < 0.8) & (depth > BOX + 0.5)
+        for i in np.flatnonzero(~behind_walker & ~behind_box):
+            found[index[i]].append((number, *xy[i]))
+    pieces, moves = [], []
+    for point, seen in enumerate(found):
+        # A track ends where its point is hidden.
+        breaks = np.diff([s[0] for s in seen]) > 1
+        # Encoders' tracks break off at other places, too.
+        breaks |= rng.random(len(breaks)) < 0.07
+        for piece in np.split(seen, np.flatnonzero(breaks) + 1):
+            if len(piece) >= 4:
+                pieces.append(np.array(piece))
+                moves.append(point >= len(still))
+    offsets = np.cumsum([0, *map(len, pieces)])
+    rows = np.concatenate(pieces)
+    xy = rows[:, 1:] + 0.1 * rng.standard_normal((len(rows), 2))
+    drifts = np.repeat(rng.random(len(pieces)) < drift, np.diff(offsets))
+    xy[drifts] += np.cumsum(rng.standard_normal((drifts.sum(), 2)), axis=0) % 6
+    image = rows[:, 0].astype(np.int64)
+    tracks = Tracks(
+        *(NUM_IMAGES, WIDTH, HEIGHT, offsets, image.astype(np.int32), xy.astype(np.float32)),
+        np.full(len(rows), 0.3, np.float32),
+        np.zeros(len(rows), np.bool_),
+    )
+    points = triangulate(
+        Observations(offsets, image, np.asarray(CAMERA.cam_from_img(xy)), tracks.sigma),
+        Views(np.array([v.cam_from_world for v in views]), np.full((NUM_IMAGES, 2), FOCAL)),
+        TriangulateOptions(
+            max_reprojection_error=8.0, min_angle=0.0, max_depth_error=None, points="survey"
+        ),
+    )
+    placed = place_tracks(tracks, image, points, views, cell=CELL)
+    return Made(placed, views, np.array(moves))
+
+
+# Along the epipolar lines against the camera and faster than it, towards it, and upwards.
+WALKS = [(-0.05, 0, 0), (0.13, 0, 0), (-0.01, 0, -0.06), (0, -0.03, 0)]
+
+
+@pytest.mark.parametrize("velocity", WALKS)
+def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, float]) -> None:
+    scene = made(velocity)
+    found = Contradictions(scene.placed, scene.views)
+    by_depth = found.by_depth(np.zeros(len(scene.moves), np.bool_))
+    assert np.mean(by_depth[scene.moves]) > 0.2
+    assert np.mean(by_depth[~scene.moves]) < 0.01
+    cells = moving_cells(scene.placed, scene.views)
+    placed = scene.placed
+    within = placed.mean(cells[placed.image, placed.row, placed.column])
+    assert np.mean(within[scene.moves] > 0.5) > 0.9
+    # Grown by a cell, so what is beside is touched.
+    assert np.mean(within[~scene.moves] > 0.5) < 0.12
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.3])
+def test_nothing_moves_in_a_still_scene(drift: float) -> None:
+    """A box before a wall hides and shows it; encoders let tracks of smooth surfaces drift."""
+    scene = made(None, drift=drift)
+    assert not moving_cells(scene.placed, scene.views).any()
+
+
+# A poster of so many pixels that goes across the pictures of the rendered courtyard.
+POSTER = (88, 200)
+NUM_FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def walked(
+    encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, NDArray[np.bool_]]:
+    """A clip with a textured thing that moves against the picture, and where that is."""
+    scene = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
+    shown = (picture for _, picture in decode_frames(scene))
+    frames = np.array(list(itertools.islice(shown, NUM_FRAMES)))
+    rng = np.random.default_rng(5)
+    texture = rng.integers(0, 256, (POSTER[1] // 8, POSTER[0] // 8, 3), dtype=np.uint8)
+    texture = cv2.resize(texture, POSTER, interpolation=cv2.INTER_CUBIC)
+    there = np.zeros(frames.shape[:3], np.bool_)
+    for number, frame in enumerate(frames):
+        x, y = 120 + 6 * number + round(4 * np.sin(number)), 100
+        frame[y : y + POSTER[1], x : x + POSTER[0]] = texture
+        there[number, y : y + POSTER[1], x : x + POSTER[0]] = True
+    return encode(frames, tmp_path_factory.mktemp("walked") / "walked.mp4"), there
+
+
+def test_reconstruct_leaves_out_what_moves(
+    walked: tuple[Path, NDArray[np.bool_]], tmp_path: Path
+) -> None:
+    video, there = walked
+    options = ReconstructOptions(
+        match=MatchOptions(
+            images=ImageOptions(every=1),
+            camera=CameraOptions(camera_model="PINHOLE", camera_params="520,520,320,180"),
+        ),
+        moving="mask",
+    )
+    report = reconstruct(video, tmp_path / "out", options=options)
+    model = pycolmap.Reconstruction(report.output / "sparse" / "0")
+    assert len(model.images) == NUM_FRAMES
+    on_it = total = 0
+    for image in model.images.values():
+        xy = np.array([p.xy for p in image.points2D if p.has_point3D()]).astype(int)
+        on_it += int(there[int(image.name[6:12]), xy[:, 1], xy[:, 0]].sum())
+        total += len(xy)
+    assert total > 20_000
+    masks = sorted((report.output / "masks").iterdir())
+    found = np.array([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) == 0 for path in masks])
+    assert np.mean(found[there]) > 0.8
+    assert on_it < 0.002 * total
+    assert np.mean(found[~there]) < 0.08
+    assert report.moving == pytest.approx(found.mean(), rel=0.05)
