@@ -328,7 +328,7 @@ def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path)
     assert {record.stem for record in records} == {*STAGES, "joints"}
     part = records[5].read_text()[:-40]
     texts = ["", "[]", "7", "{", "null", '{"key": 3, "facts": null}', part]
-    texts.append('{"key": "", "facts": {}}')
+    texts += ['{"key": "", "facts": {}}', "[1]"]
     for record, text in zip(records, texts, strict=True):
         record.write_text(text)
     assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()

@@ -31,7 +31,6 @@ class TriangulateOptions(Options):
         least=0,
         below=90,
         unit="degrees",
-        common=True,
     )
     max_depth_error: float | None = option(
         0.07,
