@@ -18,9 +18,9 @@ from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
 from colmap_av1.model.placing.stage import place_stage
 from colmap_av1.model.reconstruct_model import model_stage
-from colmap_av1.model.reconstruct_moving import moving_stage, read_moving, without_moving
 from colmap_av1.model.reconstruct_poses import (
     adjustment_stage,
     pose_stage,

@@ -15,7 +15,7 @@ from colmap_av1.model.coverage import views_of
 from colmap_av1.model.moving.contradictions import place_tracks
 from colmap_av1.model.moving.regions import mask_of_cells, moving_cells
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images
-from colmap_av1.model.reconstruct_stages import Run
+from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.track_points import chaining_for_points, seen_in, triangulate_tracks
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
