@@ -27,11 +27,11 @@ class Parser(argparse.ArgumentParser):
         self.rare: list[argparse.Action] = []
         self._full_help = full_help
         self.add_argument("-h", "--help", action=_Help, nargs=0, help="show this help and exit")
-        if full_help:
-            text = "show the help of all options and exit"
-            self.add_argument("--help-all", action=_FullHelp, nargs=0, help=text)
-            # As words come, with '_' for '-'.
-            self.add_argument("--help_all", action=_FullHelp, nargs=0, help=argparse.SUPPRESS)
+        # Where --help shows all options, it is taken, too, and not shown.
+        text = "show the help of all options and exit" if full_help else argparse.SUPPRESS
+        self.add_argument("--help-all", action=_FullHelp, nargs=0, help=text)
+        # As words come, with '_' for '-'.
+        self.add_argument("--help_all", action=_FullHelp, nargs=0, help=argparse.SUPPRESS)
 
     def short_help(self) -> str:
         """Help without the rare options where there is --help-all."""

@@ -138,6 +138,13 @@ def options_in(text: str) -> set[str]:
     return set(re.findall(r"--([a-z_-]+)", "\n".join(lines)))
 
 
+@pytest.mark.parametrize("command", ["encode", "info", "motion", "check", "export", "map"])
+def test_help_all_is_help_where_that_is_whole(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert help_of(command, "--help-all", capsys) == help_of(command, "--help", capsys)
+
+
 @pytest.mark.parametrize("command", ["match", "reconstruct", "densify", "compare", "view"])
 def test_help_shows_few_options_and_help_all_the_rest(
     command: str, capsys: pytest.CaptureFixture[str]
