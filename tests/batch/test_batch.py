@@ -235,7 +235,9 @@ def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
     options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=5)))
     assert run_batch(video, scenes, options, options=ALONE).num_done == 1
     made = sorted(p.name for p in (scenes / "scene").iterdir())
-    assert made == ["database.db", "images", "report.json", "sparse", "thumbnail.jpg"]
+    assert made == [
+        *("database.db", "images", "place.json", "report.json", "sparse", "thumbnail.jpg")
+    ]
     report = run_batch(video, dense, DensifyOptions(), models=scenes, options=ALONE)
     assert report.num_done == 1
     (row,) = rows_of(dense)
