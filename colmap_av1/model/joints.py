@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,6 +22,8 @@ _FEWEST_VIEWS = 3
 # more afterwards, models that were bent there 1 to 5 %.
 _DOUBTFUL = 0.15
 _WEAK = 0.07
+# So many points hold any joint, however many others have: bent ones had 50 at most.
+_ENOUGH = 100
 
 
 @dataclass(frozen=True)
@@ -39,17 +42,17 @@ class Joints:
     @property
     def weak(self) -> list[int]:
         """Joints, by index, that hold far less than the others do: a model may be bent there."""
-        return self._below(_WEAK)
+        return self._below(_WEAK, most=_ENOUGH)
 
     @property
     def doubtful(self) -> list[int]:
         """Joints, by index, that hold much less than the others do, the weak ones among them."""
         return self._below(_DOUBTFUL)
 
-    def _below(self, share: float) -> list[int]:
+    def _below(self, share: float, most: float = math.inf) -> list[int]:
         if len(self.num_points) == 0:
             return []
-        least = share * float(np.median(self.num_points))
+        least = min(share * float(np.median(self.num_points)), most)
         return [int(i) for i in np.flatnonzero(self.num_points < least)]
 
     @property

@@ -327,23 +327,6 @@ def end_to_end(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
 
 
-def end_to_end_summary(rows: list[Row]) -> str:
-    """SIFT's model and that of `reconstruct` on each sequence."""
-    ways = {SIFT_MODEL: "SIFT", "reconstruct: dense model": "`reconstruct`"}
-    rows = [row for row in rows if row["way"] in ways]
-    columns = [
-        Column("clip", lambda row: f"`{row['sequence']}`" if row["way"] == SIFT_MODEL else ""),
-        Column("model", lambda row: ways[row["way"]]),
-        figure("images", "images", ".0f"),
-        figure("points", "points", ",.0f"),
-        figure("reprojection error", "error_px", ".3f", " px"),
-        figure("camera centres", "ate", ".4f"),
-        figure("seconds", "seconds", ".0f"),
-        figure("CPU seconds", "cpu_s", ".0f"),
-    ]
-    return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'sequence')}"
-
-
 def jerks(rows: list[Row]) -> str:
     """Models of clips whose camera jerks, by sequence and way."""
     groups: dict[tuple[str, str], list[Row]] = {}
@@ -522,7 +505,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "phone_to_folder.steps": phone_to_folder_steps,
     "jerks": jerks,
     "end_to_end": end_to_end,
-    "end_to_end.summary": end_to_end_summary,
     "read_motion": read_motion,
     "dav1d_profile": dav1d_profile,
     "verification": verification,
