@@ -340,7 +340,7 @@ def _pose_stages(
         stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        stages["moving"] = posed = moving_stage(run, tracks, takes, posed)
+        stages["moving"] = moving_stage(run, tracks, takes, posed)
         moving = read_moving(run.stages)
     if run.options.mapping.adjust:
         # On all tracks: its loss is robust, and what still stands beside what moves is of use.

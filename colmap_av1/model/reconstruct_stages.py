@@ -36,14 +36,9 @@ from colmap_av1.model.reconstruct_tracks import (
     pose_tracks,
     tracks_of,
 )
-from colmap_av1.options import (
-    DensityOptions,
-)
+from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import (
-    Tracks,
-    keep_frames,
-)
+from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
