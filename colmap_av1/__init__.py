@@ -27,6 +27,7 @@ from colmap_av1.errors import (
 )
 from colmap_av1.map import MapReport, map_database
 from colmap_av1.match import MatchReport, match
+from colmap_av1.model.reconstruct_models import FurtherModel
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import StreamReport, inspect
 from colmap_av1.motion.motion_file import export_motion
@@ -79,6 +80,7 @@ __all__ = [
     "EvaluationError",
     "ExportOptions",
     "FrameMotion",
+    "FurtherModel",
     "HlocError",
     "HlocMatches",
     "ImageError",

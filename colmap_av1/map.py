@@ -17,10 +17,10 @@ from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
+from colmap_av1.model.agreement.far_views import FarViews, model_far_views
+from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import MODEL_FILES, posed_images, read_model
-from colmap_av1.model.far_views import FarViews, model_far_views
 from colmap_av1.model.figures import ModelFigures, model_figures
-from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import is_mapper_log, map_poses
 from colmap_av1.model.placing.placement import (
     Placement,

@@ -13,23 +13,13 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.images.inputs import paths_of, read_inputs
-from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.images.takes import Takes
-from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
-from colmap_av1.model.placing.stage import place_stage
-from colmap_av1.model.reconstruct_model import model_stage
-from colmap_av1.model.reconstruct_poses import (
-    adjustment_stage,
-    pose_stage,
-    resection_stage,
-)
-from colmap_av1.model.reconstruct_stages import match_stage, read_links
+from colmap_av1.model.reconstruct_models import FurtherModel, further_models, written_model
+from colmap_av1.model.reconstruct_posed import mended_poses
 from colmap_av1.model.reconstruct_tracks import (
     Run,
-    VideoTracks,
     read_tracks,
     stage_of_video,
     track_stage,
@@ -37,13 +27,12 @@ from colmap_av1.model.reconstruct_tracks import (
 from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
-from colmap_av1.tracks.tracks import Tracks, cut_tracks, join_tracks, tracks_in_a_row
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.util.stages import Kept, open_stages, run_stage
+from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import count_shown
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -68,7 +57,8 @@ class ReconstructReport:
         num_key_images: those of them that were mapped; the others are placed between them.
         num_registered: images with a pose; only these are written.
         registered: those of each of several videos, by its name.
-        other_models: images of further models the mapper made, which are left out.
+        other_models: models of images that nothing connects with those of this one, each in a
+            folder `model_1`, ... of the output.
         num_tracks: tracks of the videos.
         num_pose_tracks: tracks that the poses come from.
         num_points: 3D points.
@@ -103,7 +93,7 @@ class ReconstructReport:
     num_key_images: int
     num_registered: int
     registered: dict[str, int]
-    other_models: tuple[int, ...]
+    other_models: tuple[FurtherModel, ...]
     num_tracks: int
     num_pose_tracks: int
     num_points: int
@@ -218,11 +208,10 @@ def _run_stages(run: Run) -> ReconstructReport:
     positions = image_positions(takes, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
     kept = {stage_of_video(run, video): tracked[video] for video in numbers}
-    posed = _mended_poses(run, videos, takes, tracked)
+    posed = mended_poses(run, videos, takes, tracked)
     kept |= posed.stages
-    kept["place"] = placed = place_stage(run, takes, posed.last, positions)
-    tracks = join_tracks(posed.tracks, posed.links)
-    kept["model"] = model_stage(run, tracks, takes, posed.moving, placed)
+    kept |= written_model(run, posed, takes)
+    further, unplaced = further_models(run, videos, posed, takes)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     facts = {"moving": None} | facts
     facts |= {"num_images": len(takes.take), "masked": takes.masked}
@@ -233,12 +222,12 @@ def _run_stages(run: Run) -> ReconstructReport:
         *run.inputs.with_names([stage.facts["warnings"] for stage in tracked]),
         *facts["link_warnings"],
         *facts["place_warnings"],
-        *_notes(facts),
+        *_notes(facts, further, unplaced),
     ]
     reported: dict[str, Any] = {
         f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
     }
-    reported |= {"other_models": tuple(facts["other_models"]), "warnings": tuple(notes)}
+    reported |= {"other_models": further, "warnings": tuple(notes)}
     return ReconstructReport(
         output=run.output,
         videos=tuple(source.pictures.path for source in run.sources),
@@ -251,120 +240,22 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
 
 
-@dataclass(frozen=True)
-class _Posed:
-    """The stages that end in poses, and the tracks that agree with these.
-
-    Attributes:
-        stages: what each of them kept, by its name, in order.
-        tracks: the tracks of all videos, cut where motion is not believed.
-        links: links as tracks.
-        moving: by the names of images, masks that leave out what moves by itself.
-    """
-
-    stages: dict[str, Kept]
-    tracks: Tracks
-    links: Tracks
-    moving: dict[str, Mask]
-
-    @property
-    def last(self) -> Kept:
-        """The stage that holds the poses."""
-        return next(reversed(self.stages.values()))
-
-
-def _mended_poses(
-    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
-) -> _Posed:
-    """Estimate poses; where little holds them together, again with links in place of motion."""
-    first: list[_Posed] = []
-
-    def make(_: Path) -> dict[str, Any]:
-        first.append(_pose_stages(run, videos, takes, tracked, doubted=()))
-        return {"doubted": _unlinked_joints(run, takes, first[0].stages)}
-
-    options = run.options
-    doubted = run_stage(
-        run.stages,
-        "joints",
-        [
-            [t.digest for t in tracked],
-            takes.videos,
-            run.photo_digests,
-            options.match,
-            options.mapping,
-        ],
-        into=run.stages,
-        products=[],
-        make=make,
-    ).facts["doubted"]
-    if first and not doubted:
-        return first[0]
-    return _pose_stages(run, videos, takes, tracked, doubted=doubted)
-
-
-def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
-    """Frames after joints that hold little, and that no pictures have been matched across."""
-    if "adjustment" not in stages or run.options.match.links.links == "none":
-        return []
-    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
-    looked_at = stages["matches"].facts["links"]["weak_gaps"]
-    joints = [
-        (frame_of[first], frame_of[second])
-        for first, second in stages["adjustment"].facts["doubtful_joints"]
-    ]
-    return [
-        after
-        for before, after in joints
-        if not any(first <= before and after <= second for first, second in looked_at)
-    ]
-
-
-def _pose_stages(
-    run: Run,
-    videos: Sequence[VideoTracks],
-    takes: Takes,
-    tracked: Sequence[Kept],
-    *,
-    doubted: Sequence[int],
-) -> _Posed:
-    """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
-    matched = match_stage(run, videos, takes, tracked, doubted)
-    links, broken = read_links(run.stages)
-    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
-    tracks = cut_tracks(tracks, broken.tolist())
-    keyed = takes.some(matched.facts["key_images"])
-    posed = pose_stage(run, matched, keyed)
-    stages = {"matches": matched, "poses": posed}
-    if len(keyed.take) < len(takes.take):
-        stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
-    moving: dict[str, Mask] = {}
-    if run.options.moving != "keep":
-        stages["moving"] = moving_stage(run, tracks, takes, posed)
-        moving = read_moving(run.stages)
-    if run.options.mapping.adjust:
-        # On all tracks: its loss is robust, and what still stands beside what moves is of use.
-        stages["adjustment"] = adjustment_stage(run, tracks, links, takes, posed)
-    tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
-    return _Posed(stages, tracks, links, moving)
-
-
-def _notes(facts: dict[str, Any]) -> list[str]:
+def _notes(facts: dict[str, Any], further: Sequence[FurtherModel], unplaced: int) -> list[str]:
     notes = []
-    if facts["num_registered"] < facts["num_images"]:
+    if further:
         notes.append(
-            f"{facts['num_images'] - facts['num_registered']} of {facts['num_images']} images have "
-            "no pose and are left out"
+            f"nothing holds all images together: 'sparse/0' holds {facts['num_registered']} of "
+            f"{facts['num_images']}, {', '.join(map(str, further))}; each folder has its own "
+            "'images' and 'sparse/0'"
         )
+    if unplaced:
+        notes.append(f"{unplaced} of {facts['num_images']} images have no pose and are left out")
     left_out = [name for name, count in facts["registered"].items() if count == 0]
-    if left_out:
+    if left_out and not further:
         names = ", ".join(f"'{name}'" for name in left_out)
         notes.append(
             f"the model holds no image of {names}: reconstruct what shows another scene apart"
         )
-    if facts["other_models"]:
-        sizes = ", ".join(map(str, facts["other_models"]))
-        notes.append(f"the mapper made further models, of {sizes} images, which are left out")
     if facts["num_flat_pairs"] > _MANY_FLAT * facts["num_verified_pairs"]:
         notes.append(
             f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "

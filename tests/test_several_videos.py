@@ -326,3 +326,30 @@ def test_two_videos_and_photos_are_one_model(
         *("tracks_walk_in", "tracks_back", "matches", "poses", "moving", "adjustment", "place"),
         "model",
     )
+
+
+def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    apart = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
+    made = reconstruct(halves, tmp_path / "out", options=apart)
+    (further,) = made.other_models
+    assert (made.num_registered, further.num_registered) == (len(FIRST), len(SECOND))
+    assert sorted(made.registered.values()) == [0, len(FIRST)]
+    assert further.output == tmp_path / "out" / "model_1"
+    assert any("'model_1' holds 16 from '" in warning for warning in made.warnings)
+    shown = set()
+    for folder in (made.output, further.output):
+        model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+        names = {image.name for image in model.images.values()}
+        assert all((folder / "images" / name).is_file() for name in names)
+        shown |= names
+    assert len(shown) == made.num_images
+    assert model.num_points3D() == further.num_points > 500
+
+    again = reconstruct(halves, tmp_path / "out", options=apart)
+    assert again.resumed[-1] == "model"
+    assert again.other_models == made.other_models
+    together = reconstruct(halves, tmp_path / "out", options=ReconstructOptions(match=QUICK))
+    assert together.other_models == ()
+    assert not further.output.exists()

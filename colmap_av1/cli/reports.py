@@ -14,7 +14,7 @@ from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
 from colmap_av1.matching.links import gap_in_video
-from colmap_av1.model.far_views import FarViews
+from colmap_av1.model.agreement.far_views import FarViews
 from colmap_av1.model.figures import ModelFigures
 from colmap_av1.motion.info import StreamReport
 from colmap_av1.reconstruct import ReconstructReport
@@ -97,6 +97,10 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         *_mask_row(report.masked),
         *_moving_row(report.moving),
         *((f"images of {name}", f"{n} with a pose") for name, n in report.registered.items()),
+        *(
+            (f"images of {model.output.name}", f"{model.num_registered} with a pose")
+            for model in report.other_models
+        ),
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),

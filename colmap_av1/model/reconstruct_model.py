@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.masks import Mask, joined_masks
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
 from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
-from colmap_av1.model.far_views import FarViewCheck, FarViews
 from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.track_points import (

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ModelError
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import (
     ModelImage,
     no_points,
@@ -23,7 +24,6 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.model.joints import model_joints
 from colmap_av1.model.mapper import adjust_model, map_poses
 from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.model.resection import interpolate_poses, resect, sightings_of
@@ -52,8 +52,8 @@ _FEWEST_VIEWS = 3
 _FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
 
-def pose_stage(run: Run, matched: Kept, takes: Takes) -> Kept:
-    """Estimate the poses by COLMAP's mapper."""
+def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
+    """Estimate the poses of the key images, some of all, by COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
     mapping = options.mapping
     forward = bool(matched.facts["forward_motion"])
@@ -79,17 +79,19 @@ def pose_stage(run: Run, matched: Kept, takes: Takes) -> Kept:
                 how,
                 image_path=None,
                 log=run.stages / "mapper.log",
-                num_images=len(takes.images.names),
+                num_images=len(keyed.images.names),
                 progress=progress,
             )
         if max(sizes, default=0) < LEAST_IMAGES:
             raise ModelError(_why_no_start(matched.facts, mapper))
+        found = [k for k, size in enumerate(sizes) if size >= LEAST_IMAGES]
+        first, *others = _largest_first([partial / "poses" / str(k) for k in found], takes, keyed)
         return {
-            "num_registered": sizes[0],
-            "other_models": [n for n in sizes[1:] if n >= LEAST_IMAGES],
+            "num_registered": sizes[int(first.name)],
+            "other_models": [f"poses/{model.name}" for model in others],
             "mapper": mapper,
-            "poses": "poses/0",
-            "registered": _registered(partial / "poses" / "0", takes),
+            "poses": f"poses/{first.name}",
+            "registered": _registered(first, keyed),
         }
 
     return run_stage(
@@ -100,6 +102,25 @@ def pose_stage(run: Run, matched: Kept, takes: Takes) -> Kept:
         products=["poses"],
         make=make,
     )
+
+
+def _largest_first(models: list[Path], takes: Takes, keyed: Takes) -> list[Path]:
+    """The folders of models by how many images, key images or between these, they stand for."""
+    if len(models) < 2:
+        return models
+    key = keyed.images.frames
+    nearest = np.searchsorted((key[1:] + key[:-1]) / 2, takes.images.frames)
+    stands_for = np.bincount(nearest, minlength=len(key))
+    posed = [posed_images(read_model(model)) for model in models]
+    size = [
+        sum(
+            int(count)
+            for name, count in zip(keyed.images.names, stands_for, strict=True)
+            if name in images
+        )
+        for images in posed
+    ]
+    return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
 
 
 def _registered(model: Path, takes: Takes) -> dict[str, int]:

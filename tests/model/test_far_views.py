@@ -11,8 +11,8 @@ import pytest
 
 from colmap_av1 import ImageError
 from colmap_av1.cli import main
+from colmap_av1.model.agreement.far_views import model_far_views
 from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.far_views import model_far_views
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1

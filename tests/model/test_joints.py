@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from colmap_av1.cli import main
+from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.joints import model_joints
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1

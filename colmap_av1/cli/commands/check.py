@@ -11,10 +11,10 @@ from colmap_av1.cli.reports import check_rows, model_rows
 from colmap_av1.cli.terminal import progress_bars
 from colmap_av1.database.check import check
 from colmap_av1.errors import OptionError
+from colmap_av1.model.agreement.far_views import model_far_views
+from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.far_views import model_far_views
 from colmap_av1.model.figures import model_figures
-from colmap_av1.model.joints import model_joints
 
 _FAILED_CHECK = 1
 

@@ -1,0 +1,126 @@
+"""The stages of `reconstruct` that end in poses, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from colmap_av1.images.masks import Mask
+from colmap_av1.images.takes import Takes
+from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
+from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
+from colmap_av1.model.reconstruct_stages import match_stage, read_links
+from colmap_av1.model.reconstruct_tracks import Run, VideoTracks
+from colmap_av1.tracks.tracks import Tracks, cut_tracks, tracks_in_a_row
+from colmap_av1.util.stages import Kept, run_stage
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The stages that end in poses, and the tracks that agree with these.
+
+    Attributes:
+        stages: what each of them kept, by its name, in order.
+        tracks: the tracks of all videos, cut where motion is not believed.
+        links: links as tracks.
+        moving: by the names of images, masks that leave out what moves by itself.
+    """
+
+    stages: dict[str, Kept]
+    tracks: Tracks
+    links: Tracks
+    moving: dict[str, Mask]
+
+    @property
+    def last(self) -> Kept:
+        """The stage that holds the poses."""
+        return next(reversed(self.stages.values()))
+
+
+def mended_poses(
+    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
+) -> Posed:
+    """Estimate poses; where little holds them together, again with links in place of motion."""
+    first: list[Posed] = []
+
+    def make(_: Path) -> dict[str, Any]:
+        first.append(_pose_stages(run, videos, takes, tracked, doubted=()))
+        return {"doubted": _unlinked_joints(run, takes, first[0].stages)}
+
+    options = run.options
+    doubted = run_stage(
+        run.stages,
+        "joints",
+        [
+            [t.digest for t in tracked],
+            takes.videos,
+            run.photo_digests,
+            options.match,
+            options.mapping,
+        ],
+        into=run.stages,
+        products=[],
+        make=make,
+    ).facts["doubted"]
+    if first and not doubted:
+        return first[0]
+    return _pose_stages(run, videos, takes, tracked, doubted=doubted)
+
+
+def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
+    """Frames after joints that hold little, and that no pictures have been matched across."""
+    if "adjustment" not in stages or run.options.match.links.links == "none":
+        return []
+    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    looked_at = stages["matches"].facts["links"]["weak_gaps"]
+    joints = [
+        (frame_of[first], frame_of[second])
+        for first, second in stages["adjustment"].facts["doubtful_joints"]
+    ]
+    return [
+        after
+        for before, after in joints
+        if not any(first <= before and after <= second for first, second in looked_at)
+    ]
+
+
+def _pose_stages(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept],
+    *,
+    doubted: Sequence[int],
+) -> Posed:
+    """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
+    matched = match_stage(run, videos, takes, tracked, doubted)
+    keyed = takes.some(matched.facts["key_images"])
+    stages = {"matches": matched, "poses": pose_stage(run, matched, takes, keyed)}
+    return refined_poses(run, stages, believed_tracks(run, videos, takes), takes, keyed)
+
+
+def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:
+    """The tracks of all videos, cut where motion is not believed, and the links."""
+    links, broken = read_links(run.stages)
+    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
+    return cut_tracks(tracks, broken.tolist()), links
+
+
+def refined_poses(
+    run: Run, stages: dict[str, Kept], believed: tuple[Tracks, Tracks], takes: Takes, keyed: Takes
+) -> Posed:
+    """Place what lies between the key images that a mapper placed, and adjust."""
+    (tracks, links), posed = believed, stages["poses"]
+    if len(keyed.take) < len(takes.take):
+        stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
+    moving: dict[str, Mask] = {}
+    if run.options.moving != "keep":
+        stages["moving"] = moving_stage(run, tracks, takes, posed)
+        moving = read_moving(run.stages)
+    if run.options.mapping.adjust:
+        # On all tracks: its loss is robust, and what still stands beside what moves is of use.
+        stages["adjustment"] = adjustment_stage(run, tracks, links, takes, posed)
+    tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
+    return Posed(stages, tracks, links, moving)
