@@ -491,6 +491,23 @@ def movers(rows: list[Row]) -> str:
     return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'people')}"
 
 
+def loops(rows: list[Row]) -> str:
+    """Models of clips that see places again, or that only seem to."""
+    columns = [
+        words("clip, way", "clip", "way"),
+        words("images", "images"),
+        words("with a pose", "registered"),
+        figure("ATE", "ate", ".4f", " m"),
+        figure("of the path", "ate_of_path", ".4f", " %"),
+        words("verified pairs", "pairs"),
+        words("false", "false"),
+        words("far apart in time", "far_pairs"),
+        words("false", "far_false"),
+        figure("CPU s", "cpu_s", ".0f"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+
+
 def plain(rows: list[Row]) -> str:
     """A table whose columns are those of the file, in its words."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
@@ -504,6 +521,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "phone_to_folder": phone_to_folder,
     "phone_to_folder.steps": phone_to_folder_steps,
     "jerks": jerks,
+    "loops": loops,
     "end_to_end": end_to_end,
     "read_motion": read_motion,
     "dav1d_profile": dav1d_profile,
