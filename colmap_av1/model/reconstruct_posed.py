@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.moving.following import follow_behind, has_moving_masks
 from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
 from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
 from colmap_av1.model.reconstruct_stages import match_stage, read_links
@@ -119,8 +121,15 @@ def refined_poses(
     if run.options.moving != "keep":
         stages["moving"] = moving_stage(run, tracks, takes, posed)
         moving = read_moving(run.stages)
-    if run.options.mapping.adjust:
-        # On all tracks: its loss is robust, and what still stands beside what moves is of use.
-        stages["adjustment"] = adjustment_stage(run, tracks, links, takes, posed)
     tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
+    if run.options.mapping.adjust:
+        # What a shutter's read-out has moved does not lie where the pictures show it.
+        follows = run.options.match.camera.rolling_shutter == "none" and (
+            bool(moving) or has_moving_masks(takes)
+        )
+        stages["adjustment"] = adjustment_stage(
+            *(run, tracks, links, takes, posed),
+            moved=stages["moving"] if moving else None,
+            follow=partial(follow_behind, run, moving) if follows else None,
+        )
     return Posed(stages, tracks, links, moving)

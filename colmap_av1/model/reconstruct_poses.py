@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -243,12 +243,30 @@ def _count(progress: Progress, total: int, done: int) -> None:
     progress("resection", done, total)
 
 
-def adjustment_stage(run: Run, tracks: Tracks, links: Tracks, takes: Takes, posed: Kept) -> Kept:
+def adjustment_stage(
+    run: Run,
+    tracks: Tracks,
+    links: Tracks,
+    takes: Takes,
+    posed: Kept,
+    *,
+    moved: Kept | None = None,
+    follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
+) -> Kept:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
     Links take part whole: without them places seen again would drift apart once more.
 
     The mapper's own adjustments have no robust loss, and drop what drifts.
+
+    Args:
+        run: what every stage is given.
+        tracks: the tracks of all takes.
+        links: links as tracks.
+        takes: the images.
+        posed: the stage that left the poses.
+        moved: the stage that found what moves, where tracks and links are without it.
+        follow: corrects the chosen tracks in the images that have a pose.
     """
     options = run.options
     refine = _refines_intrinsics(options)
@@ -256,7 +274,11 @@ def adjustment_stage(run: Run, tracks: Tracks, links: Tracks, takes: Takes, pose
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
         longer = keep_frames(pose_tracks(run, tracks), placed.frames)
-        spread = join_tracks(select_tracks(longer, _ADJUSTED), keep_frames(links, placed.frames))
+        spread = select_tracks(longer, _ADJUSTED)
+        if follow is not None:
+            with run.clock.measure("refinement"):
+                spread = follow(spread, placed)
+        spread = join_tracks(spread, keep_frames(links, placed.frames))
         with run.clock.measure("adjustment"):
             seen, view = seen_in(spread, placed.frames)
             points = triangulate_images(
@@ -291,7 +313,7 @@ def adjustment_stage(run: Run, tracks: Tracks, links: Tracks, takes: Takes, pose
     return run_stage(
         run.stages,
         "adjustment",
-        [posed.digest, given],
+        [posed.digest, given, moved.digest if moved is not None else None],
         into=run.stages,
         products=["adjusted"],
         make=make,

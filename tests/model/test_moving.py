@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -11,12 +11,21 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import Encode
+from dense_scene import Truth
 from numpy.typing import NDArray
 
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.images.masks import make_mask
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
+from colmap_av1.model.moving.following import expect_in_views
 from colmap_av1.model.moving.regions import moving_cells
-from colmap_av1.model.triangulate import Observations, Views, triangulate
+from colmap_av1.model.triangulate import (
+    Observations,
+    TriangulatedPoints,
+    Views,
+    triangulate,
+)
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -170,7 +179,7 @@ def walked(
 
 
 def test_reconstruct_leaves_out_what_moves(
-    walked: tuple[Path, NDArray[np.bool_]], tmp_path: Path
+    walked: tuple[Path, NDArray[np.bool_]], truth: Truth, tmp_path: Path
 ) -> None:
     video, there = walked
     options = ReconstructOptions(
@@ -195,3 +204,56 @@ def test_reconstruct_leaves_out_what_moves(
     assert on_it < 0.002 * total
     assert np.mean(found[~there]) < 0.08
     assert report.moving == pytest.approx(found.mean(), rel=0.05)
+    errors = pose_errors(model_poses(model, NUM_FRAMES), truth.cam_from_world[:NUM_FRAMES])
+    assert errors is not None
+    assert errors.ate < 0.0002 * errors.extent
+    # What stands still behind it was found again after it had passed.
+    adjusted = pycolmap.Reconstruction(report.output / ".stages" / "adjusted")
+    frame_of = {key: int(image.name[6:12]) for key, image in adjusted.images.items()}
+    seen = [[frame_of[e.image_id] for e in p.track.elements] for p in adjusted.points3D.values()]
+    gaps = np.array([np.diff(np.sort(frames)).max() for frames in seen])
+    assert np.count_nonzero(gaps >= 8) > 20
+
+
+def test_points_are_looked_for_where_they_should_be_seen() -> None:
+    rng = np.random.default_rng(3)
+    views = cameras(rng)
+    x, y = np.meshgrid(np.arange(-3.0, 5.0, 0.5), np.arange(-2.0, 2.5, 0.5))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, WALL)])
+    # Of each the first three images that show it, and three after a gap.
+    rows = []
+    shown = [dict(zip(*view.project(xyz)[:2], strict=True)) for view in views]
+    for point in range(len(xyz)):
+        images = [i for i, own in enumerate(shown) if point in own]
+        rows += [(point, i, *shown[i][point]) for i in [*images[:3], *images[5:8]]]
+    table = np.array(rows)
+    point, image = table[:, :2].astype(np.int64).T
+    kept = np.isin(point, np.flatnonzero(np.bincount(point) == 6))
+    number = np.unique(point[kept])
+    offsets = 6 * np.arange(len(number) + 1)
+    frames = np.arange(0, 2 * NUM_IMAGES, 2, dtype=np.int32)
+    tracks = Tracks(
+        *(frames[-1] + 1, WIDTH, HEIGHT, offsets, frames[image[kept]]),
+        table[kept, 2:].astype(np.float32),
+        *(np.full(kept.sum(), 0.3, np.float32), np.zeros(kept.sum(), np.bool_)),
+    )
+    points = TriangulatedPoints(
+        *(xyz[number], np.zeros(len(number)), offsets, np.arange(kept.sum())),
+        *(len(number), len(number)),
+    )
+    left_half = np.ones((HEIGHT, WIDTH), np.bool_)
+    left_half[:, : WIDTH // 2] = False
+    views = [replace(view, mask=make_mask(left_half)) for view in views]
+    found, expected = expect_in_views(tracks, image[kept], points, views, frames)
+    # What was seen stays, and each point is expected where it is in other images, later ones only,
+    # off the edge and where the mask does not leave it out.
+    np.testing.assert_array_equal(found.xy[~expected], tracks.xy)
+    np.testing.assert_array_equal(found.frame[~expected], tracks.frame)
+    assert expected.sum() > 300
+    for row in np.flatnonzero(expected):
+        own, seen_in = found.track[row], int(found.frame[row]) // 2
+        np.testing.assert_allclose(found.xy[row], shown[seen_in][number[own]], atol=1e-3)
+        assert found.xy[row, 0] >= WIDTH // 2
+        assert found.frame[row] > tracks.frame[offsets[own]]
+        assert found.frame[row] not in tracks.frame[offsets[own] : offsets[own + 1]]
+    assert (np.diff(found.frame)[np.diff(found.track) == 0] > 0).all()
