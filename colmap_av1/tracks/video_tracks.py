@@ -132,6 +132,7 @@ def open_source(
             made = encode(
                 *(video, folder / "stream.mp4"),
                 strict=strict,
+                telemetry=False,  # the video itself is asked
                 options=how,
                 progress=progress,
             )

@@ -40,7 +40,9 @@ from colmap_av1.video.encoders import (
     settings,
 )
 from colmap_av1.video.facts import with_counted_packets
+from colmap_av1.video.positions import read_positions
 from colmap_av1.video.stored_frames import count_frames
+from colmap_av1.video.telemetry import carrying, loss_of
 from colmap_av1.video.unchanged import unchanged
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
@@ -75,6 +77,7 @@ def encode(
     *,
     overwrite: bool = False,
     strict: bool = False,
+    telemetry: bool = True,
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
@@ -82,14 +85,16 @@ def encode(
 
     Every frame of the video becomes one of the stream, none is dropped or doubled, and time
     stamps are kept. Pictures are turned as players turn them, and downscaled where the options say
-    so; sound is left out. The stream appears under its name only when whole. Of a damaged video the
-    frames before the damage are converted, with a warning.
+    so; sound is left out. Where the video was taken, and how it was held, goes over to streams that
+    can hold it, else a warning says so. The stream appears under its name only when whole. Of a
+    damaged video the frames before the damage are converted, with a warning.
 
     Args:
         video: a video that ffmpeg decodes.
         output: the stream; its extension .mp4, .mkv, .webm or .ivf says the container.
         overwrite: replace an output that exists.
         strict: refuse a damaged video.
+        telemetry: take over where the video was taken.
         options: which encoder and how.
         progress: called with the stage "encoding", the frames done, and of how many where known.
 
@@ -111,6 +116,9 @@ def encode(
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
     remove_leftovers(output.parent, output.name)
     file = with_counted_packets(read_file(video))
+    place = read_positions(file) if telemetry else None
+    output_format = _FORMATS[output.suffix.lower()]
+    beside, carried = carrying(file, place, output_format) if telemetry else ([], [])
     name, ffmpeg = find_encoder(options)
     encoder = ENCODERS[name]
     quality, speed = settings(encoder, options)
@@ -119,11 +127,11 @@ def encode(
         # Frames that an edit list hides are frames all the same, and good ones.
         before += ["-ignore_editlist", "1"]
     how = [
-        *("-i", f"file:{path}", "-map", f"0:{file.index}"),
+        *("-i", f"file:{path}", *beside, "-map", f"0:{file.index}"),
         *("-vf", ",".join([*scaling(options), encoder.upload])),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
-        *("-progress", "pipe:1", "-f", _FORMATS[output.suffix.lower()]),
+        *("-progress", "pipe:1", "-f", output_format, *carried),
     ]
     mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
     if scaling(options):
@@ -153,6 +161,7 @@ def encode(
                 count = convert(partial, readable)
     except OSError as error:
         raise EncodeError(cannot_write(output, error)) from error
+    _warn(loss_of(file, place, output))
     return EncodeReport(output, encoder.ffmpeg_name, count)
 
 
@@ -210,7 +219,8 @@ def stream_of(
             f"{output.resolve().parent}: the AV1 stream of {path.name} cannot be written there: "
             "say where with --keep_stream"
         )
-    return encode(file, output, overwrite=True, strict=strict, options=options, progress=progress)
+    how = {"overwrite": True, "strict": strict, "telemetry": False}
+    return encode(file, output, **how, options=options, progress=progress)
 
 
 def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]) -> int:
@@ -296,6 +306,11 @@ def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
         raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
     _warn_of_damage(video, readable, damage)
     return readable
+
+
+def _warn(text: str | None) -> None:
+    if text is not None:
+        warnings.warn(text, stacklevel=3)
 
 
 def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:

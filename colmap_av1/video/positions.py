@@ -57,6 +57,9 @@ class Positions:
         gravity_times: float64 [m] as `times`.
         gravity: float64 [m, 3] direction of gravity in axes of the camera, which are the image's
             but for their order and signs.
+        stream: index of the stream of the video that holds times and places; None: another file
+            does, or none.
+        first_picture: time in seconds of the video's first picture as players count it.
     """
 
     source: str
@@ -65,6 +68,8 @@ class Positions:
     place: tuple[float, float, float] | None
     gravity_times: NDArray[np.float64]
     gravity: NDArray[np.float64]
+    stream: int | None = None
+    first_picture: float = 0.0
 
 
 def read_positions(video: VideoFile) -> Positions | None:
@@ -75,17 +80,18 @@ def read_positions(video: VideoFile) -> Positions | None:
     """
     place = _one_place(dict(video.tags))
     found: Positions | None = None
+    start = 0.0
     if video.has_telemetry:
-        with open_container(video.path) as container:
-            start = _start(container.streams[video.index])
+        with open_container(video.path, apply_edits=True) as container:
+            start = _first_picture(video, container)
             found = _of_data(container, start) or _of_subtitles(container, start)
     beside = _file_beside(video.path)
     if found is None and beside is not None:
         with contextlib.suppress(VideoError), open_container(beside) as container:
             found = _of_subtitles(container, 0.0)
-            found = replace(found, source=str(beside)) if found is not None else None
+            found = replace(found, source=str(beside), stream=None) if found else None
     if found is not None:
-        return replace(found, place=place)
+        return replace(found, place=place, first_picture=start)
     nothing = np.empty(0), np.empty((0, 3))
     return Positions(str(video), *nothing, place, *nothing) if place is not None else None
 
@@ -118,6 +124,28 @@ def _file_beside(video: Path) -> Path | None:
     return next((p for s in (".srt", ".SRT") if (p := video.with_suffix(s)).is_file()), None)
 
 
+def _first_picture(video: VideoFile, container: Any) -> float:
+    """Time of a video's first picture as players count it, who may hide it.
+
+    Telemetry has edits of its own, or none: pictures coded out of order are shown later, and edits
+    make up for that.
+    """
+    stream = container.streams[video.index]
+    if "mov" not in video.container:
+        return _start(stream)
+    with (
+        contextlib.suppress(av.error.FFmpegError, OSError),
+        open_container(video.path) as unedited,
+    ):
+        shown = next((p for p in container.demux(stream) if p.size and p.pts is not None), None)
+        same = unedited.streams[video.index]
+        for packet in unedited.demux(same):
+            if shown is not None and packet.pos == shown.pos and packet.pts is not None:
+                later = (packet.pts - shown.pts) * stream.time_base
+                return _start(same) - float(later)
+    return _start(stream)
+
+
 def _start(stream: Any) -> float:
     if stream.start_time is None or not stream.time_base:
         return 0.0
@@ -145,8 +173,8 @@ def are_places(places: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(on_earth & ((latitude != 0) | (longitude != 0)))
 
 
-def _packets(container: Any, streams: Sequence[Any]) -> Iterator[tuple[float, float, bytes]]:
-    """Start, duration and content of some streams' packets, up to damage."""
+def _packets(container: Any, streams: Sequence[Any]) -> Iterator[tuple[int, float, float, bytes]]:
+    """Stream's index, start, duration and content of some streams' packets, up to damage."""
     for other in container.streams:
         if hasattr(other, "discard"):  # of later PyAV: what is not wanted is not even read
             other.discard = type(other.discard)(_READ if other in streams else _SKIP)
@@ -155,7 +183,8 @@ def _packets(container: Any, streams: Sequence[Any]) -> Iterator[tuple[float, fl
         for packet in container.demux(streams):
             if packet.size and packet.pts is not None:
                 base = packet.time_base
-                yield float(packet.pts * base), float((packet.duration or 0) * base), bytes(packet)
+                start, duration = packet.pts * base, (packet.duration or 0) * base
+                yield packet.stream.index, float(start), float(duration), bytes(packet)
 
 
 def _of_data(container: Any, start: float) -> Positions | None:
@@ -163,11 +192,8 @@ def _of_data(container: Any, start: float) -> Positions | None:
     streams = list(container.streams.data)
     if not streams:
         return None
-    payloads = [
-        (time - start, duration, read_payload(data))
-        for time, duration, data in _packets(container, streams)
-        if data.startswith(_GPMF)
-    ]
+    found = [own for own in _packets(container, streams) if own[-1].startswith(_GPMF)]
+    payloads = [(time - start, duration, read_payload(data)) for _, time, duration, data in found]
     times, places = _spread(payloads, lambda payload: payload.positions)
     gravity_times, gravity = _spread(payloads, lambda payload: payload.gravity)
     kept = are_places(places)
@@ -179,6 +205,7 @@ def _of_data(container: Any, start: float) -> Positions | None:
         *_ascending(times[kept], places[kept]),
         None,
         *_ascending(gravity_times[held], gravity[held]),
+        stream=found[0][0],
     )
 
 
@@ -202,7 +229,7 @@ def _of_subtitles(container: Any, start: float) -> Positions | None:
     for stream in container.streams.subtitles:
         found = [
             (time - start, place)
-            for time, _, data in _packets(container, [stream])
+            for _, time, _, data in _packets(container, [stream])
             if (place := _place_in(data.decode("utf-8", "replace"))) is not None
         ]
         places = np.array([place for _, place in found]).reshape(-1, 3)
@@ -211,7 +238,8 @@ def _of_subtitles(container: Any, start: float) -> Positions | None:
             times = np.array([time for time, _ in found])
             nothing = np.empty(0), np.empty((0, 3))
             source = f"the subtitles of {container.name}"
-            return Positions(source, *_ascending(times[kept], places[kept]), None, *nothing)
+            own = _ascending(times[kept], places[kept])
+            return Positions(source, *own, None, *nothing, stream=stream.index)
     return None
 
 
