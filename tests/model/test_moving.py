@@ -5,21 +5,26 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+import render_scene
 from conftest import Encode
-from dense_scene import Truth
+from dense_scene import SCENE, Truth
 from numpy.typing import NDArray
 
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.images.masks import make_mask
+from colmap_av1.images.masks import make_mask, mask_tracks
+from colmap_av1.model.colmap_model import ModelImage
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
-from colmap_av1.model.moving.following import expect_in_views
+from colmap_av1.model.moving.following import expect_in_views, follow_behind
 from colmap_av1.model.moving.regions import moving_cells
+from colmap_av1.model.reconstruct_poses import PosedImages
+from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.triangulate import (
     Observations,
     TriangulatedPoints,
@@ -28,14 +33,19 @@ from colmap_av1.model.triangulate import (
 )
 from colmap_av1.options import (
     CameraOptions,
+    DensityOptions,
     ImageOptions,
     MatchOptions,
     ReconstructOptions,
     TriangulateOptions,
 )
 from colmap_av1.reconstruct import reconstruct
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.video_tracks import VideoSource, track_video
+from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.facts import read_video
 
 WIDTH, HEIGHT, FOCAL, CELL = 320, 240, 300.0, 8
 CAMERA = pycolmap.Camera(
@@ -207,12 +217,60 @@ def test_reconstruct_leaves_out_what_moves(
     errors = pose_errors(model_poses(model, NUM_FRAMES), truth.cam_from_world[:NUM_FRAMES])
     assert errors is not None
     assert errors.ate < 0.0002 * errors.extent
-    # What stands still behind it was found again after it had passed.
-    adjusted = pycolmap.Reconstruction(report.output / ".stages" / "adjusted")
-    frame_of = {key: int(image.name[6:12]) for key, image in adjusted.images.items()}
-    seen = [[frame_of[e.image_id] for e in p.track.elements] for p in adjusted.points3D.values()]
-    gaps = np.array([np.diff(np.sort(frames)).max() for frames in seen])
-    assert np.count_nonzero(gaps >= 8) > 20
+
+
+def test_tracks_are_followed_behind_what_passes(truth: Truth, tmp_path: Path) -> None:
+    """A broad band goes across the pictures and cuts the tracks that it hides."""
+    video = read_video(SCENE)
+    source = VideoSource(video, video)
+    every = track_video(
+        source, MatchOptions(), one_size=True, clock=Clock(), progress=no_progress
+    ).tracks
+    frames = np.arange(NUM_FRAMES, dtype=np.int32)
+    left = 60 + 14 * frames
+    column = np.arange(640)
+    masks = [
+        make_mask(np.tile((column < at) | (column >= at + 100), (360, 1))) for at in left.tolist()
+    ]
+    names = [f"{frame}.png" for frame in frames]
+    placed = PosedImages(
+        images=[
+            ModelImage(frame + 1, name, 7, truth.cam_from_world[frame])
+            for frame, name in enumerate(names)
+        ],
+        frames=frames,
+        take=np.zeros(NUM_FRAMES, np.int32),
+        first_frame=np.array([0, every.num_frames]),
+        cameras={7: truth.camera},
+        masks=(None,) * NUM_FRAMES,
+    )
+    inputs: Any = None  # for stages before
+    run = Run(*(inputs, (source,), tmp_path, tmp_path, ReconstructOptions(), Clock(), no_progress))
+    some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
+    cut = mask_tracks(keep_frames(every, frames), dict(enumerate(masks)), 4)
+    cut = select_tracks(cut, some)
+    moving = dict(zip(names, masks, strict=True))
+    found = follow_behind(run, moving, cut, placed, shifted=[False])
+
+    assert len(found.frame) > 1.1 * len(cut.frame)
+    ends, taken_up = (
+        np.flatnonzero((np.diff(tracks.frame) > 5) & (np.diff(tracks.track) == 0))
+        for tracks in (cut, found)
+    )
+    assert len(ends) < 10
+    assert len(taken_up) > 100
+    scene = render_scene.build_scene()
+    off = []
+    for row in taken_up[::3]:
+        frames_of_gap = found.frame[[row, row + 1]].tolist()
+        xy, _ = render_scene.transfer(scene, found.xy[[row]].astype(float), *frames_of_gap)
+        off.append(np.linalg.norm(xy[0] - found.xy[row + 1]))
+    assert np.median(off) < 0.5
+    on_it = (found.xy[:, 0] >= left[found.frame] + 1) & (found.xy[:, 0] < left[found.frame] + 99)
+    assert on_it.mean() < 0.001
+    # Positions that a shutter's read-out moved are not those of the pictures.
+    as_they_were = follow_behind(run, moving, cut, placed, shifted=[True])
+    np.testing.assert_array_equal(as_they_were.xy, cut.xy)
 
 
 def test_points_are_looked_for_where_they_should_be_seen() -> None:
