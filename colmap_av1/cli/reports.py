@@ -14,6 +14,7 @@ from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
 from colmap_av1.matching.links import gap_in_video
+from colmap_av1.matching.shutter.of_video import VideoReadOut
 from colmap_av1.model.agreement.far_views import FarViews
 from colmap_av1.model.figures import ModelFigures
 from colmap_av1.motion.info import StreamReport
@@ -288,6 +289,16 @@ def info_rows(report: StreamReport) -> Rows:
         ("bits per pixel", f"{report.bits_per_pixel:.3f}"),
         ("for matching", "; ".join(report.reasons) or "good"),
     ]
+
+
+def read_out_rows(found: VideoReadOut | str | None) -> Rows:
+    """How long the shutter reads, or why that cannot be told; None: it was not asked for."""
+    if found is None:
+        return []
+    if isinstance(found, str):
+        return [("rolling shutter", f"cannot be told: {found}")]
+    told = f"{found.milliseconds:.1f} +- {found.error:.1f} ms from the first row to the last"
+    return [("rolling shutter", told)]
 
 
 def check_rows(report: CheckReport) -> Rows:

@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1 import CameraOptions, MatchOptions, OptionError, match
 from colmap_av1.cli import main
+from colmap_av1.matching.shutter import of_video
 from colmap_av1.matching.shutter.correct import rows_down, without_shutter
 from colmap_av1.matching.shutter.estimate import ReadOut, estimate_read_out
 from colmap_av1.tracks.shutter import correct_tracks, velocities
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource
 from colmap_av1.util.progress import Clock
 from colmap_av1.video.display import Display
 
@@ -142,3 +144,34 @@ def test_command(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "rolling shutter\t12.5 ms from the first row to the last" in told
     report = match(tmp_path / "b.db", clip)
     assert report.read_outs == (None,)
+
+
+def test_info_tells_the_read_out_time(
+    clip: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["info", "--video", str(clip), "--quiet"]
+    assert main(words) == 0
+    without = capsys.readouterr().out
+    assert "rolling shutter" not in without
+    words += ["--rolling_shutter", "estimate"]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(without)
+    assert told[len(without) :].startswith("rolling shutter\tcannot be told: ")
+
+    def track(source: VideoSource, *_: object, **__: object) -> TrackedVideo:
+        tracks = tracks_of(0.45)
+        return TrackedVideo(tracks, NUM_FRAMES, np.ones(NUM_FRAMES, np.float32), ())
+
+    monkeypatch.setattr(of_video, "track_video", track)
+    found = of_video.estimate_video_read_out(clip)
+    assert not isinstance(found, str)
+    # The clip has 25 frames a second.
+    assert found.milliseconds == pytest.approx(0.45 * 40, rel=0.1)
+    assert 0 <= found.error < 2
+    assert main(words) == 0
+    row = capsys.readouterr().out.splitlines()[-1]
+    assert row == (
+        f"rolling shutter\t{found.milliseconds:.1f} +- {found.error:.1f} ms from the first row to "
+        "the last"
+    )
