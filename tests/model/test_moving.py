@@ -22,7 +22,7 @@ from colmap_av1.model.colmap_model import ModelImage
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
 from colmap_av1.model.moving.following import expect_in_views, follow_behind
-from colmap_av1.model.moving.regions import moving_cells
+from colmap_av1.model.moving.regions import moving_cells, strong_patches
 from colmap_av1.model.reconstruct_poses import PosedImages
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.triangulate import (
@@ -162,6 +162,17 @@ def test_nothing_moves_in_a_still_scene(drift: float) -> None:
     """A box before a wall hides and shows it; encoders let tracks of smooth surfaces drift."""
     scene = made(None, drift=drift)
     assert not moving_cells(scene.placed, scene.views).any()
+
+
+def test_patches_that_only_time_joins_to_what_moves_are_left_out() -> None:
+    cells, share = np.zeros((2, 20, 30), np.bool_), np.full((2, 20, 30), 0.1)
+    cells[:, 2:10, 3:9] = True
+    share[:, 4:9, 4:8] = 0.7
+    cells[0, 12:16, 20:26] = True  # at the edge of what somebody passed
+    share[0, 12, 20] = 0.7
+    found = strong_patches(cells, share)
+    assert found[:, 2:10, 3:9].all()
+    assert found.sum() == 2 * 8 * 6
 
 
 # A poster of so many pixels that goes across the pictures of the rendered courtyard.

@@ -27,6 +27,9 @@ _FEWEST_TRACKS = 4
 _MAY, _SURELY = 0.27, 0.6
 _FEWEST_SURE = 400
 _SURE_SHARE = 0.3
+# Share, as above, of the cells in a patch of an image, and share of those in the patch: what joins
+# a region in time only, at the edges of what people passed, has fewer.
+_STRONG, _STRONG_SHARE = 0.35, 0.3
 # A track moves that is in such cells in most of its images, or in some and contradicts.
 _MOSTLY, _PARTLY = 0.5, 0.2
 # Width in cells in which most tracks, and so many, move.
@@ -56,11 +59,12 @@ def moving_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
         by_depth = found.by_depth(moving)
         behind = found.unseen(by_depth | moving)
         says = np.where(by_depth | surely, 1.0, np.where(by_motion, _BY_MOTION, 0.0))
-        cells = _sure_regions(placed, says, behind)
+        share = _shares_above_usual(placed, says)
+        cells = _sure_regions(placed, share, behind)
         if not cells.any():
             return cells
         cells, moving = _cells_of_tracks(placed, cells, by_motion | by_depth)
-    return _closed(cells)
+    return _closed(strong_patches(cells, share))
 
 
 def _sum_around(cells: _Floats, width: int) -> _Floats:
@@ -70,31 +74,56 @@ def _sum_around(cells: _Floats, width: int) -> _Floats:
     return np.asarray(uniform_filter(cells, (1, width, width), mode="constant") * width**2)
 
 
-def _sure_regions(placed: PlacedTracks, says: _Floats, behind: _Floats) -> _Bools:
-    """Connected cells in space and time of which enough surely move.
+def _shares_above_usual(placed: PlacedTracks, says: _Floats) -> _Floats:
+    """How far the tracks around each cell say that it moves, above the median of the clip.
 
     Args:
         placed: the tracks.
         says: float64 [num_tracks] how far each of them says that something moves.
+
+    Returns:
+        float64 [images, rows, columns]; below 0 where there are too few tracks.
+    """
+    tracks = _sum_around(placed.counts(np.ones(len(says))), _AROUND)
+    enough = tracks > _FEWEST_TRACKS - 0.5
+    if not enough.any():
+        return np.full(placed.shape, -1.0)
+    share = _sum_around(placed.counts(says), _AROUND) / np.maximum(tracks, 1.0)
+    return np.where(enough, share - float(np.median(share[enough])), -1.0)
+
+
+def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Bools:
+    """Connected cells in space and time of which enough surely move.
+
+    Args:
+        placed: the tracks.
+        share: float64 [images, rows, columns] how far tracks say that something moves.
         behind: float64 [images, rows, columns] points that only other images see there.
     """
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
-    tracks = _sum_around(placed.counts(np.ones(len(says))), _AROUND)
-    enough = tracks > _FEWEST_TRACKS - 0.5
-    if not enough.any():
-        return np.zeros(placed.shape, np.bool_)
-    share = np.where(
-        enough, _sum_around(placed.counts(says), _AROUND) / np.maximum(tracks, 1.0), 0.0
-    )
-    usual = float(np.median(share[enough]))
-    region, count = label(share > usual + _MAY, structure=np.ones((3, 3, 3)))
-    sure = (share > usual + _SURELY) & (_sum_around(behind, _AROUND) >= tracks)
+    tracks = _sum_around(placed.counts(np.ones(len(placed.off))), _AROUND)
+    region, count = label(share > _MAY, structure=np.ones((3, 3, 3)))
+    sure = (share > _SURELY) & (_sum_around(behind, _AROUND) >= tracks)
     num_sure = np.bincount(region[sure], minlength=count + 1)
     num_cells = np.bincount(region.ravel(), minlength=count + 1)
     kept = (num_sure >= _FEWEST_SURE) & (num_sure >= _SURE_SHARE * num_cells)
     kept[0] = False
     return np.asarray(kept[region])
+
+
+def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
+    """The cells in those patches of images of which enough move strongly."""
+    from scipy.ndimage import label  # noqa: PLC0415 - slow to import
+
+    found = np.zeros_like(cells)
+    for image, own in enumerate(cells):
+        patch, count = label(own, structure=np.ones((3, 3)))
+        strong = np.bincount(patch[share[image] > _STRONG], minlength=count + 1)
+        kept = strong > _STRONG_SHARE * np.bincount(patch.ravel(), minlength=count + 1)
+        kept[0] = False
+        found[image] = kept[patch]
+    return found
 
 
 def _cells_of_tracks(
