@@ -147,9 +147,13 @@ def pictures_of(
                 if first + index in left
             }
             if image_of:
-                for frame, picture in decodable_frames(video, max(image_of) + 1, options, display):
-                    if frame in image_of:
-                        yield image_of[frame], picture
+                shown = decodable_frames(
+                    *(video, max(image_of) + 1, options, display),
+                    wanted=image_of,
+                    use="pictures are looked at",
+                )
+                for frame, picture in shown:
+                    yield image_of[frame], picture
         first_photo = len(takes.take) - len(photos)
         for index, photo in enumerate(photos, start=first_photo):
             if index in left:

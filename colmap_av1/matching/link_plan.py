@@ -22,6 +22,8 @@ from colmap_av1.options import LinkOptions, MatchOptions
 # Images on either side of a weak gap whose pictures are matched, by their distance from it: the
 # nearest see most in common across, those farther off give the scale.
 _AROUND_GAP = (0, 1, 2, 4, 7)
+# Those whose pictures are held against the motion first: most gaps that seem weak are ordinary.
+_FIRST_LOOK = (0, 2)
 # Key images for places seen again lie this share of the span that tracks reach apart.
 _KEY_SHARE = 0.2
 # Places are seen again only in videos that are longer than tracks reach by this factor.
@@ -66,9 +68,15 @@ class Plan:
     effort: Literal["light", "full"] = "light"
 
     @classmethod
-    def of_neighbours(cls, gaps: list[int]) -> Plan:
-        """A look at the images on either side of some gaps, no more."""
-        return cls(np.array(gaps, np.int64), [[gap, gap + 1] for gap in gaps], [], [])
+    def of_first_look(cls, weak: NDArray[np.int64], probes: list[int], takes: Takes) -> Plan:
+        """A look at few images on either side of gaps: is their motion borne out?"""
+        around = {
+            gap: _images_around(gap, takes.images_of(int(takes.take[gap])), _FIRST_LOOK)
+            for gap in weak.tolist()
+        }
+        around |= {gap: [gap, gap + 1] for gap in probes if gap not in around}
+        gaps = sorted(around)
+        return cls(np.array(gaps, np.int64), [around[gap] for gap in gaps], [], [])
 
     @property
     def wanted(self) -> list[int]:
@@ -93,9 +101,11 @@ def images_to_link(
     """
     chosen = np.zeros(len(frames), dtype=np.bool_)
     weak = weak_gaps(inter_share, frames)
+    surely = weak_gaps(inter_share, frames, surely=True)
     if options.links != "none":
         for gap in np.flatnonzero(weak).tolist():
-            chosen[_images_around(gap, range(len(frames)))] = True
+            around = _AROUND_GAP if surely[gap] else _FIRST_LOOK
+            chosen[_images_around(gap, range(len(frames)), around)] = True
     if _probes(inter_share, weak, options):
         chosen[:] = True
     return chosen
@@ -179,9 +189,9 @@ def _probes(
     return [int(gap) for gap in strong[np.unique(spread)]]
 
 
-def _images_around(gap: int, images: range) -> list[int]:
+def _images_around(gap: int, images: range, distances: Sequence[int] = _AROUND_GAP) -> list[int]:
     """Images of a video whose pictures are matched across a gap."""
-    found = {gap - d for d in _AROUND_GAP} | {gap + 1 + d for d in _AROUND_GAP}
+    found = {gap - d for d in distances} | {gap + 1 + d for d in distances}
     return sorted(found & set(images))
 
 
@@ -264,20 +274,25 @@ def _videos(takes: Takes) -> range:
 
 def weak_and_probed_gaps(
     takes: Takes, inter_share: NDArray[np.float32], options: LinkOptions
-) -> tuple[NDArray[np.bool_], list[int]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], list[int]]:
     """Gaps between images of a video that hold a weak frame, and those whose motion is probed.
 
     Between takes there are no gaps: no motion crosses from one to the next.
+
+    Returns:
+        bool [num_images - 1] gaps that are surely weak, those that may be ordinary; and indices of
+        gaps that stand for all of their video.
     """
-    weak = np.zeros(max(len(takes.take) - 1, 0), dtype=np.bool_)
-    probes = []
+    surely = np.zeros(max(len(takes.take) - 1, 0), dtype=np.bool_)
+    maybe, probes = np.zeros_like(surely), list[int]()
     for video in _videos(takes):
         share = inter_share[takes.first_frame[video] : takes.first_frame[video + 1]]
-        images = takes.images_of(video)
-        own = weak_gaps(share, takes.of_video(video).frames)
-        weak[images.start : images.stop - 1] = own
-        probes += [images.start + gap for gap in _probes(share, own, options)]
-    return weak, probes
+        images, frames = takes.images_of(video), takes.of_video(video).frames
+        weak, own = weak_gaps(share, frames), slice(images.start, images.stop - 1)
+        surely[own] = weak_gaps(share, frames, surely=True)
+        maybe[own] = weak & ~surely[own]
+        probes += [images.start + gap for gap in _probes(share, weak, options)]
+    return surely, maybe, probes
 
 
 def places_of(images: Iterable[int], takes: Takes) -> dict[int, int]:

@@ -7,14 +7,16 @@ the motion across it is believed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.errors import VideoError
 from colmap_av1.images.takes import Pictures, Takes
+from colmap_av1.matching.features import Features
 from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
 from colmap_av1.matching.link_matches import (
     Links,
@@ -47,8 +49,13 @@ from colmap_av1.util.progress import Clock, Progress
 # Inliers across a gap from which on mappers take it: they register an image by 30 points of its,
 # of which matches of two images give a part.
 _SURE_INLIERS = 100
+# Share of the usual inliers between neighbours from which on motion that agrees with the pictures
+# carries over a gap by itself.
+_ENOUGH_OF_USUAL = 0.3
 # Gaps of a video that are probed and contradicted by pictures, which prove its motion wrong.
 _NUM_BROKEN_PROBES = 2
+# Features of a picture below which it shows nothing: others have hundreds.
+_FEW_FEATURES = 20
 # Gaps that a warning names.
 _NUM_NAMED = 4
 
@@ -185,22 +192,33 @@ def link_images(
     Raises:
         VideoError: neither motion nor pictures connect any two images.
     """
+    found: dict[str, dict[int, Features]] = {"light": {}, "full": {}}
+
+    def look_at(wanted: Iterable[int], effort: Literal["light", "full"]) -> dict[int, Features]:
+        known = found[effort]
+        missing = sorted(set(wanted) - known.keys())
+        with clock.measure("links"):
+            known |= extract_features(
+                *(missing, pictures, cameras, takes.masks, options.links),
+                effort=effort,
+                progress=progress,
+            )
+        return {image: known[image] for image in wanted if image in known}
 
     def link(plan: Plan) -> LinkedImages:
+        features = look_at(plan.wanted, plan.effort)
         with clock.measure("links"):
             return _link(
-                *(plan, takes, matched, cameras, pictures), options=options, progress=progress
+                *(plan, takes, matched, cameras, features), options=options, progress=progress
             )
 
-    weak, probes = weak_and_probed_gaps(takes, inter_share, options.links)
-    if probes:
-        before = [frame for frame, _ in link(Plan.of_neighbours(probes)).report.broken_gaps]
-        broken = takes.take[np.searchsorted(takes.images.frames, before)]
-        for take, count in enumerate(np.bincount(broken, minlength=takes.num_takes).tolist()):
-            if count >= _NUM_BROKEN_PROBES:
-                images = takes.images_of(take)
-                weak[images.start : images.stop - 1] = True
+    weak, maybe, probes = weak_and_probed_gaps(takes, inter_share, options.links)
     plan = plan_links(takes, matched, weak, images_apart, options.links)
+    if options.links.links != "none" and (maybe.any() or probes):
+        first = Plan.of_first_look(np.flatnonzero(maybe), probes, takes)
+        look_at([*first.wanted, *plan.wanted], "light")  # the videos are decoded once
+        weak |= _proved_weak(link(first).report, maybe, probes, matched, takes)
+        plan = plan_links(takes, matched, weak, images_apart, options.links)
     if plan.wanted:
         linked = link(plan)
     else:
@@ -210,8 +228,49 @@ def link_images(
         anywhere = bool(linked.report.doubtful_gaps)
         linked = link(thorough_plan(plan, takes, matched, images_apart, anywhere=anywhere))
     if len(linked.matched.pairs) == 0:
+        sizes = [len(features.xy) for features in found["light"].values()]
+        if sizes and np.median(sizes) < _FEW_FEATURES:
+            raise VideoError(
+                f"{name}: its pictures show hardly any detail, {np.median(sizes):.0f} features "
+                "each, so there is nothing to match: film what has texture, in light and in focus"
+            )
         raise nothing_to_match(name, options)
-    return linked
+    looked_at = found["light"].keys() | found["full"].keys()
+    return replace(linked, report=replace(linked.report, num_images=len(looked_at)))
+
+
+def _proved_weak(
+    report: LinkReport,
+    maybe: NDArray[np.bool_],
+    probes: list[int],
+    matched: MatchedImages,
+    takes: Takes,
+) -> NDArray[np.bool_]:
+    """The gaps whose motion a look at few pictures does not bear out, or where it is little.
+
+    All gaps of a video are weak where several of its probes are wrong.
+
+    Args:
+        report: of the look.
+        maybe: bool [num_images - 1] gaps that may be weak.
+        probes: other gaps that stand for all of them.
+        matched: the images, matched along tracks.
+        takes: the images.
+    """
+    wrong = {frame for frame, _ in report.broken_gaps}
+    is_wrong = np.isin(takes.images.frames[:-1], sorted(wrong))
+    across = np.zeros(len(maybe))
+    for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
+        if j == i + 1:
+            across[i] = len(geometry.inlier_matches)
+    enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * float(np.median(across)))
+    proved = maybe & (is_wrong | (across < enough))
+    broken = [int(takes.take[gap]) for gap in probes if is_wrong[gap]]
+    for take, count in enumerate(np.bincount(broken, minlength=takes.num_takes).tolist()):
+        if count >= _NUM_BROKEN_PROBES:
+            images = takes.images_of(take)
+            proved[images.start : images.stop - 1] = True
+    return proved
 
 
 def _largest(cameras: Sequence[Any]) -> tuple[int, int]:
@@ -224,18 +283,13 @@ def _link(
     takes: Takes,
     matched: MatchedImages,
     cameras: Sequence[Any],
-    pictures: Pictures,
+    features: dict[int, Features],
     *,
     options: MatchOptions,
     progress: Progress,
 ) -> LinkedImages:
-    """Link the images of a plan, see `link_images`."""
+    """Link the images of a plan by their features, see `link_images`."""
     gaps = plan.gaps
-    features = extract_features(
-        *(plan.wanted, pictures, cameras, takes.masks, options.links),
-        effort=plan.effort,
-        progress=progress,
-    )
 
     def matched_pairs(pairs: set[tuple[int, int]]) -> Links:
         return match_pairs(

@@ -359,9 +359,14 @@ def decodable_frames(
     num_frames: int,
     options: MatchOptions,
     display: Display | None = None,
+    *,
     wanted: Container[int] | None = None,
+    use: str = "tracks are refined",
 ) -> Iterator[tuple[int, _Image]]:
-    """The pictures of the frames that have tracks; those before a damage, with a warning."""
+    """The pictures of the frames that have tracks; those before a damage, with a warning.
+
+    `use` says in it what they are for.
+    """
     decoded = decode_frames(
         video,
         operating_point=options.read.operating_point,
@@ -380,7 +385,7 @@ def decodable_frames(
     except BitstreamError as error:
         if options.read.strict:
             raise
-        warnings.warn(f"{error}; tracks are refined in {count} frames only", stacklevel=2)
+        warnings.warn(f"{error}; {use} in {count} frames only", stacklevel=2)
     finally:
         decoded.close()
 

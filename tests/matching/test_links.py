@@ -186,6 +186,34 @@ def test_nothing_is_decoded_where_motion_connects_all(
     assert report.links.num_images == 0
 
 
+def test_gaps_that_only_seem_weak_need_few_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def seeming(_: object, frames: NDArray[np.int32], *, surely: bool = False) -> NDArray[np.bool_]:
+        return (np.arange(len(frames) - 1) == 20) & (not surely)
+
+    monkeypatch.setattr("colmap_av1.matching.link_plan.weak_gaps", seeming)
+    report = match(tmp_path / "a.db", SCENE)
+    assert report.links.num_images == 4
+    assert report.links.weak_gaps == ()
+    assert report.links.num_links == 0
+    match(tmp_path / "b.db", SCENE, options=MatchOptions(links=LinkOptions(links="none")))
+    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
+
+
+def test_jerk_that_seems_ordinary_is_linked(
+    encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the share of inter units tells little, few pictures contradict the motion."""
+    monkeypatch.setattr("colmap_av1.matching.weak_gaps._LEAST_INTER_SHARE", 0.001)
+    monkeypatch.setattr("colmap_av1.matching.weak_gaps._SURELY_LESS", 0.0)
+    report = match(tmp_path / "a.db", encode(_without(FAR_OUT), tmp_path / "jerk.mp4"))
+    before = FAR_OUT.start - 1
+    assert report.links.weak_gaps == ((before, before + 1),)
+    assert report.links.num_images > 4
+    assert report.links.num_links > 10
+
+
 @pytest.mark.slow
 def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
     made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
@@ -249,7 +277,7 @@ def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
 def test_frames_of_one_colour(encode: Encode, tmp_path: Path) -> None:
     """Links are looked for and there is nothing to see."""
     grey = np.full((12, 128, 192, 3), 90, np.uint8)
-    with pytest.raises(VideoError, match="so there is nothing to match"):
+    with pytest.raises(VideoError, match="hardly any detail, 0 features each, so there is nothing"):
         match(
             tmp_path / "a.db",
             encode(grey, tmp_path / "grey.mp4"),
