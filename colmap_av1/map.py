@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,8 @@ def map_database(
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
-    warnings = [*placement.warnings, model_joints(model).warning]
+    missing = _missing(num_images, num_registered)
+    warnings = [*placement.warnings, missing, model_joints(model).warning]
     far_views: FarViews | None = None
     try:
         with clock.measure("far views"):
@@ -160,6 +162,20 @@ def map_database(
         far_views=far_views,
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
+    )
+
+
+def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
+    """What the user should know of images that the largest model lacks."""
+    largest, *others = num_registered
+    if largest == num_images:
+        return None
+    if not others:
+        return f"{num_images - largest} of {num_images} images have no pose"
+    further = ", ".join(f"'{number}' {size}" for number, size in enumerate(others, start=1))
+    return (
+        f"nothing holds all {num_images} images together: model '0' holds {largest}, {further}; "
+        "each has coordinates of its own"
     )
 
 

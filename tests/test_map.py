@@ -94,6 +94,8 @@ def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) ->
     report = map_database(apart, images, tmp_path / "model", options=options)
     sizes = [read_model(tmp_path / "model" / str(i)).num_reg_images() for i in range(2)]
     assert report.num_registered == tuple(sizes) == (NUM_IMAGES - num_first, num_first)
+    said = f"model '0' holds {NUM_IMAGES - num_first}, '1' {num_first}; each has coordinates"
+    assert any(said in warning for warning in report.warnings)
 
 
 def test_intrinsics_are_kept_in_forward_motion(
