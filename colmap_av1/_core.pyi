@@ -89,3 +89,27 @@ def select_spread(
     min_length: int,
 ) -> NDArray[np.uint8]: ...
 def displacement(frame: FrameMotion, list_index: int) -> NDArray[np.float32]: ...
+def triangulate(
+    *,
+    cam_from_world: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    offsets: NDArray[np.int64],
+    view: NDArray[np.int64],
+    rays: NDArray[np.float64],
+    sigma: NDArray[np.float32],
+    first: int,
+    last: int,
+    min_observations: int,
+    max_reprojection_error: float,
+    min_angle: float,
+    max_depth_error: float | None,
+    sigma_floor: float,
+    error_to_sigma: float,
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.int64],
+    NDArray[np.int64],
+    int,
+    int,
+]: ...

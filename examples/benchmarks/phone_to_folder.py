@@ -98,11 +98,8 @@ class Row:
     far_views_90: float | None = None
 
 
-# Which frames become images; of other clips all do.
-IMAGES = {
-    "kitchen": ImageOptions(every=2),
-    "phone": ImageOptions(every=2),
-}
+# Which frames become images, where it is not left to `reconstruct`: all, or a choice of a long clip.
+IMAGES = {"kitchen": ImageOptions(every=2)}
 
 
 def main() -> int:
@@ -140,7 +137,7 @@ def clip_of(name: str, folder: Path) -> Clip:
     if seconds is not None:
         video = phone_clip.phone_clip(folder.parent / "clips", int(seconds[1]))
         poses = phone_clip.true_poses(int(seconds[1]) * phone_clip.FPS)
-        return Clip(name, video, IMAGES["phone"], CameraOptions(), poses)
+        return Clip(name, video, ImageOptions(), CameraOptions(), poses)
     sequence = read_sequence(ruler.SEQUENCES / name)
     case = next((case for case in ruler.CASES if case.name == name), None)
     return Clip(
@@ -157,10 +154,8 @@ def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
     """Both ways on a clip: a row for each step, and one for each way as a whole."""
     console.print(f"{clip.name}: reconstruct", markup=False)
     converted, made, output = folder_of(clip, folder / "reconstruct")
-    ours = [
-        row_of(clip, "conversion", converted),
-        row_of(clip, "reconstruct from AV1", made),
-    ]
+    ours = [row_of(clip, "conversion", converted)] if converted is not None else []
+    ours.append(row_of(clip, "reconstruct from AV1", made))
     # What has no pose is not written; SIFT is given what is.
     names = sorted(path.name for path in (output / "images").iterdir())
     num_images = json.loads((output / "report.json").read_text())["num_images"]
@@ -177,16 +172,24 @@ def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
     return [*ours, *sift, total]
 
 
-def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any], dict[str, Any], Path]:
-    """What conversion and the rest of `reconstruct` took, and the folder that it made."""
+def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any], Path]:
+    """What conversion and the rest of `reconstruct` took, and the folder that it made.
+
+    Nothing was converted where the clip is AV1.
+    """
     stream, output = folder / "converted" / "stream.mp4", folder / "made" / "output"
+    is_av1 = read_video(clip.video).codec == "av1"
 
     def convert() -> dict[str, Any]:
         return taken(run_measured(run_encode, clip.video, stream, log=stream.parent / "log"))
 
     source = file_digest(clip.video)
-    converted = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True).facts
-    match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=stream)
+    converted = None
+    if not is_av1:
+        kept = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True)
+        converted = kept.facts
+    keep_stream = None if is_av1 else stream
+    match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
     options = ReconstructOptions(match=match)
 
     def make() -> dict[str, Any]:
@@ -251,7 +254,7 @@ def sift_of(
 
 def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -> None:
     """Write frames of a video as images."""
-    wanted = "+".join(f"eq(n\\,{frame})" for frame in frames)
+    wanted = any_of([f"eq(n\\,{frame})" for frame in frames])
     if frames == list(range(len(frames))):
         wanted = f"lt(n\\,{len(frames)})"
     numbered = folder / "%06d.png"
@@ -261,6 +264,14 @@ def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -
     )
     for number, name in enumerate(names):
         (folder / f"{number:06d}.png").replace(folder / name)
+
+
+def any_of(terms: list[str]) -> str:
+    """ffmpeg's expression for the sum of terms, which it refuses where it is nested deeply."""
+    if len(terms) == 1:
+        return terms[0]
+    half = len(terms) // 2
+    return f"({any_of(terms[:half])}+{any_of(terms[half:])})"
 
 
 def run_extraction(footage: Footage, database: Path) -> None:

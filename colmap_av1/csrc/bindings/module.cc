@@ -3,11 +3,13 @@
 
 #include "bindings/av1.h"
 #include "bindings/frame_motion.h"
+#include "bindings/model.h"
 #include "bindings/tracks.h"
 
 NB_MODULE(_core, m) {
-  m.doc() = "AV1 motion parser and track builder";
+  m.doc() = "AV1 motion parser, track builder and triangulation";
   colmap_av1::bind_av1(m);
   colmap_av1::bind_frame_motion(m);
   colmap_av1::bind_tracks(m);
+  colmap_av1::bind_model(m);
 }
