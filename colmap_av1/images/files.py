@@ -22,6 +22,7 @@ from colmap_av1.images.names import (
     natural_key,
     pattern_regex,
 )
+from colmap_av1.images.png import png_bytes
 from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
@@ -332,9 +333,12 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """
     check_extension(path.name)
     suffix = path.suffix.lower()
-    _, encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])
+    if suffix == ".png" and image.ndim == 3:
+        encoded = png_bytes(image)
+    else:
+        encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])[1].tobytes()
     try:
         with whole_file(path) as partial:
-            partial.write_bytes(encoded.tobytes())
+            partial.write_bytes(encoded)
     except OSError as error:
         raise ImageError(cannot_write(path, error)) from error

@@ -14,15 +14,10 @@ from colmap_av1.errors import ImageError
 from colmap_av1.options.images import ImageOptions, check_extension, check_image_pattern
 
 _MOST_DIGITS = 255
-_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # from OpenCV 4.12 on
-    # Each row less the average of what is left of it and above: else every filter is tried on every
-    # row, which takes a third longer for files as large.
-    _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG]
 WRITE_PARAMETERS = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-    ".png": _PNG,
+    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
 }
 
 

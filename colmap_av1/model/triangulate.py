@@ -110,20 +110,19 @@ def triangulate(
     """
     options = options if options is not None else TriangulateOptions()
     offsets = observations.offsets
-    arrays = {
-        "cam_from_world": np.ascontiguousarray(views.cam_from_world),
-        "focal": np.ascontiguousarray(views.focal),
-        "offsets": offsets,
-        "view": observations.view,
-        "rays": observations.rays,
-        "sigma": observations.sigma,
-    }
+    cam_from_world = np.ascontiguousarray(views.cam_from_world)
+    focal = np.ascontiguousarray(views.focal)
     chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK), side="left")
     bounds = np.unique(np.minimum(chunk, len(offsets) - 1))
 
     def work(index: int) -> tuple[Any, ...]:
         return _core.triangulate(
-            **arrays,
+            cam_from_world=cam_from_world,
+            focal=focal,
+            offsets=offsets,
+            view=observations.view,
+            rays=observations.rays,
+            sigma=observations.sigma,
             first=int(bounds[index]),
             last=int(bounds[index + 1]),
             min_observations=options.min_observations,

@@ -98,7 +98,7 @@ class Row:
     far_views_90: float | None = None
 
 
-# Which frames become images, where it is not left to `reconstruct`: all, or a choice of a long clip.
+# Which frames become images, where that is not left to `reconstruct`.
 IMAGES = {"kitchen": ImageOptions(every=2)}
 
 
@@ -267,7 +267,7 @@ def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -
 
 
 def any_of(terms: list[str]) -> str:
-    """ffmpeg's expression for the sum of terms, which it refuses where it is nested deeply."""
+    """A sum of terms for ffmpeg, nested as little as can be: it refuses deep expressions."""
     if len(terms) == 1:
         return terms[0]
     half = len(terms) // 2

@@ -18,6 +18,7 @@ from colmap_av1.matching.features import FeatureExtractor, Features, masked_feat
 from colmap_av1.matching.link_matches import match_pairs
 from colmap_av1.matching.two_view_models import epipolar_terms
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
+from colmap_av1.model.coverage import evenly_spread
 from colmap_av1.options import RunOptions, VerifyOptions
 from colmap_av1.util.progress import Progress, no_progress
 
@@ -35,6 +36,8 @@ _MAX_SCALE = 2.0
 _NUM_POINTS = 200
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500
+# Images that pairs are made of, evenly spread: features take a tenth of a second of each.
+_NUM_IMAGES = 16
 # Pixels that views from far apart in time may disagree by before it is said: the surfaces of
 # models that hold together agree to less than one, or two with long focal lengths.
 _FAR_APART = 4.0
@@ -208,13 +211,12 @@ def _far_pairs(
     if num_images <= GAP:
         return np.empty((0, 2), np.int32)
     poses = np.array([image.cam_from_world for image in images])
-    # Beginnings of pairs are spread over the images; each takes its partner farthest in time.
-    anchors = np.unique(np.linspace(0, num_images - GAP - 1, 2 * _NUM_PAIRS).round().astype(int))
+    chosen = evenly_spread(num_images, _NUM_IMAGES)
     found = []
-    for i in anchors.tolist():
+    for i in chosen:
         points = points_of(i)
         points = points[:: max(1, len(points) // _NUM_POINTS)]
-        later = range(num_images - 1, i + GAP - 1, -1)
+        later = (j for j in reversed(chosen) if j >= i + GAP)
         partner = next((j for j in later if _sees_same(points, poses[[i, j]], cameras[j])), None)
         if partner is not None:
             found.append((i, partner))
