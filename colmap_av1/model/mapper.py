@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ModelError
 from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.mapping import child
+from colmap_av1.model.mapping.child import run_mapping
 from colmap_av1.options import MapOptions
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.outputs import made_by
@@ -27,12 +26,15 @@ _ADJUSTMENT_STEPS = 20
 _ADJUSTMENT_TOLERANCE = 1e-5
 _LOG_START = f"{made_by('map')}\n".encode()
 
-# Not `-m`, nor with '' on the path: a checkout in the working folder would hide the package.
+# The file by itself: the whole package takes twice as long to import as pycolmap. Without '' on the
+# path: what lies in the working folder would be imported in place of libraries.
 _CHILD = """
-import json, sys
+import importlib.util, json, sys
 sys.path[:] = filter(None, sys.path)
-from colmap_av1.model.mapper import run_child
-run_child(json.loads(sys.argv[1]))
+spec = importlib.util.spec_from_file_location("child", sys.argv[1])
+child = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(child)
+child.run_child(json.loads(sys.argv[2]))
 """
 
 
@@ -64,14 +66,7 @@ def map_poses(
         ModelError: the mapper failed; the log says more.
     """
     output.mkdir(parents=True, exist_ok=True)
-    settings = {
-        "task": "mapping",
-        "database": str(database),
-        "model": str(output),
-        "image_path": str(image_path) if image_path is not None else None,
-        "options": asdict(options),
-        "seed": options.seed,
-    }
+    settings = _mapping_settings(database, output, options, image_path)
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
@@ -113,41 +108,24 @@ def run_mapper(
     Returns:
         Images with a pose in each model.
     """
-    import numpy as np  # noqa: F401, PLC0415 - before pycolmap
-    import pycolmap  # noqa: PLC0415 - after what a process of its own does first
+    return run_mapping(_mapping_settings(database, output, options, image_path), placed)
 
+
+def _mapping_settings(
+    database: Path, output: Path, options: MapOptions, image_path: Path | None
+) -> dict[str, Any]:
     refine = options.refine_intrinsics
-    if refine is None:
-        refine = not options.forward_motion
-    common = {"random_seed": options.seed, "num_threads": threads_or_cpus(options.num_threads)}
-    pycolmap.set_random_seed(options.seed)
-    each = output / "each"
-    each.mkdir()
-    if options.mapper == "incremental":
-        how = pycolmap.IncrementalPipelineOptions(**common)
-        how.extract_colors = False
-        how.ba_refine_focal_length = refine
-        how.ba_refine_extra_params = refine
-        how.mapper.abs_pose_refine_focal_length = refine
-        how.mapper.abs_pose_refine_extra_params = refine
-        if options.forward_motion:
-            how.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
-        callbacks = {"initial_image_pair_callback": placed, "next_image_callback": placed}
-        models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
-    else:
-        how = pycolmap.GlobalPipelineOptions(**common)
-        how.mapper.bundle_adjustment.refine_focal_length = refine
-        how.mapper.bundle_adjustment.refine_extra_params = refine
-        models = pycolmap.global_mapping(database, each, each, options=how)
-    shutil.rmtree(each)
-    found = sorted(models.values(), key=lambda m: -m.num_reg_images())
-    for number, model in enumerate(found):
-        if image_path is not None:
-            model.extract_colors_for_all_images(image_path)
-        folder = output / str(number)
-        folder.mkdir()
-        model.write_binary(folder)
-    return [model.num_reg_images() for model in found]
+    return {
+        "task": "mapping",
+        "database": str(database),
+        "model": str(output),
+        "image_path": str(image_path) if image_path is not None else None,
+        "mapper": options.mapper,
+        "refine_intrinsics": refine if refine is not None else not options.forward_motion,
+        "init_max_forward_motion": ANY_FORWARD_MOTION if options.forward_motion else None,
+        "seed": options.seed,
+        "num_threads": threads_or_cpus(options.num_threads),
+    }
 
 
 def adjust_model(
@@ -180,6 +158,8 @@ def adjust_model(
         "loss_scale": loss_scale,
         "seed": seed,
         "num_threads": num_threads,
+        "max_num_iterations": _ADJUSTMENT_STEPS,
+        "function_tolerance": _ADJUSTMENT_TOLERANCE,
     }
     _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
     _check_whole(model)
@@ -211,14 +191,14 @@ def _run_apart(
     hint: str,
 ) -> None:
     """Run the settings in a process; `hear` gets the names and values that it prints."""
-    # The package is found where this one was.
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *sys.path])
+    # Libraries are found where this process has them.
+    path = os.pathsep.join(sys.path)
     done, reason = False, ""
     log.write_bytes(_LOG_START)
     with (
         log.open("ab") as file,
         subprocess.Popen(
-            bound([sys.executable, "-c", _CHILD, json.dumps(settings)]),
+            bound([sys.executable, "-c", _CHILD, child.__file__, json.dumps(settings)]),
             stdout=subprocess.PIPE,
             stderr=file,
             env={**os.environ, "PYTHONPATH": path},
@@ -241,51 +221,3 @@ def _run_apart(
         raise ModelError(
             f"{failed} stopped with status {process.returncode}{reason}: {log} says where; {hint}"
         )
-
-
-def run_child(settings: dict[str, Any]) -> None:
-    """Map or adjust in this process; progress goes to standard output."""
-    # The interrupt of a terminal reaches the parent, too, which ends this process.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-
-    import numpy as np  # noqa: F401, PLC0415 - before pycolmap
-    import pycolmap  # noqa: PLC0415
-
-    pycolmap.set_random_seed(settings["seed"])
-    image_path = settings.get("image_path")
-    try:
-        if settings["task"] == "adjustment":
-            _adjust(settings)
-        else:
-            found = run_mapper(
-                Path(settings["database"]),
-                Path(settings["model"]),
-                MapOptions(**settings["options"]),
-                image_path=Path(image_path) if image_path is not None else None,
-                placed=lambda: print("placed", file=channel),
-            )
-            print("models", json.dumps(found), file=channel)
-    except Exception as error:
-        channel.write(f"failed {' '.join(str(error).split())}\n")
-        raise
-    channel.write("done\n")
-    channel.close()
-
-
-def _adjust(settings: dict[str, Any]) -> None:
-    import pycolmap  # noqa: PLC0415 - after what run_child does first
-
-    model = pycolmap.Reconstruction(settings["model"])
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = settings["refine_intrinsics"]
-    options.refine_extra_params = settings["refine_intrinsics"]
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = settings["loss_scale"]
-    solver = options.ceres.solver_options
-    solver.num_threads = settings["num_threads"]
-    solver.max_num_iterations = _ADJUSTMENT_STEPS
-    solver.function_tolerance = _ADJUSTMENT_TOLERANCE
-    pycolmap.bundle_adjustment(model, options)
-    model.write_binary(settings["model"])

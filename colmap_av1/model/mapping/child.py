@@ -1,0 +1,97 @@
+"""The work of the process that maps or adjusts; it imports none of the package.
+
+That takes twice as long as pycolmap alone, each time. So settings and results are what JSON holds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def run_child(settings: dict[str, Any]) -> None:
+    """Map or adjust in this process; progress goes to standard output."""
+    # The interrupt of a terminal reaches the parent, too, which ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    channel = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    import numpy as np  # noqa: F401, PLC0415 - before pycolmap
+    import pycolmap  # noqa: PLC0415
+
+    pycolmap.set_random_seed(settings["seed"])
+    try:
+        if settings["task"] == "adjustment":
+            _adjust(settings)
+        else:
+            found = run_mapping(settings, lambda: print("placed", file=channel))
+            print("models", json.dumps(found), file=channel)
+    except Exception as error:
+        channel.write(f"failed {' '.join(str(error).split())}\n")
+        raise
+    channel.write("done\n")
+    channel.close()
+
+
+def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = None) -> list[int]:
+    """Map a database, see `run_mapper`; `placed` is called at each image of the incremental mapper.
+
+    Returns:
+        Images with a pose in each model.
+    """
+    import numpy as np  # noqa: F401, PLC0415 - before pycolmap
+    import pycolmap  # noqa: PLC0415 - after what a process of its own does first
+
+    database, output = Path(settings["database"]), Path(settings["model"])
+    refine = settings["refine_intrinsics"]
+    common = {"random_seed": settings["seed"], "num_threads": settings["num_threads"]}
+    pycolmap.set_random_seed(settings["seed"])
+    each = output / "each"
+    each.mkdir()
+    if settings["mapper"] == "incremental":
+        how = pycolmap.IncrementalPipelineOptions(**common)
+        how.extract_colors = False
+        how.ba_refine_focal_length = refine
+        how.ba_refine_extra_params = refine
+        how.mapper.abs_pose_refine_focal_length = refine
+        how.mapper.abs_pose_refine_extra_params = refine
+        if settings["init_max_forward_motion"] is not None:
+            how.mapper.init_max_forward_motion = settings["init_max_forward_motion"]
+        callbacks = {"initial_image_pair_callback": placed, "next_image_callback": placed}
+        models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
+    else:
+        how = pycolmap.GlobalPipelineOptions(**common)
+        how.mapper.bundle_adjustment.refine_focal_length = refine
+        how.mapper.bundle_adjustment.refine_extra_params = refine
+        models = pycolmap.global_mapping(database, each, each, options=how)
+    shutil.rmtree(each)
+    found = sorted(models.values(), key=lambda m: -m.num_reg_images())
+    for number, model in enumerate(found):
+        if settings["image_path"] is not None:
+            model.extract_colors_for_all_images(settings["image_path"])
+        folder = output / str(number)
+        folder.mkdir()
+        model.write_binary(folder)
+    return [model.num_reg_images() for model in found]
+
+
+def _adjust(settings: dict[str, Any]) -> None:
+    import pycolmap  # noqa: PLC0415 - after what run_child does first
+
+    model = pycolmap.Reconstruction(settings["model"])
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = settings["refine_intrinsics"]
+    options.refine_extra_params = settings["refine_intrinsics"]
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = settings["loss_scale"]
+    solver = options.ceres.solver_options
+    solver.num_threads = settings["num_threads"]
+    solver.max_num_iterations = settings["max_num_iterations"]
+    solver.function_tolerance = settings["function_tolerance"]
+    pycolmap.bundle_adjustment(model, options)
+    model.write_binary(settings["model"])
