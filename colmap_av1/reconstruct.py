@@ -79,6 +79,7 @@ class ReconstructReport:
         gaussians: file of initial Gaussians, where one was wanted.
         resumed: stages that an earlier run had finished.
         seconds: wall time of each stage of this run.
+        cpu_seconds: processor time of each, of all threads and processes.
         warnings: what the user should know.
     """
 
@@ -111,6 +112,7 @@ class ReconstructReport:
     gaussians: Path | None
     resumed: tuple[str, ...]
     seconds: dict[str, float]
+    cpu_seconds: dict[str, float]
     warnings: tuple[str, ...]
 
 
@@ -236,6 +238,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         gaussians=None,
         resumed=tuple(name for name, stage in kept.items() if stage.resumed),
         seconds=run.clock.seconds,
+        cpu_seconds=run.clock.cpu_seconds,
         **reported,
     )
 

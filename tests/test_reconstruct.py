@@ -219,6 +219,8 @@ def test_report(made: ReconstructReport, tmp_path: Path) -> None:
     assert report["num_points"] == made.num_points
     assert report["mapper"] == "global"
     assert set(report["seconds"]) >= {"motion", "poses", "points", "images"}
+    assert report["cpu_seconds"].keys() == report["seconds"].keys()
+    assert report["cpu_seconds"]["poses"] > 0.1  # which another process takes
     # pycolmap brings a database to its own layout.
     shutil.copyfile(made.database, tmp_path / "copy.db")
     with pycolmap.Database.open(tmp_path / "copy.db") as database:
@@ -278,7 +280,8 @@ def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:
     again = reconstruct(SCENE, made.output, options=OPTIONS)
     assert again.resumed == STAGES
     assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
-    assert replace(again, resumed=(), seconds=made.seconds) == made
+    timed = {"seconds": made.seconds, "cpu_seconds": made.cpu_seconds}
+    assert replace(again, resumed=(), **timed) == made
 
 
 def contents(output: Path) -> dict[str, bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,29 +20,33 @@ def no_progress(stage: str, done: int, total: int | None) -> None:
 
 
 class Clock:
-    """Wall time of named stages, in the order in which they first ran.
+    """Time of named stages, in the order in which they first ran.
 
     Attributes:
-        seconds: the time of each stage so far.
+        seconds: the wall time of each stage so far.
+        cpu_seconds: the processor time, of all threads and of processes that were waited for.
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Add the time the body takes to a stage."""
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), _processor_time()
         try:
             yield
         finally:
-            elapsed = time.perf_counter() - start
+            elapsed, cpu = time.perf_counter() - start, _processor_time() - cpu_start
             self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
+            self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu
 
     def iterate(self, stage: str, items: Iterable[_Item]) -> Iterator[_Item]:
         """Yield from `items`, adding the time they take to come to a stage."""
         iterator = iter(items)
         self.seconds.setdefault(stage, 0.0)
+        self.cpu_seconds.setdefault(stage, 0.0)
         while True:
             with self.measure(stage):
                 try:
@@ -49,3 +54,8 @@ class Clock:
                 except StopIteration:
                     return
             yield item
+
+
+def _processor_time() -> float:
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
