@@ -87,7 +87,7 @@ class Row:
     way: str
     cpu_s: float
     seconds: float
-    memory_mb: float
+    memory_mb: float | None
     images: int | None = None
     registered: int | None = None
     points: int | None = None
@@ -115,13 +115,16 @@ def main() -> int:
         metavar="NAME",
         help="sequences of ../shared, or phone_10s for a rendered clip of 10 seconds",
     )
+    parser.add_argument(
+        "--ours", action="store_true", help="measure `reconstruct` alone; rows of SIFT stay"
+    )
     add_results(parser, "phone_to_folder")
     arguments = parser.parse_args()
     console = Console(stderr=True)
     for name in arguments.clips:
         folder = arguments.cache.resolve() / name
         try:
-            rows = measure(clip_of(name, folder), folder, console)
+            rows = measure(clip_of(name, folder), folder, console, ours_alone=arguments.ours)
         except ColmapAv1Error as error:
             console.print(f"error: {name}: {error}", markup=False)
             continue
@@ -150,7 +153,7 @@ def clip_of(name: str, folder: Path) -> Clip:
     )
 
 
-def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
+def measure(clip: Clip, folder: Path, console: Console, *, ours_alone: bool) -> list[Row]:
     """Both ways on a clip: a row for each step, and one for each way as a whole."""
     console.print(f"{clip.name}: reconstruct", markup=False)
     converted, made, output = folder_of(clip, folder / "reconstruct")
@@ -158,9 +161,15 @@ def measure(clip: Clip, folder: Path, console: Console) -> list[Row]:
     ours.append(row_of(clip, "reconstruct from AV1", made))
     # What has no pose is not written; SIFT is given what is.
     names = sorted(path.name for path in (output / "images").iterdir())
-    num_images = json.loads((output / "report.json").read_text())["num_images"]
-    figures = figures_of(clip, output / "sparse" / "0", output / "images", num_images)
+    report = json.loads((output / "report.json").read_text())
+    figures = figures_of(clip, output / "sparse" / "0", output / "images", report["num_images"])
     ours.append(replace(sum_of("reconstruct", ours), **figures))
+    ours += [
+        Row(clip.name, f"{render.STAGE}{stage}", cpu_s, report["seconds"][stage], None)
+        for stage, cpu_s in report["cpu_seconds"].items()
+    ]
+    if ours_alone:
+        return ours
     console.print(f"{clip.name}: SIFT on {len(names)} images", markup=False)
     steps, model, images = sift_of(clip, folder / "sift", names)
     sift = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
@@ -305,7 +314,7 @@ def sum_of(way: str, steps: list[Row]) -> Row:
         way,
         cpu_s=sum(step.cpu_s for step in steps),
         seconds=sum(step.seconds for step in steps),
-        memory_mb=max(step.memory_mb for step in steps),
+        memory_mb=max(step.memory_mb or 0 for step in steps),
     )
 
 

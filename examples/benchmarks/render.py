@@ -294,12 +294,34 @@ def phone_to_folder_steps(rows: list[Row]) -> str:
     def of_step(way: str) -> Callable[[Row], str]:
         return lambda row: number(by_way.get((row["clip"], way), {}), "cpu_s", ".1f")
 
-    steps = list(dict.fromkeys(row["way"] for row in rows if row["way"] not in _WHOLE))
+    ways = dict.fromkeys(row["way"] for row in rows)
+    steps = [way for way in ways if way not in _WHOLE and not way.startswith(STAGE)]
     columns = [words("clip", "clip"), *(Column(step, of_step(step)) for step in steps)]
     return f"{markdown(columns, [{'clip': clip} for clip in clips])}\n{measured_at(rows, 'clip')}"
 
 
 _WHOLE = (FROM_FILE, SIFT_FROM_FILE)
+# What the ways that are stages of `reconstruct` begin with.
+STAGE = "stage: "
+_NOTABLE = 0.05  # CPU seconds of a stage
+
+
+def phone_to_folder_stages(rows: list[Row]) -> str:
+    """CPU seconds of every stage of `reconstruct`, but for those that take next to nothing."""
+    staged = [row for row in rows if row["way"].startswith(STAGE)]
+    clips = list(dict.fromkeys(row["clip"] for row in staged))
+    by_way = {(row["clip"], row["way"]): row for row in rows}
+
+    def of_clip(clip: str) -> Callable[[Row], str]:
+        return lambda row: number(by_way.get((clip, row["way"]), {}), "cpu_s", ".1f")
+
+    ways = dict.fromkeys(row["way"] for row in staged if float(row["cpu_s"]) >= _NOTABLE)
+    columns = [
+        Column("stage", lambda row: row["way"].removeprefix(STAGE)),
+        *(Column(clip, of_clip(clip)) for clip in clips),
+    ]
+    shown = [{"way": way} for way in (*ways, FROM_STREAM)]
+    return f"{markdown(columns, shown)}\n{measured_at(staged, 'clip')}"
 
 
 def end_to_end(rows: list[Row]) -> str:
@@ -520,6 +542,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "dense_points": dense_points,
     "phone_to_folder": phone_to_folder,
     "phone_to_folder.steps": phone_to_folder_steps,
+    "phone_to_folder.stages": phone_to_folder_stages,
     "jerks": jerks,
     "loops": loops,
     "end_to_end": end_to_end,
