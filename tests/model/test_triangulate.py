@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from colmap_av1 import _core
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import TriangulateOptions
 
@@ -156,3 +159,30 @@ def test_threads_change_nothing() -> None:
         assert np.array_equal(getattr(one, name), getattr(two, name))
     assert len(done) > 1
     assert done[-1] == 40_000
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"view": np.array([0, 7])}, "of no view"),
+        ({"view": np.array([0, 1, 1])}, "view, rays and sigma"),
+        ({"offsets": np.array([0, 3])}, "offsets and view"),
+        ({"offsets": np.array([2, 0])}, "offsets and view"),
+        ({"focal": np.ones((3, 2))}, "poses and focal lengths"),
+        ({"last": 2}, "no such tracks"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(changed: dict[str, Any], said: str) -> None:
+    fitting: dict[str, Any] = {
+        "cam_from_world": np.tile(np.eye(3, 4), (2, 1, 1)),
+        "focal": np.ones((2, 2)),
+        "offsets": np.array([0, 2]),
+        "view": np.array([0, 1]),
+        "rays": np.zeros((2, 2)),
+        "sigma": np.ones(2, np.float32),
+        **{"first": 0, "last": 1, "min_observations": 2, "max_reprojection_error": 1.0},
+        **{"min_angle": 0.0, "max_depth_error": None, "sigma_floor": 0.3, "error_to_sigma": 2.0},
+    }
+    assert len(_core.triangulate(**fitting)) == 6
+    with pytest.raises(ValueError, match=said):
+        _core.triangulate(**(fitting | changed))
