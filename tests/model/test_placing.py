@@ -118,6 +118,23 @@ def test_path_is_brought_onto_positions_with_noise_and_jumps(straight: bool) -> 
     assert np.array_equal(again.similarity.rotation, found.similarity.rotation)
 
 
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_third_of_the_positions_may_jump(straight: bool) -> None:
+    poses = walk(straight=straight)
+    positions = camera_centres(poses)
+    rng = np.random.default_rng(1)
+    said = positions + rng.normal(0, 0.4, positions.shape)
+    jumped = rng.permutation(len(said))[: len(said) // 3]
+    said[jumped] += rng.normal(0, 800, (len(jumped), 3))
+    mapped = elsewhere().apply_to_poses(poses)
+    up = Up(up_of_cameras(mapped), np.deg2rad(6))
+    found = fit_path(camera_centres(mapped), said, up, 0)
+    assert isinstance(found, PathFit), found
+    assert found.num_used == len(said) - len(jumped)
+    placed = found.similarity.apply(camera_centres(mapped))
+    assert np.abs(placed - positions).max() < 0.6
+
+
 @pytest.mark.parametrize(
     ("said", "why"),
     [

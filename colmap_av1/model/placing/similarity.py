@@ -21,6 +21,8 @@ _LARGEST_SCALE_ERROR = 0.1
 # Length in metres of the posts that stand on the path for what is up: as one that is 10 degrees
 # off moves a post's end by less than an error, a wide path of good positions still decides.
 _POST = 12.0
+# Of the scales that pairs of positions say, the one for the length of posts.
+_ROUGH_QUANTILE = 0.25
 _NUM_TRIALS = 10_000
 _ITERATIONS = 10
 # Error of positions, in metres, that no agreement of them makes less.
@@ -196,11 +198,15 @@ def _spread(points: _Floats) -> float:
 
 
 def _rough_scale(path: _Floats, positions: _Floats) -> float | None:
-    """Metres to the path's unit: the median over pairs of images far apart."""
+    """Metres to the path's unit, by pairs of images far apart.
+
+    Not the median: of two positions, one in three of which has jumped, most often one has, and what
+    jumps makes distances larger.
+    """
     half = max(len(path) // 2, 1)
     there = np.linalg.norm(positions[half:] - positions[:-half], axis=1)
     here = np.linalg.norm(path[half:] - path[:-half], axis=1)
     moved = here > 1e-9 * max(float(np.abs(path).max()), 1e-9)
     if not moved.any() or not (there[moved] > 0).any():
         return None
-    return float(np.median(there[moved] / here[moved])) or None
+    return float(np.quantile(there[moved] / here[moved], _ROUGH_QUANTILE)) or None
