@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -64,6 +65,10 @@ class PosedCamera:
         kept[:height, :width] = self.mask.kept[np.ix_(own[1].astype(int), own[0].astype(int))]
         return np.asarray(kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
 
+    @functools.cached_property
+    def _seen_rays(self) -> tuple[_Floats, _Floats]:
+        return _seen_rays(self.camera)
+
     def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
         """Whether pixels [n, 2] of the image count."""
         return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
@@ -78,7 +83,7 @@ class PosedCamera:
             int64 [m] their indices, ascending; float64 [m, 2] pixels, the first one's centre at
             (0.5, 0.5); and float64 [m] depths along the camera's axis.
         """
-        low, high = _seen_rays(self.camera)
+        low, high = self._seen_rays
         width, height = self.size
         found = []
         for first in range(0, len(xyz), _CHUNK):
