@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import labels_of
 from colmap_av1.images.takes import count_through
 from colmap_av1.match import match
+from colmap_av1.model.mapper import map_poses
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -353,3 +355,20 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
     together = reconstruct(halves, tmp_path / "out", options=ReconstructOptions(match=QUICK))
     assert together.other_models == ()
     assert not further.output.exists()
+
+
+def test_another_model_of_the_same_images_is_no_further_one(
+    halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a mapper that began once more among images that it had placed."""
+
+    def twice(database: Path, output: Path, *rest: Any, **how: Any) -> tuple[int, ...]:
+        (size,) = map_poses(database, output, *rest, **how)
+        shutil.copytree(output / "0", output / "1")
+        return size, size
+
+    monkeypatch.setattr("colmap_av1.model.reconstruct_poses.map_poses", twice)
+    made = reconstruct(halves[0], tmp_path / "out", options=ReconstructOptions(match=QUICK))
+    assert made.other_models == ()
+    assert made.warnings == ()
+    assert not (tmp_path / "out" / "model_1").exists()

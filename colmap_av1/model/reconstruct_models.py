@@ -11,11 +11,12 @@ from typing import Any
 
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.colmap_model import posed_images, read_model
 from colmap_av1.model.placing.stage import place_stage
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_posed import Posed, believed_tracks, refined_poses
 from colmap_av1.model.reconstruct_poses import read_posed_images
-from colmap_av1.model.reconstruct_tracks import Run, VideoTracks
+from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, VideoTracks
 from colmap_av1.tracks.tracks import join_tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, run_stage
@@ -72,12 +73,13 @@ def further_models(
     left = set(takes.images.names) - {image.name for image in placed}
     mapped = first.stages["poses"]
     keyed = takes.some(first.stages["matches"].facts["key_images"])
-    others = mapped.facts["other_models"]
-    found = []
-    for number, poses in enumerate(others, start=1):
-        own = _run_of_model(run, number)
+    found: list[FurtherModel] = []
+    for poses in mapped.facts["other_models"]:
+        known = set(posed_images(read_model(run.stages / poses)))
+        if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
+            continue
+        own = _run_of_model(run, len(found) + 1)
         stages = {"poses": _poses_of_model(run, own, mapped, poses)}
-        known = {image.name for image in read_posed_images(own, stages["poses"], keyed).images}
         some, key = _named(takes, known | left), _named(keyed, known)
         posed = refined_poses(own, stages, believed_tracks(run, videos, takes), some, key)
         images = [image.name for image in read_posed_images(own, posed.last, takes).images]
@@ -85,7 +87,7 @@ def further_models(
         facts = written_model(own, posed, takes)["model"].facts
         figures = (facts["num_points"], facts["mean_error"])
         found.append(FurtherModel(own.output, len(images), images[0], images[-1], *figures))
-    _remove_further_models(run, len(others) + 1)
+    _remove_further_models(run, len(found) + 1)
     return tuple(found), len(left)
 
 
