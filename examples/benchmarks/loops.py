@@ -27,7 +27,7 @@ from clips import load_render_scene
 from numpy.typing import NDArray
 from results import Value, add_results, read_rows, save
 
-from colmap_av1 import ImageOptions, MatchOptions, ReconstructOptions, reconstruct
+from colmap_av1 import CameraOptions, ImageOptions, MatchOptions, ReconstructOptions, reconstruct
 from colmap_av1.evaluate import (
     measure_mapper,
     model_poses,
@@ -185,7 +185,13 @@ def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[
     """The row of one way on a clip."""
     truth = scene.cam_from_world
     if way.startswith("SIFT"):
-        footage = prepare_footage(video, folder / "footage", num_frames=len(truth), image_step=STEP)
+        footage = prepare_footage(
+            video,
+            folder / "footage",
+            num_frames=len(truth),
+            image_step=STEP,
+            camera=CameraOptions(),
+        )
         matched = run_frontend("sift-exhaustive", footage, folder / "sift")
         database = matched.database
         mapped = measure_mapper(database, footage.image_path, folder / "sift-model")
