@@ -253,6 +253,9 @@ def phone_to_folder(rows: list[Row]) -> str:
 
         return Column(heading, cell)
 
+    def is_first(row: Row) -> bool:
+        return row["way"] == SIFT_FROM_FILE or (row["clip"], SIFT_FROM_FILE) not in by_way
+
     def from_stream(row: Row) -> str:
         sift, ours = (by_way.get((row["clip"], way)) for way in (SIFT_FROM_FILE, FROM_STREAM))
         if row["way"] != FROM_FILE or sift is None or ours is None:
@@ -264,7 +267,7 @@ def phone_to_folder(rows: list[Row]) -> str:
         return f"{number(row, 'far_views', '.2f')} / {number(row, 'far_views_90', '.2f')}"
 
     columns = [
-        Column("clip", lambda row: f"`{row['clip']}`" if row["way"] == SIFT_FROM_FILE else ""),
+        Column("clip", lambda row: f"`{row['clip']}`" if is_first(row) else ""),
         Column("model", lambda row: ways[row["way"]]),
         Column("images", lambda row: f"{row['registered'] or '-'} of {row['images'] or '-'}"),
         figure("points", "points", ",.0f"),
