@@ -82,6 +82,19 @@ class ModelPoints:
     xy: NDArray[np.float64]
 
 
+def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
+    """All points of several sets, which the same images see."""
+    counts = np.concatenate([np.diff(part.offsets) for part in parts])
+    return ModelPoints(
+        xyz=np.concatenate([part.xyz for part in parts]),
+        rgb=np.concatenate([part.rgb for part in parts]),
+        error=np.concatenate([part.error for part in parts]),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        image=np.concatenate([part.image for part in parts]),
+        xy=np.concatenate([part.xy for part in parts]),
+    )
+
+
 def take_rows(
     offsets: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -18,7 +18,12 @@ from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
 from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
-from colmap_av1.model.reconstruct_poses import PosedImages, read_posed_images, triangulate_images
+from colmap_av1.model.reconstruct_poses import (
+    PosedImages,
+    check_agreement,
+    read_posed_images,
+    triangulate_in,
+)
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.track_points import (
     Colours,
@@ -59,9 +64,13 @@ def _dense_cloud(
     options, clock = run.options.triangulate, run.clock
     pinholes = [own.camera for own in views]
     with clock.measure("points"):
-        points = triangulate_images(
-            *(run, placed, seen, view), pinholes=pinholes, options=options, progress=run.progress
+        points = triangulate_in(
+            *(run, placed, seen, view),
+            options=options,
+            pinholes=pinholes,
+            progress=run.progress,
         )
+        check_agreement(len(points.xyz), points.num_tracks)
     with clock.measure("cloud"):
         xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
         cloud = cloud_of(points, view, xy, views, options)

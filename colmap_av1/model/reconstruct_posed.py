@@ -10,6 +10,7 @@ from typing import Any
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.mapping.corners import corners_in_images
 from colmap_av1.model.moving.following import follow_behind, has_moving_masks
 from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
 from colmap_av1.model.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
@@ -124,12 +125,12 @@ def refined_poses(
     tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
     if run.options.mapping.adjust:
         # What a shutter's read-out has moved does not lie where the pictures show it.
-        follows = run.options.match.camera.rolling_shutter == "none" and (
-            bool(moving) or has_moving_masks(takes)
-        )
+        in_place = run.options.match.camera.rolling_shutter == "none"
+        follows = in_place and (bool(moving) or has_moving_masks(takes))
         stages["adjustment"] = adjustment_stage(
             *(run, tracks, links, takes, posed),
             moved=stages["moving"] if moving else None,
             follow=partial(follow_behind, run, moving) if follows else None,
+            corners=partial(corners_in_images, run, moving) if in_place else None,
         )
     return Posed(stages, tracks, links, moving)

@@ -19,6 +19,8 @@ from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import (
     ModelImage,
+    ModelPoints,
+    joined_points,
     no_points,
     posed_images,
     read_model,
@@ -40,7 +42,7 @@ _FEW_TRACKS = 100
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted.
 _ADJUSTED = DensityOptions(
-    preset="sparse", max_tracks_per_image=1000, spacing=12.0, min_images=3, max_sigma=0.0
+    preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.25
 # Tracks that images between key images are placed by, and views of these that make their points.
@@ -50,6 +52,10 @@ _RESECTED = DensityOptions(
 _FEWEST_VIEWS = 3
 # Poses follow from rays, however uncertain the points are that these meet in.
 _FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
+# Beside corners, which say where an image is, motion that is off by more tells nothing; a corner is
+# where the picture shows it, and where a shutter bends this, all of it is to count.
+_BESIDE_CORNERS = replace(_FOR_POSES, max_reprojection_error=0.7)
+FOR_CORNERS = replace(_FOR_POSES, max_reprojection_error=8.0)
 
 
 def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
@@ -198,9 +204,8 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
     seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
     spread = select_tracks(keep_frames(seen_thrice, takes.images.frames), _RESECTED)
     seen, view = seen_in(spread, known.frames)
-    points = triangulate_images(
-        *(run, known, seen, view), pinholes=None, options=_FOR_POSES, progress=no_progress
-    )
+    points = triangulate_in(run, known, seen, view, options=_FOR_POSES)
+    check_agreement(len(points.xyz), points.num_tracks)
     pose_of = {
         frame: (image.camera_id, image.cam_from_world)
         for frame, image in zip(known.frames.tolist(), known.images, strict=True)
@@ -252,10 +257,12 @@ def adjustment_stage(
     *,
     moved: Kept | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
+    corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
 ) -> Kept:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
-    Links take part whole: without them places seen again would drift apart once more.
+    Links take part whole: without them places seen again would drift apart once more. Corners of
+    the pictures say where an image is whose motion misleads, as where the camera jerks.
 
     The mapper's own adjustments have no robust loss, and drop what drifts.
 
@@ -267,6 +274,8 @@ def adjustment_stage(
         posed: the stage that left the poses.
         moved: the stage that found what moves, where tracks and links are without it.
         follow: corrects the chosen tracks in the images that have a pose.
+        corners: follows corners of these images' pictures, which take part whole, and corrects
+            poses that these contradict.
     """
     options = run.options
     refine = _refines_intrinsics(options)
@@ -279,18 +288,17 @@ def adjustment_stage(
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
         spread = join_tracks(spread, keep_frames(links, placed.frames))
+        sets = [(spread, _FOR_POSES)]
+        if corners is not None:
+            with run.clock.measure("refinement"):
+                followed, placed = corners(spread, placed)
+            sets = [(spread, _BESIDE_CORNERS), (followed, FOR_CORNERS)]
         with run.clock.measure("adjustment"):
-            seen, view = seen_in(spread, placed.frames)
-            points = triangulate_images(
-                *(run, placed, seen, view), pinholes=None, options=_FOR_POSES, progress=no_progress
-            )
             folder = partial / "adjusted"
             folder.mkdir()
-            black = np.zeros((len(points.xyz), 3), np.uint8)
-            xy = seen.xy[points.observation].astype(np.float64)
-            write_model(
-                folder, placed.cameras, placed.images, to_model_points(points, black, view, xy)
-            )
+            points = joined_points([_black_points(run, placed, *own) for own in sets])
+            check_agreement(len(points.xyz), len(spread.offsets) - 1)
+            write_model(folder, placed.cameras, placed.images, points)
             run.progress("adjustment", 0, 1)
             adjust_model(
                 folder,
@@ -309,7 +317,8 @@ def adjustment_stage(
         }
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
-    given = (_ADJUSTED, _LOSS_SCALE, refine, *how)
+    kinds = (_BESIDE_CORNERS, FOR_CORNERS) if corners is not None else (_FOR_POSES,)
+    given = (_ADJUSTED, kinds, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,
         "adjustment",
@@ -318,6 +327,16 @@ def adjustment_stage(
         products=["adjusted"],
         make=make,
     )
+
+
+def _black_points(
+    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+) -> ModelPoints:
+    """Points of tracks in the images that have a pose, without colours."""
+    seen, view = seen_in(tracks, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=options)
+    black = np.zeros((len(points.xyz), 3), np.uint8)
+    return to_model_points(points, black, view, seen.xy[points.observation].astype(np.float64))
 
 
 @dataclass(frozen=True)
@@ -359,27 +378,30 @@ def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
     return PosedImages(images, own.images.frames, own.take, own.first_frame, cameras, own.masks)
 
 
-def triangulate_images(
+def triangulate_in(
     run: Run,
     placed: PosedImages,
     seen: Tracks,
     view: NDArray[np.int64],
     *,
-    pinholes: Sequence[Any] | None,
     options: TriangulateOptions,
-    progress: Progress,
+    pinholes: Sequence[Any] | None = None,
+    progress: Progress = no_progress,
 ) -> TriangulatedPoints:
-    """Points of tracks in the images that have a pose, one at least; see `triangulate_tracks`."""
-    points = triangulate_tracks(
+    """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
+    return triangulate_tracks(
         *(seen, view, placed.camera_of_image),
         *([image.cam_from_world for image in placed.images], pinholes),
         options=options,
         num_threads=run.options.match.run.num_threads,
         progress=progress,
     )
-    if len(points.xyz) == 0:
+
+
+def check_agreement(num_points: int, num_tracks: int) -> None:
+    """Refuse poses that no track agrees with."""
+    if num_points == 0:
         raise ModelError(
-            f"none of the {points.num_tracks} tracks agrees with the poses: try the other "
-            "--mapper, or give --camera_params"
+            f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
+            "give --camera_params"
         )
-    return points

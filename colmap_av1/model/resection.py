@@ -83,6 +83,7 @@ def resect(
     guesses: _Floats,
     focal: float,
     *,
+    loss_scale: float = _LOSS_SCALE,
     seed: int = 0,
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -93,6 +94,7 @@ def resect(
         sightings: the points in the images.
         guesses: float64 [num_images, 3, 4] poses that may be right, x_cam = R x_world + t.
         focal: focal length in pixels, which errors are measured in.
+        loss_scale: error in pixels from which on a point counts less (Cauchy's loss).
         seed: of the samples.
         num_threads: threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of images done so far.
@@ -105,7 +107,10 @@ def resect(
     def work(image: int) -> _Floats | None:
         own = slice(int(sightings.bounds[image]), int(sightings.bounds[image + 1]))
         rays, xyz = sightings.rays[own], sightings.xyz[own]
-        return _resect_one(rays * focal, xyz, guesses[image], camera, seed=seed_of(seed, image))
+        own_seed = seed_of(seed, image)
+        return _resect_one(
+            *(rays * focal, xyz, guesses[image], camera), loss_scale=loss_scale, seed=own_seed
+        )
 
     found: list[_Floats | None] = []
     with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
@@ -117,7 +122,13 @@ def resect(
 
 
 def _resect_one(
-    xy: _Floats, xyz: _Floats, guess: _Floats, camera: dict[str, Any], *, seed: int
+    xy: _Floats,
+    xyz: _Floats,
+    guess: _Floats,
+    camera: dict[str, Any],
+    *,
+    loss_scale: float,
+    seed: int,
 ) -> _Floats | None:
     import poselib  # noqa: PLC0415 - after NumPy
 
@@ -129,7 +140,7 @@ def _resect_one(
         "max_iterations": _MAX_SAMPLES,
         "seed": seed,
     }
-    bundle = {"loss_type": "CAUCHY", "loss_scale": _LOSS_SCALE}
+    bundle = {"loss_type": "CAUCHY", "loss_scale": loss_scale}
     start = poselib.CameraPose()
     start.R, start.t = guess[:, :3], guess[:, 3]
     pose, info = poselib.estimate_absolute_pose(xy, xyz, camera, ransac, bundle, start)

@@ -1,0 +1,133 @@
+"""Corners followed through the images that have a pose, for the adjustment of these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.images.masks import Mask, joined_masks
+from colmap_av1.model.reconstruct_poses import FOR_CORNERS, PosedImages, triangulate_in
+from colmap_av1.model.reconstruct_tracks import Run
+from colmap_av1.model.resection import resect, sightings_of
+from colmap_av1.model.track_points import seen_in
+from colmap_av1.tracks.corners import follow_corners
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations
+from colmap_av1.tracks.video_tracks import decodable_frames
+
+_Image = NDArray[np.uint8]
+
+# Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
+# more than a shutter's read-out bends a picture, so that no part of it decides alone.
+_LOSS_SCALE = 2.0
+# Error beyond which a corner is lost, wherever it is.
+_LOST = 8.0
+
+
+def corners_in_images(
+    run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+) -> tuple[Tracks, PosedImages]:
+    """Follow the corners of all videos' pictures, and place images anew that contradict them.
+
+    Args:
+        run: what every stage is given.
+        moving: by the names of images, masks that leave out what moves.
+        tracks: tracks of what stands still, which say where to look for corners.
+        placed: the images that have a pose.
+
+    Returns:
+        The corners as tracks, and the images.
+    """
+    found = keep_observations(tracks, np.zeros(len(tracks.frame), np.bool_))
+    for video in range(len(run.sources)):
+        own = np.flatnonzero(placed.take == video)
+        if len(own) == 0:
+            continue
+        first = int(placed.first_frame[video])
+        mask_of = {
+            int(placed.frames[i]) - first: joined_masks(
+                placed.masks[i], moving.get(placed.images[i].name)
+            )
+            for i in own
+        }
+        guide = keep_observations(tracks, np.isin(tracks.frame, placed.frames[own]))
+        num_frames = max(mask_of) + 1
+        guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
+        decoded = decodable_frames(
+            *(run.sources[video].pictures, num_frames, run.options.match),
+            wanted=mask_of,
+            use="corners are followed",
+        )
+        corners = follow_corners(guide, _reported(run, decoded, len(own)), partial(_keeps, mask_of))
+        found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
+    return found, place_anew(run, found, placed)
+
+
+def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
+    """Place images anew by the points of the corners, where these then fit better.
+
+    Motion that is wrong together places an image where its own tracks fit, so that what the
+    picture shows is taken for errors, and left out of any adjustment that starts from there.
+
+    Args:
+        run: what every stage is given.
+        corners: corners as tracks.
+        placed: the images that have a pose.
+    """
+    seen, view = seen_in(corners, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=FOR_CORNERS)
+    if len(points.xyz) == 0:
+        return placed
+    images = list(placed.images)
+    how = run.options.match.run
+    for camera_id, camera in sorted(placed.cameras.items()):
+        own = [i for i, image in enumerate(images) if image.camera_id == camera_id]
+        sightings = sightings_of(points, seen, seen, placed.frames[own], camera)
+        guesses = np.array([images[i].cam_from_world for i in own])
+        focal = float(camera.mean_focal_length())
+        found = resect(
+            *(sightings, guesses, focal),
+            loss_scale=_LOSS_SCALE,
+            seed=how.seed,
+            num_threads=how.num_threads,
+        )
+        bounds = zip(sightings.bounds[:-1].tolist(), sightings.bounds[1:].tolist(), strict=True)
+        for i, pose, (first, last) in zip(own, found, bounds, strict=True):
+            shown = sightings.rays[first:last] * focal, sightings.xyz[first:last], focal
+            if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
+                images[i] = replace(images[i], cam_from_world=pose)
+    return replace(placed, images=images)
+
+
+def _error(
+    xy: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    focal: float,
+    cam_from_world: NDArray[np.float64],
+) -> float:
+    """Mean distance in pixels of points from where they are seen, of lost ones that of these."""
+    in_camera = xyz @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    off = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] * focal - xy, axis=1)
+    return float(np.where(in_camera[:, 2] > 0, np.minimum(off, _LOST), _LOST).mean())
+
+
+def _keeps(
+    mask_of: Mapping[int, Mask | None],
+    frame: int,
+    xy: NDArray[np.float32],
+    size: tuple[int, int],
+) -> NDArray[np.bool_]:
+    """Which positions in the picture of a frame its mask keeps; None: all."""
+    mask = mask_of[frame]
+    return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)
+
+
+def _reported(
+    run: Run, pictures: Iterable[tuple[int, _Image]], total: int
+) -> Iterator[tuple[int, _Image]]:
+    for done, picture in enumerate(pictures, start=1):
+        yield picture
+        run.progress("refinement", done, total)

@@ -1,0 +1,84 @@
+"""Images that their corners contradict are placed anew, the others stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from colmap_av1 import ReconstructOptions
+from colmap_av1.model.colmap_model import ModelImage
+from colmap_av1.model.mapping.corners import place_anew
+from colmap_av1.model.reconstruct_poses import PosedImages
+from colmap_av1.tracks.tracks import Tracks
+
+NUM_IMAGES, NUM_POINTS, FOCAL = 9, 200, 500.0
+WRONG = 4
+
+
+def scene() -> tuple[PosedImages, Tracks]:
+    """Images along a path with exact poses, and corners that see points with a little noise."""
+    rng = np.random.default_rng(3)
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=640, height=480, params=[FOCAL, 320, 240]
+    )
+    xyz = rng.uniform([-2, -1.5, 4], [2, 1.5, 8], (NUM_POINTS, 3))
+    images, seen = [], []
+    for i in range(NUM_IMAGES):
+        turn = Rotation.from_euler("y", 0.5 * i, degrees=True).as_matrix()
+        pose = np.column_stack([turn, -turn @ np.array([0.15 * i, 0.02 * i, 0])])
+        images.append(ModelImage(i + 1, f"{i}.png", 1, pose))
+        in_camera = xyz @ pose[:, :3].T + pose[:, 3]
+        seen.append(np.asarray(camera.img_from_cam(in_camera)))
+    xy = np.stack(seen, axis=1) + rng.normal(0, 0.1, (NUM_POINTS, NUM_IMAGES, 2))
+    frames = np.arange(NUM_IMAGES, dtype=np.int32)
+    total = NUM_POINTS * NUM_IMAGES
+    tracks = Tracks(
+        num_frames=NUM_IMAGES,
+        width=640,
+        height=480,
+        offsets=np.arange(0, total + 1, NUM_IMAGES),
+        frame=np.tile(frames, NUM_POINTS),
+        xy=xy.reshape(-1, 2).astype(np.float32),
+        sigma=np.full(total, 0.25, np.float32),
+        confirmed=np.ones(total, np.bool_),
+    )
+    first = np.array([0, NUM_IMAGES])
+    placed = PosedImages(
+        images, frames, np.zeros(NUM_IMAGES, np.int32), first, {1: camera}, (None,) * NUM_IMAGES
+    )
+    return placed, tracks
+
+
+RUN = cast(Any, SimpleNamespace(options=ReconstructOptions()))
+
+
+def test_an_image_that_is_off_comes_to_where_its_corners_are() -> None:
+    placed, corners = scene()
+    true = placed.images[WRONG].cam_from_world
+    turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
+    images = list(placed.images)
+    images[WRONG] = replace(images[WRONG], cam_from_world=turned)
+    found = place_anew(RUN, corners, replace(placed, images=images))
+    for image, right in zip(found.images, placed.images, strict=True):
+        # In pixels at the picture's centre and edges.
+        off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
+        assert off < 0.3, image.name
+    assert np.abs(turned - true).max() * FOCAL > 3
+
+
+def test_without_corners_all_stays() -> None:
+    placed, corners = scene()
+    none = replace(
+        corners,
+        offsets=corners.offsets[:1],
+        frame=corners.frame[:0],
+        xy=corners.xy[:0],
+        sigma=corners.sigma[:0],
+        confirmed=corners.confirmed[:0],
+    )
+    assert place_anew(RUN, none, placed) is placed

@@ -1,0 +1,120 @@
+"""Corners are followed to where the pictures show them, with a hint from tracks."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_av1.tracks.corners import follow_corners
+from colmap_av1.tracks.tracks import Tracks
+
+SIZE = (320, 240)
+BORDER = 200
+
+
+def texture(seed: int) -> NDArray[np.uint8]:
+    """A picture with detail at several scales, larger than what is shown of it."""
+    rng = np.random.default_rng(seed)
+    shape = (SIZE[1] + 2 * BORDER, SIZE[0] + 2 * BORDER)
+    sum_of = np.zeros(shape)
+    for sigma in (2.0, 4.0, 8.0):
+        blurred = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), sigma)
+        sum_of += blurred / blurred.std()
+    return np.clip(128 + 40 * sum_of, 0, 255).astype(np.uint8)
+
+
+def view(whole: NDArray[np.uint8], shift: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """What is shown when the content has moved by a shift in pixels, BGR."""
+    move = np.array([[1.0, 0, shift[0] - BORDER], [0, 1.0, shift[1] - BORDER]])
+    return cv2.cvtColor(
+        cv2.warpAffine(whole, move, SIZE, flags=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR
+    )
+
+
+def guide_along(shifts: NDArray[np.float64], starts: NDArray[np.float64]) -> Tracks:
+    """Tracks that start at some points and move with the content."""
+    xy = (starts[:, None] + shifts[None]).reshape(-1, 2).astype(np.float32)
+    n, length = len(starts), len(shifts)
+    return Tracks(
+        num_frames=length,
+        width=SIZE[0],
+        height=SIZE[1],
+        offsets=np.arange(0, n * length + 1, length),
+        frame=np.tile(np.arange(length, dtype=np.int32), n),
+        xy=xy,
+        sigma=np.full(n * length, 0.3, np.float32),
+        confirmed=np.zeros(n * length, np.bool_),
+    )
+
+
+def all_count(_: int, xy: NDArray[np.float32], __: tuple[int, int]) -> NDArray[np.bool_]:
+    return np.ones(len(xy), np.bool_)
+
+
+def motion_of(tracks: Tracks, shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each observation lies from where the content has moved since the first one."""
+    first = np.repeat(tracks.offsets[:-1], np.diff(tracks.offsets))
+    moved = shifts[tracks.frame] - shifts[tracks.frame[first]]
+    return np.linalg.norm(tracks.xy - tracks.xy[first] - moved, axis=1)
+
+
+SLOW = np.array([[0.0, 0], [3.3, -1.2], [7.1, 0.4], [10.9, 2.8], [13.2, 6.6]])
+STARTS = np.array([[80.0, 60], [160, 120], [240, 180]])
+
+
+def test_corners_lie_where_the_pictures_show_them() -> None:
+    whole = texture(1)
+    pictures = [(f, view(whole, s)) for f, s in enumerate(SLOW)]
+    found = follow_corners(guide_along(SLOW, STARTS), pictures, all_count)
+    assert len(found.offsets) > 50
+    assert np.diff(found.offsets).min() >= 3
+    assert np.percentile(motion_of(found, SLOW), 95) < 0.1
+    assert found.confirmed.all()
+
+
+def test_a_jump_is_followed_where_tracks_say_it() -> None:
+    shifts = np.array([[0.0, 0], [2, 1], [92, -61], [95, -60]])
+    whole = texture(2)
+    pictures = [(f, view(whole, s)) for f, s in enumerate(shifts)]
+    found = follow_corners(guide_along(shifts, STARTS), pictures, all_count)
+    across = np.isin(np.arange(len(found.offsets) - 1), found.track[found.frame == 1])
+    across &= np.isin(np.arange(len(found.offsets) - 1), found.track[found.frame == 2])
+    assert across.sum() > 30
+    assert np.percentile(motion_of(found, shifts), 95) < 0.1
+
+
+def test_what_does_not_count_holds_no_corner() -> None:
+    whole = texture(3)
+    pictures = [(f, view(whole, s)) for f, s in enumerate(SLOW)]
+
+    def right_half(_: int, xy: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.bool_]:
+        return np.asarray(xy[:, 0] >= size[0] / 2)
+
+    found = follow_corners(guide_along(SLOW, STARTS), pictures, right_half)
+    assert len(found.offsets) > 20
+    assert found.xy[:, 0].min() >= SIZE[0] / 2
+
+
+def test_large_pictures_are_followed_in_their_own_pixels() -> None:
+    shifts = SLOW * 5
+    pictures = []
+    whole = texture(4)
+    for frame, shift in enumerate(SLOW):
+        small = view(whole, shift)
+        large = cv2.resize(small, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
+        pictures.append((frame, large))
+    found = follow_corners(guide_along(shifts, STARTS * 5), pictures, all_count)
+    assert found.xy[:, 0].max() > SIZE[0] * 4
+    assert np.percentile(motion_of(found, shifts), 95) < 0.5
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_or_plain_pictures_give_no_tracks(count: int) -> None:
+    whole = texture(5)
+    shown = [(f, view(whole, s)) for f, s in enumerate(SLOW[:count])]
+    guide = guide_along(SLOW, STARTS)
+    assert len(follow_corners(guide, shown, all_count).offsets) == 1
+    plain = [(f, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)) for f in range(4)]
+    assert len(follow_corners(guide, plain, all_count).offsets) == 1
