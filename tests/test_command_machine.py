@@ -78,7 +78,7 @@ COMMANDS = {
         *(("pair.png",), ("a.db", "frames")),
     ),
     "map": Command(
-        "map --database a.db --image_path frames --output model",
+        "map --database a.db --image_path frames --output model --num_threads 1",
         *(("model",), ("a.db", "frames")),
         once=True,
     ),

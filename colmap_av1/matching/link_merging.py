@@ -14,7 +14,7 @@ from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.tracks import Tracks, no_tracks
 from colmap_av1.util.graphs import connected_components
 
 # A feature within this many pixels of a track's keypoint is the same keypoint.
@@ -161,12 +161,4 @@ def links_as_tracks(
         xy=xy[order].astype(np.float32),
         sigma=np.full(len(order), _SIGMA, np.float32),
         confirmed=np.ones(len(order), np.bool_),
-    )
-
-
-def no_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
-    """Tracks of a video where there are none."""
-    return Tracks(
-        *(num_frames, *size, np.zeros(1, np.int64), np.empty(0, np.int32)),
-        *(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty(0, np.bool_)),
     )

@@ -29,7 +29,6 @@ from colmap_av1.matching.link_merging import (
     connected_images,
     links_as_tracks,
     merge_links,
-    no_tracks,
 )
 from colmap_av1.matching.link_plan import (
     Plan,
@@ -43,7 +42,7 @@ from colmap_av1.matching.link_plan import (
     weak_and_probed_gaps,
 )
 from colmap_av1.options import MatchOptions
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.tracks import Tracks, no_tracks
 from colmap_av1.util.progress import Clock, Progress
 
 # Inliers across a gap from which on mappers take it: they register an image by 30 points of its,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.files import read_image, write_image, write_images
-from colmap_av1.images.masks import Mask, joined_masks
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
 from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
@@ -188,10 +188,7 @@ def model_stage(
         cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
         images = placed.images
         given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
-        joined = [
-            joined_masks(mask, moving.get(image.name))
-            for mask, image in zip(placed.masks, images, strict=True)
-        ]
+        joined = placed.masks_with(moving)
         counting = undistorted_masks(joined, placed.camera_of_image, cameras)
         views = views_of(images, cameras, counting)
         seen, view = seen_in(tracks, placed.frames)

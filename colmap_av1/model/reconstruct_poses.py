@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
-from colmap_av1.images.masks import Mask
+from colmap_av1.images.masks import Mask, joined_masks
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import (
@@ -34,7 +33,7 @@ from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_frames, keep_tracks_of
-from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress, progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
 # Of an image, below which a mapper that finds no start may lack them.
@@ -51,11 +50,11 @@ _RESECTED = DensityOptions(
 )
 _FEWEST_VIEWS = 3
 # Poses follow from rays, however uncertain the points are that these meet in.
-_FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
+FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 # Beside corners, which say where an image is, motion that is off by more tells nothing; a corner is
 # where the picture shows it, and where a shutter bends this, all of it is to count.
-_BESIDE_CORNERS = replace(_FOR_POSES, max_reprojection_error=0.7)
-FOR_CORNERS = replace(_FOR_POSES, max_reprojection_error=8.0)
+_BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.7)
+FOR_CORNERS = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
 def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
@@ -204,7 +203,7 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
     seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
     spread = select_tracks(keep_frames(seen_thrice, takes.images.frames), _RESECTED)
     seen, view = seen_in(spread, known.frames)
-    points = triangulate_in(run, known, seen, view, options=_FOR_POSES)
+    points = triangulate_in(run, known, seen, view, options=FOR_POSES)
     check_agreement(len(points.xyz), points.num_tracks)
     pose_of = {
         frame: (image.camera_id, image.cam_from_world)
@@ -228,7 +227,7 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
             float(camera.mean_focal_length()),
             seed=run_options.seed,
             num_threads=run_options.num_threads,
-            progress=partial(_count, run.progress, len(left)),
+            progress=progress_in(run.progress, "resection", len(left)),
         )
         pose_of |= {
             frame: (camera_id, pose)
@@ -242,10 +241,6 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
         )
         if frame in pose_of
     ]
-
-
-def _count(progress: Progress, total: int, done: int) -> None:
-    progress("resection", done, total)
 
 
 def adjustment_stage(
@@ -288,7 +283,7 @@ def adjustment_stage(
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
         spread = join_tracks(spread, keep_frames(links, placed.frames))
-        sets = [(spread, _FOR_POSES)]
+        sets = [(spread, FOR_POSES)]
         if corners is not None:
             with run.clock.measure("refinement"):
                 followed, placed = corners(spread, placed)
@@ -317,7 +312,7 @@ def adjustment_stage(
         }
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
-    kinds = (_BESIDE_CORNERS, FOR_CORNERS) if corners is not None else (_FOR_POSES,)
+    kinds = (_BESIDE_CORNERS, FOR_CORNERS) if corners is not None else (FOR_POSES,)
     given = (_ADJUSTED, kinds, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,
@@ -363,6 +358,13 @@ class PosedImages:
     def camera_of_image(self) -> list[Any]:
         """The camera of each image."""
         return [self.cameras[image.camera_id] for image in self.images]
+
+    def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
+        """The mask of each image, joined with another of its name where there is one."""
+        return [
+            joined_masks(mask, others.get(image.name))
+            for mask, image in zip(self.masks, self.images, strict=True)
+        ]
 
 
 def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:

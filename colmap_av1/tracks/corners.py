@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
-from colmap_av1.video.coded_size import usual_downscale
+from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
 # Which positions [n, 2] count in a frame, by its index, whose picture is (width, height) large.
@@ -44,6 +44,7 @@ def follow_corners(
     guide: Tracks,
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     counts: Counts,
+    progress: Callable[[int], None] | None = None,
 ) -> Tracks:
     """Follow corners from each picture to the next one.
 
@@ -53,6 +54,7 @@ def follow_corners(
         guide: tracks of the same video: a corner is looked for where the track next to it goes.
         pictures: (frame, picture) in the order of frames, uint8 BGR [height, width, 3] of one size.
         counts: which positions count, see `Counts`: masks leave out others.
+        progress: called after each picture with the number of pictures so far.
 
     Returns:
         Tracks of three and more of the pictures, in the frames of `guide` and pixels of the
@@ -61,17 +63,22 @@ def follow_corners(
     by_frame = order_by_frame(guide.frame, guide.num_frames)
     bounds = np.searchsorted(guide.frame[by_frame], np.arange(guide.num_frames + 1))
     track = guide.track
+
+    def observations(frame: int) -> NDArray[np.int64]:
+        return by_frame[bounds[frame] : bounds[frame + 1]]
+
     seen: list[tuple[int, NDArray[np.int64], _Floats]] = []
     before: tuple[int, NDArray[np.uint8]] | None = None
     number, at = np.empty(0, np.int64), np.empty((0, 2), np.float32)
     count, scale = 0, np.ones(2, np.float32)
     for frame, picture in pictures:
-        grey, scale = _reduced(picture)
+        grey = smaller_grey(picture)
+        scale = (np.array(picture.shape[1::-1]) / grey.shape[::-1]).astype(np.float32)
         inside = partial(_counts, counts, frame, grey.shape[::-1])
         if before is not None and len(at):
-            own = (by_frame[bounds[f] : bounds[f + 1]] for f in (before[0], frame))
-            start, way = _motion(next(own), next(own), guide.xy / scale, track)
-            at, followed = _follow(before[1], grey, at, _nearest(start, way, at))
+            start, way = _motion(observations(before[0]), observations(frame), guide.xy, track)
+            expected = _nearest(start / scale, way / scale, at)
+            at, followed = _follow(before[1], grey, at, expected)
             followed &= inside(at)
             number, at = number[followed], at[followed]
         if len(at) < _FEW * _MAX_CORNERS:
@@ -81,19 +88,9 @@ def follow_corners(
             at, count = np.concatenate([at, new]), count + len(new)
         seen.append((frame, number, at))
         before = frame, grey
+        if progress is not None:
+            progress(len(seen))
     return _as_tracks(guide, seen, scale)
-
-
-def _reduced(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], _Floats]:
-    """The grey picture, smaller where it is large, and pixels of the given one to one of it."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    height, width = grey.shape
-    factor = usual_downscale((width, height))
-    if factor > 1:
-        size = (width // factor, height // factor)
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    scale = np.array([width, height], np.float32) / grey.shape[::-1]
-    return np.asarray(grey, np.uint8), scale.astype(np.float32)
 
 
 def _motion(

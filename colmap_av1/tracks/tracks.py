@@ -251,6 +251,14 @@ def split_tracks(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
     )
 
 
+def no_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
+    """Tracks of a video where there are none."""
+    return Tracks(
+        *(num_frames, *size, np.zeros(1, np.int64), np.empty(0, np.int32)),
+        *(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty(0, np.bool_)),
+    )
+
+
 def join_tracks(a: Tracks, b: Tracks) -> Tracks:
     """All tracks of one video that two sets hold, those of the first first."""
     if len(b.offsets) == 1:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
+
+from colmap_av1.util.cpus import cpu_seconds
 
 # Called with a stage's name, what is done of it and, where known, of how much.
 Progress = Callable[[str, int, "int | None"], None]
@@ -17,6 +18,11 @@ _Item = TypeVar("_Item")
 def no_progress(stage: str, done: int, total: int | None) -> None:
     """A `Progress` that reports nothing."""
     del stage, done, total
+
+
+def progress_in(progress: Progress, stage: str, total: int) -> Callable[[int], None]:
+    """What reports how much of a stage is done, by the number alone."""
+    return lambda done: progress(stage, done, total)
 
 
 class Clock:
@@ -34,11 +40,11 @@ class Clock:
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Add the time the body takes to a stage."""
-        start, cpu_start = time.perf_counter(), _processor_time()
+        start, cpu_start = time.perf_counter(), cpu_seconds()
         try:
             yield
         finally:
-            elapsed, cpu = time.perf_counter() - start, _processor_time() - cpu_start
+            elapsed, cpu = time.perf_counter() - start, cpu_seconds() - cpu_start
             self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
             self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu
 
@@ -54,8 +60,3 @@ class Clock:
                 except StopIteration:
                     return
             yield item
-
-
-def _processor_time() -> float:
-    used = os.times()
-    return used.user + used.system + used.children_user + used.children_system

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_av1.options import EncodeOptions
 
 # Pixels that a picture keeps at least where it is coded smaller than it is.
@@ -21,6 +25,16 @@ def with_downscale(options: EncodeOptions, size: tuple[int, int]) -> EncodeOptio
 def usual_downscale(size: tuple[int, int]) -> int:
     """The largest whole factor by which pictures of a (width, height) stay large enough."""
     return max(1, math.isqrt(size[0] * size[1] // _LEAST_PIXELS))
+
+
+def smaller_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The grey picture of a BGR one, made smaller by the usual factor where it is large."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    factor = usual_downscale(grey.shape[::-1])
+    if factor > 1:
+        size = tuple(length // factor for length in grey.shape[::-1])
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey, np.uint8)
 
 
 def coded_size(size: tuple[int, int], options: EncodeOptions) -> tuple[int, int]:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.masks import Mask, joined_masks
+from colmap_av1.images.masks import Mask
 from colmap_av1.model.reconstruct_poses import FOR_CORNERS, PosedImages, triangulate_in
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.resection import resect, sightings_of
 from colmap_av1.model.track_points import seen_in
 from colmap_av1.tracks.corners import follow_corners
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
-
-_Image = NDArray[np.uint8]
+from colmap_av1.util.progress import progress_in
 
 # Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
 # more than a shutter's read-out bends a picture, so that no part of it decides alone.
@@ -41,18 +40,14 @@ def corners_in_images(
     Returns:
         The corners as tracks, and the images.
     """
-    found = keep_observations(tracks, np.zeros(len(tracks.frame), np.bool_))
+    masks = placed.masks_with(moving)
+    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.sources)):
         own = np.flatnonzero(placed.take == video)
         if len(own) == 0:
             continue
         first = int(placed.first_frame[video])
-        mask_of = {
-            int(placed.frames[i]) - first: joined_masks(
-                placed.masks[i], moving.get(placed.images[i].name)
-            )
-            for i in own
-        }
+        mask_of = {int(placed.frames[i]) - first: masks[i] for i in own}
         guide = keep_observations(tracks, np.isin(tracks.frame, placed.frames[own]))
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
@@ -61,7 +56,8 @@ def corners_in_images(
             wanted=mask_of,
             use="corners are followed",
         )
-        corners = follow_corners(guide, _reported(run, decoded, len(own)), partial(_keeps, mask_of))
+        report = progress_in(run.progress, "refinement", len(own))
+        corners = follow_corners(guide, decoded, partial(_keeps, mask_of), report)
         found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
     return found, place_anew(run, found, placed)
 
@@ -123,11 +119,3 @@ def _keeps(
     """Which positions in the picture of a frame its mask keeps; None: all."""
     mask = mask_of[frame]
     return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)
-
-
-def _reported(
-    run: Run, pictures: Iterable[tuple[int, _Image]], total: int
-) -> Iterator[tuple[int, _Image]]:
-    for done, picture in enumerate(pictures, start=1):
-        yield picture
-        run.progress("refinement", done, total)

@@ -9,23 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.masks import Mask, joined_masks
+from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.coverage import PosedCamera, views_of
-from colmap_av1.model.reconstruct_poses import PosedImages
+from colmap_av1.model.reconstruct_poses import FOR_POSES, PosedImages
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.track_points import seen_in, triangulate_tracks
 from colmap_av1.model.triangulate import TriangulatedPoints
-from colmap_av1.options import RefineOptions, TriangulateOptions
+from colmap_av1.options import RefineOptions
 from colmap_av1.tracks.refine import refine_tracks
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
-from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.progress import no_progress, progress_in
 
 # Images after the last that sees a point in which it is looked for: from farther away it looks
 # different.
@@ -34,7 +33,6 @@ _REACH = 15
 _MARGIN = 4
 # Expected error in pixels of where poses that are to be adjusted put a point.
 _PREDICTED_SIGMA = 1.0
-_FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 _LK = RefineOptions(refine="lk")
 
 
@@ -62,7 +60,8 @@ def follow_behind(
     Returns:
         The tracks in these images, one for each point, without what disagrees with it.
     """
-    found = keep_observations(tracks, np.zeros(len(tracks.frame), np.bool_))
+    masks = placed.masks_with(moving)
+    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.sources)):
         own = np.flatnonzero(placed.take == video)
         frames = placed.frames[own]
@@ -70,14 +69,10 @@ def follow_behind(
         if len(view) == 0:
             continue
         images = [placed.images[i] for i in own]
-        masks = [
-            joined_masks(placed.masks[i], moving.get(image.name))
-            for i, image in zip(own, images, strict=True)
-        ]
-        views = views_of(images, placed.cameras, masks)
+        views = views_of(images, placed.cameras, [masks[i] for i in own])
         points = triangulate_tracks(
             *(seen, view, [v.camera for v in views], [v.cam_from_world for v in views], None),
-            options=_FOR_POSES,
+            options=FOR_POSES,
             num_threads=run.options.match.run.num_threads,
             progress=no_progress,
         )
@@ -96,13 +91,9 @@ def _on_pictures(run: Run, video: int, tracks: Tracks, first_frame: int) -> Trac
     num_frames = max(wanted) + 1
     own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
     decoded = decodable_frames(pictures, num_frames, run.options.match, wanted=wanted)
-    report = partial(_count, run.progress, len(wanted))
+    report = progress_in(run.progress, "refinement", len(wanted))
     found = refine_tracks(own, decoded, _LK, report)
     return replace(tracks, xy=found.xy, sigma=found.sigma, confirmed=found.confirmed)
-
-
-def _count(progress: Progress, total: int, done: int) -> None:
-    progress("refinement", done, total)
 
 
 def expect_in_views(
