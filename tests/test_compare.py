@@ -55,6 +55,15 @@ def truth(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_cpu():
+    """Give the mapper one thread: with several, its results vary from run to run."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    yield
+    os.sched_setaffinity(0, allowed)
+
+
 @pytest.fixture(scope="module")
 def compared(video, truth, tmp_path_factory):
     """The folder of a comparison in which one of the front-ends fails, made by the command."""

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +82,18 @@ def test_mp4_shows_both_and_is_the_same_each_time(panning: Path, tmp_path: Path)
         pictures = list(container.decode(video=0))
         assert float(container.streams.video[0].average_rate or 0) == 25
     assert [(p.width, p.height) for p in pictures] == [(512, 320)] * 10
+
+
+def test_mp4_does_not_depend_on_what_lies_in_memory(clip: Path, tmp_path: Path) -> None:
+    written = []
+    for number in ("1", "165"):
+        output = tmp_path / f"{number}.mp4"
+        words = [*(sys.executable, "-m", "colmap_av1", "view", "--video", str(clip), "--quiet")]
+        # glibc fills memory that is given out with this number.
+        environment = os.environ | {"MALLOC_PERTURB_": number}
+        subprocess.run([*words, "--output", str(output)], check=True, env=environment)
+        written.append(output.read_bytes())
+    assert written[0] == written[1]
 
 
 @pytest.mark.parametrize("when", ["tracks", "pictures"])

@@ -24,6 +24,8 @@ from colmap_av1.util.outputs import check_files, made_by
 Image = NDArray[np.uint8]
 # Set, because x264's output depends on their number.
 _ENCODER_THREADS = 4
+# With `mbtree` it depends on what lies in memory that x264 never wrote.
+_ENCODER_OPTIONS = {"crf": "18", "x264-params": "mbtree=0"}
 _MARK = made_by("view")
 # Signature and header of a PNG file, with its checksum.
 _PNG_HEADER = 33
@@ -148,7 +150,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
     with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
         container.metadata["comment"] = _MARK
         rate = Fraction(frame_rate).limit_denominator(1001)
-        stream: Any = container.add_stream("libx264", rate, options={"crf": "18"})
+        stream: Any = container.add_stream("libx264", rate, options=_ENCODER_OPTIONS)
         stream.pix_fmt = "yuv420p"
         stream.codec_context.thread_count = _ENCODER_THREADS
         size: tuple[int, int] | None = None
