@@ -61,12 +61,7 @@ class Mask:
             xy: [n, 2] pixels, the first one's centre at (0.5, 0.5).
             size: (width, height) of the picture, which may be another than the mask's.
         """
-        # By columns: NumPy's loops over rows of two take several times as long.
-        column, row = (
-            np.clip((along * (own / other)).astype(np.int64), 0, own - 1)
-            for along, own, other in zip((xy[:, 0], xy[:, 1]), self.size, size, strict=True)
-        )
-        return self.kept[row, column]
+        return _on(self.kept, xy, size)
 
 
 def make_mask(kept: NDArray[np.bool_]) -> Mask:
@@ -337,7 +332,9 @@ def mask_tracks(
 ) -> Tracks:
     """The tracks without what masks leave out: one that enters such an area ends there.
 
-    One that leaves such an area begins there, too: what was before may be of another surface.
+    One that leaves such an area begins there, too: what was before may be of another surface. In
+    frames that do not see a track, between two that do, it is where the straight way between these
+    leads.
 
     Args:
         tracks: any tracks.
@@ -347,17 +344,57 @@ def mask_tracks(
             need not be alike.
     """
     size = (tracks.width, tracks.height)
-    if isinstance(masks, Mask):
-        kept = masks.keeps(tracks.xy, size)
-    else:
-        kept = np.ones(len(tracks.frame), dtype=np.bool_)
-        order = order_by_frame(tracks.frame, tracks.num_frames)
-        bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
-        for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
-            if frame in masks and first < last:
-                own = order[first:last]
-                mask = masks[frame]
-                kept[own] = mask.keeps(tracks.xy[own], size if scaled else mask.size)
-    if kept.all():
+    of_all, by_frame = (masks.kept, {}) if isinstance(masks, Mask) else (None, masks)
+    kept = np.ones(len(tracks.frame), dtype=np.bool_)
+    begins = np.zeros(len(tracks.frame), dtype=np.bool_)
+    order = order_by_frame(tracks.frame, tracks.num_frames)
+    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    unseen = _Unseen(tracks)
+    for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
+        pixels = by_frame[frame].kept if frame in by_frame else of_all
+        if pixels is None:
+            continue
+        own = order[first:last]
+        passing, between = unseen.at(frame)
+        own_size = size if scaled else (pixels.shape[1], pixels.shape[0])
+        kept[own] = _on(pixels, tracks.xy[own], own_size)
+        begins[passing] |= ~_on(pixels, between, own_size)
+    if kept.all() and not begins.any():
         return tracks
-    return keep_long_tracks(split_tracks(tracks, kept), min_length)
+    return keep_long_tracks(split_tracks(tracks, kept, begins), min_length)
+
+
+class _Unseen:
+    """Where tracks are in frames that do not see them, between two that do."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        self._tracks = tracks
+        apart = np.diff(tracks.frame)
+        apart[tracks.offsets[1:-1] - 1] = 1
+        after = np.flatnonzero(apart > 1) + 1
+        self._longest = int(apart.max(initial=1))
+        # By the frame before each gap.
+        self._after = after[np.argsort(tracks.frame[after - 1], kind="stable")]
+        self._start = tracks.frame[self._after - 1]
+
+    def at(self, frame: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The observations that follow such a gap in a frame, and positions [n, 2] there."""
+        tracks = self._tracks
+        first, last = np.searchsorted(self._start, [frame - self._longest + 1, frame])
+        after = self._after[first:last]
+        after = after[tracks.frame[after] > frame]
+        start, end = tracks.frame[after - 1], tracks.frame[after]
+        share = ((frame - start) / (end - start)).astype(np.float32)[:, None]
+        return after, tracks.xy[after - 1] * (1 - share) + tracks.xy[after] * share
+
+
+def _on(
+    kept: NDArray[np.bool_], xy: NDArray[np.floating], size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Whether positions lie on pixels that count, see `Mask.keeps`."""
+    # By columns: NumPy's loops over rows of two take several times as long.
+    column, row = (
+        np.clip((along * (own / other)).astype(np.int64), 0, own - 1)
+        for along, own, other in zip((xy[:, 0], xy[:, 1]), kept.shape[::-1], size, strict=True)
+    )
+    return np.asarray(kept[row, column])

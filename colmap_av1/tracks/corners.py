@@ -10,6 +10,7 @@ and say where it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -23,9 +24,7 @@ _Floats = NDArray[np.float32]
 # Which positions [n, 2] count in a frame, by its index, whose picture is (width, height) large.
 Counts = Callable[[int, _Floats, tuple[int, int]], NDArray[np.bool_]]
 
-# Corners of an image, pixels between them, and share of the strongest one's strength.
-_MAX_CORNERS = 500
-_SPACING = 16
+# Share of the strongest corner's strength that one has at least.
 _QUALITY = 0.01
 # New ones are looked for where fewer than this share of them are left.
 _FEW = 0.8
@@ -40,11 +39,26 @@ _LEAST_IMAGES = 3
 _SIGMA = 0.25
 
 
+@dataclass(frozen=True)
+class CornerDensity:
+    """How many corners are followed.
+
+    Attributes:
+        most: corners of an image.
+        spacing: pixels between them, of the picture that is looked at.
+    """
+
+    most: int = 500
+    spacing: int = 16
+
+
 def follow_corners(
     guide: Tracks,
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     counts: Counts,
     progress: Callable[[int], None] | None = None,
+    *,
+    density: CornerDensity = CornerDensity(),
 ) -> Tracks:
     """Follow corners from each picture to the next one.
 
@@ -55,6 +69,7 @@ def follow_corners(
         pictures: (frame, picture) in the order of frames, uint8 BGR [height, width, 3] of one size.
         counts: which positions count, see `Counts`: masks leave out others.
         progress: called after each picture with the number of pictures so far.
+        density: how many.
 
     Returns:
         Tracks of three and more of the pictures, in the frames of `guide` and pixels of the
@@ -81,8 +96,8 @@ def follow_corners(
             at, followed = _follow(before[1], grey, at, expected)
             followed &= inside(at)
             number, at = number[followed], at[followed]
-        if len(at) < _FEW * _MAX_CORNERS:
-            new = _new_corners(grey, at)
+        if len(at) < _FEW * density.most:
+            new = _new_corners(grey, at, density)
             new = new[inside(new)]
             number = np.concatenate([number, np.arange(count, count + len(new))])
             at, count = np.concatenate([at, new]), count + len(new)
@@ -152,12 +167,13 @@ def _counts(counts: Counts, frame: int, size: tuple[int, int], at: _Floats) -> N
     return inside
 
 
-def _new_corners(grey: NDArray[np.uint8], at: _Floats) -> _Floats:
+def _new_corners(grey: NDArray[np.uint8], at: _Floats, density: CornerDensity) -> _Floats:
     """Corners of a picture apart from those that are followed already."""
     free = np.full(grey.shape, 255, np.uint8)
     for x, y in at.astype(np.int64).tolist():
-        cv2.circle(free, (x, y), _SPACING, 0, -1)
-    found = cv2.goodFeaturesToTrack(grey, _MAX_CORNERS - len(at), _QUALITY, _SPACING, mask=free)
+        cv2.circle(free, (x, y), density.spacing, 0, -1)
+    wanted = density.most - len(at)
+    found = cv2.goodFeaturesToTrack(grey, wanted, _QUALITY, density.spacing, mask=free)
     if found is None:
         return np.empty((0, 2), np.float32)
     return np.asarray(found.reshape(-1, 2) + np.float32(0.5), np.float32)

@@ -40,6 +40,8 @@ def refine_tracks(
     frames: Iterable[tuple[int, NDArray[np.uint8]]],
     options: RefineOptions | None = None,
     progress: Callable[[int], None] | None = None,
+    *,
+    expected: NDArray[np.bool_] | None = None,
 ) -> Tracks:
     """Correct track positions by Lucas-Kanade on the decoded pictures.
 
@@ -59,6 +61,9 @@ def refine_tracks(
             missing keep the bitstream's step.
         options: how to refine; the defaults of RefineOptions if None.
         progress: called after each frame with the number of frames so far.
+        expected: bool [num_observations] which are places that something else lets expect, and
+            nothing has seen; None: none. Where such a one is not found, nothing is looked for by
+            what its picture shows. They are not the first of their tracks.
 
     Returns:
         The same tracks and observations with corrected positions, their expected errors and
@@ -71,7 +76,7 @@ def refine_tracks(
     options = options if options is not None else RefineOptions()
     if options.refine == "none":
         return tracks
-    state = match_tracks(tracks, frames, options, progress)
+    state = match_tracks(tracks, frames, options, progress, expected=expected)
     return replace(
         tracks,
         xy=state.xy,
@@ -85,12 +90,14 @@ def match_tracks(
     frames: Iterable[tuple[int, NDArray[np.uint8]]],
     options: RefineOptions,
     progress: Callable[[int], None] | None = None,
+    *,
+    expected: NDArray[np.bool_] | None = None,
 ) -> RefinedTracks:
     """Do the work of `refine_tracks`, and return how every observation was found.
 
     Args and errors are those of `refine_tracks`.
     """
-    state = RefinedTracks.start(tracks, options)
+    state = RefinedTracks.start(tracks, options, expected)
     by_frame = order_by_frame(tracks.frame, tracks.num_frames)
     bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
     next_frame = 0
@@ -134,6 +141,7 @@ class RefinedTracks:
     track: NDArray[np.int64]  # of each observation
     is_first: NDArray[np.bool_]
     is_last: NDArray[np.bool_]
+    shown: NDArray[np.bool_]  # whether it was seen, or is found: its picture is of the track
     step: NDArray[np.float32]  # by which the bitstream led to each observation
     step_variance: NDArray[np.float64]
     bitstream_variance: NDArray[np.float64]
@@ -147,7 +155,9 @@ class RefinedTracks:
     last_frame: int = -1
 
     @classmethod
-    def start(cls, tracks: Tracks, options: RefineOptions) -> RefinedTracks:
+    def start(
+        cls, tracks: Tracks, options: RefineOptions, expected: NDArray[np.bool_] | None
+    ) -> RefinedTracks:
         """What is known before the first frame."""
         num_observations = len(tracks.frame)
         is_first = np.zeros(num_observations, dtype=np.bool_)
@@ -165,6 +175,7 @@ class RefinedTracks:
             track=tracks.track,
             is_first=is_first,
             is_last=is_last,
+            shown=np.ones(num_observations, np.bool_) if expected is None else ~expected,
             step=np.diff(tracks.xy, axis=0, prepend=np.zeros((1, 2), np.float32)),
             step_variance=step_variance,
             bitstream_variance=variance,
@@ -205,7 +216,7 @@ class RefinedTracks:
         lost = tracked[~sure]
         fresh = np.empty(0, dtype=np.int64)
         if self.last_image is not None:
-            lost = lost[self.tracks.frame[lost - 1] == self.last_frame]
+            lost = lost[(self.tracks.frame[lost - 1] == self.last_frame) & self.shown[lost - 1]]
             track = self.track[lost]
             found = _match(
                 self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
@@ -215,6 +226,7 @@ class RefinedTracks:
             self.variance[lost[~sure]] += _REFUSED_SIGMA**2
 
         given_up = tracked[templates.misses[self.track[tracked]] > _MAX_MISSES]
+        given_up = given_up[self.shown[given_up]]
         renewed = np.concatenate([seen[self.is_first[seen]], np.union1d(fresh, given_up)])
         renewed = renewed[~self.is_last[renewed]]
         templates.drop(self.track[seen[self.is_last[seen]]])
@@ -251,6 +263,7 @@ class RefinedTracks:
         since = self.bitstream_variance[taken] - self.bitstream_variance[source[sure]]
         self.variance[taken] = self.variance[source[sure]] + _match_variance(noise, since)
         self.confirmed[taken] = True
+        self.shown[taken] = True
         self.source[taken] = source[sure]
         self.noise[taken] = noise
         return sure

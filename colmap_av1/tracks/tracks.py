@@ -230,17 +230,17 @@ def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
     return replace(tracks, offsets=np.flatnonzero(starts).astype(np.int64))
 
 
-def split_tracks(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
+def split_tracks(tracks: Tracks, kept: NDArray[np.bool_], cut: NDArray[np.bool_]) -> Tracks:
     """The tracks with some of their observations only, cut in two where one between is left out.
 
     Args:
         tracks: any tracks.
         kept: bool [num_observations].
+        cut: bool [num_observations] those before which a track is cut all the same.
     """
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
-    left_out = np.cumsum(~kept)
+    part = np.cumsum(~kept | cut)
     begins = np.ones(int(np.count_nonzero(kept)), dtype=np.bool_)
-    begins[1:] = (np.diff(track[kept]) != 0) | (np.diff(left_out[kept]) != 0)
+    begins[1:] = (np.diff(tracks.track[kept]) != 0) | (np.diff(part[kept]) != 0)
     return replace(
         tracks,
         offsets=np.append(np.flatnonzero(begins), len(begins)).astype(np.int64),

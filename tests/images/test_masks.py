@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import ColmapAv1Error, ImageError
 from colmap_av1.images.masks import Mask, make_mask, mask_tracks, read_masks
 from colmap_av1.match import match
-from colmap_av1.options import ImageOptions, LinkOptions, MaskOptions, MatchOptions
+from colmap_av1.options import DensityOptions, ImageOptions, LinkOptions, MaskOptions, MatchOptions
 from colmap_av1.tracks.tracks import Tracks
 
 WIDTH, HEIGHT, NUM_FRAMES = 192, 128, 16
@@ -81,36 +82,46 @@ def test_masks_of_images_in_both_layouts(clip: Path, tmp_path: Path) -> None:
     for layout in ("colmap", "trainers"):
         for i, name in enumerate(names):
             file = f"{name}.png" if layout == "colmap" else Path(name).with_suffix(".png")
-            write(tmp_path / layout / file, LEFT if i == 2 else LEFT * 0 + 1)
+            write(tmp_path / layout / file, LEFT if i == 0 else LEFT * 0 + 1)
         how = options(tmp_path / layout, every=3, image_name="frame_%06d.jpg")
         match(tmp_path / f"{layout}.db", clip, options=how)
         found.append(positions(tmp_path / f"{layout}.db"))
     assert list(found[0]) == names
     for i, name in enumerate(names):
-        assert (num_on_black(found[0][name], LEFT) == 0) == (i == 2)
+        assert (num_on_black(found[0][name], LEFT) == 0) == (i == 0)
         assert np.array_equal(found[0][name], found[1][name])
 
 
-def test_masks_of_frames_end_tracks_between_images(clip: Path, tmp_path: Path) -> None:
-    """A frame that is no image has its say: no track crosses one that is all black."""
+@pytest.mark.parametrize("preset", ["default", "dense"])
+def test_masks_of_frames_end_tracks_between_images(
+    preset: Literal["default", "dense"], clip: Path, tmp_path: Path
+) -> None:
+    """A frame that is no image has its say: no track crosses one that is all black.
+
+    Among many there are some that it does not see, and that are seen before and after it.
+    """
     for i in range(NUM_FRAMES):
         write(tmp_path / "masks" / f"{i + 1}.png", LEFT * 0 if i == 7 else LEFT * 0 + 255)
-    how = replace(options(tmp_path / "masks", every=5), links=LinkOptions(links="none"))
+    how = replace(
+        options(tmp_path / "masks", every=2),
+        links=LinkOptions(links="none"),
+        density=DensityOptions(preset=preset),
+    )
     match(tmp_path / "a.db", clip, options=how)
     crossing = []
     for name in ("a", "b"):
         if name == "b":
-            match(tmp_path / "b.db", clip, options=MatchOptions(images=how.images))
+            match(tmp_path / "b.db", clip, options=replace(how, masks=MaskOptions()))
         with sqlite3.connect(tmp_path / f"{name}.db") as database:
             pairs = [
                 image_ids_from_pair_id(i)
                 for (i,) in database.execute("SELECT pair_id FROM matches")
             ]
-        crossing.append([(i, j) for i, j in pairs if i <= 2 < j])
+        crossing.append([(i, j) for i, j in pairs if i <= 4 < j])
     assert crossing[0] == []
     assert crossing[1] != []
-    report = match(tmp_path / "c.db", clip, options=options(tmp_path / "masks", every=5))
-    assert report.links.weak_gaps == ((5, 10),)
+    report = match(tmp_path / "c.db", clip, options=options(tmp_path / "masks", every=2))
+    assert report.links.weak_gaps == ((6, 8),)
 
 
 def test_masks_of_other_pixels_change_nothing(
@@ -267,3 +278,50 @@ def test_tracks_end_where_a_mask_begins(tracks: list[list[bool]]) -> None:
             found = mask_tracks(given_tracks, given_masks, least)
             pieces = np.split(found.sigma.astype(int), found.offsets[1:-1])
             assert [p.tolist() for p in pieces if len(p)] == wanted
+
+
+@given(
+    st.lists(st.sets(st.integers(0, 8), min_size=1), min_size=1, max_size=6),
+    st.dictionaries(st.integers(0, 8), st.lists(st.booleans(), min_size=4, max_size=4)),
+    st.integers(0, 2**31),
+)
+def test_tracks_end_at_masks_of_frames_that_do_not_see_them(
+    frames: list[set[int]], white: dict[int, list[bool]], seed: int
+) -> None:
+    """Between two frames that see it a track is on the straight way between its places there."""
+    seen = [sorted(own) for own in frames]
+    lengths = [len(own) for own in seen]
+    # Not on the edges of pixels, and no way of a share of eighths or less leads there.
+    x = np.random.default_rng(seed).integers(0, 4, sum(lengths)) + np.float32(0.45)
+    given_tracks = Tracks(
+        num_frames=9,
+        width=4,
+        height=1,
+        offsets=np.cumsum([0, *lengths]),
+        frame=np.concatenate(seen).astype(np.int32),
+        xy=np.column_stack([x, np.full(len(x), 0.5, np.float32)]),
+        sigma=np.arange(len(x), dtype=np.float32),
+        confirmed=np.zeros(len(x), np.bool_),
+    )
+    masks = {frame: make_mask(np.array([row])) for frame, row in white.items()}
+    pieces: list[list[int]] = []
+    at = 0
+    for own in seen:
+        piece: list[int] = []
+        for k, frame in enumerate(own):
+            before = own[k - 1] if k else frame
+            passed = range(before + 1, frame + 1) if k else [frame]
+            where = np.interp(passed, [before, frame], [x[at - 1], x[at]]) if k else [x[at]]
+            counts = [
+                white.get(f, [True] * 4)[int(to)] for f, to in zip(passed, where, strict=True)
+            ]
+            if not all(counts):
+                pieces.append(piece)
+                piece = []
+            if counts[-1]:
+                piece.append(at)
+            at += 1
+        pieces.append(piece)
+    found = mask_tracks(given_tracks, masks, 1)
+    split = np.split(found.sigma.astype(int), found.offsets[1:-1])
+    assert [p.tolist() for p in split if len(p)] == [p for p in pieces if p]

@@ -15,9 +15,10 @@ import render_scene
 from conftest import Encode
 from dense_scene import SCENE, Truth
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.images.masks import make_mask, mask_tracks
+from colmap_av1.images.masks import Mask, make_mask, mask_tracks
 from colmap_av1.model.colmap_model import ModelImage
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
@@ -230,15 +231,34 @@ def test_reconstruct_leaves_out_what_moves(
     assert errors.ate < 0.0002 * errors.extent
 
 
-def test_tracks_are_followed_behind_what_passes(truth: Truth, tmp_path: Path) -> None:
-    """A broad band goes across the pictures and cuts the tracks that it hides."""
+@dataclass(frozen=True)
+class Passed:
+    """The scene with a broad band that goes across its pictures and cuts the tracks it hides.
+
+    Attributes:
+        run: what the stages before leave.
+        moving: masks that leave out the band, by the images' names.
+        tracks: tracks of the scene, ended and begun anew at the band.
+        placed: its images.
+        left: the first column of the band in each.
+    """
+
+    run: Run
+    moving: dict[str, Mask]
+    tracks: Tracks
+    placed: PosedImages
+    left: NDArray[np.int64]
+
+
+@pytest.fixture(scope="module")
+def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     video = read_video(SCENE)
     source = VideoSource(video, video)
     every = track_video(
         source, MatchOptions(), one_size=True, clock=Clock(), progress=no_progress
     ).tracks
     frames = np.arange(NUM_FRAMES, dtype=np.int32)
-    left = 60 + 14 * frames
+    left = 60 + 14 * np.arange(NUM_FRAMES)
     column = np.arange(640)
     masks = [
         make_mask(np.tile((column < at) | (column >= at + 100), (360, 1))) for at in left.tolist()
@@ -256,29 +276,64 @@ def test_tracks_are_followed_behind_what_passes(truth: Truth, tmp_path: Path) ->
         masks=(None,) * NUM_FRAMES,
     )
     inputs: Any = None  # for stages before
-    run = Run(*(inputs, (source,), tmp_path, tmp_path, ReconstructOptions(), Clock(), no_progress))
+    folder = tmp_path_factory.mktemp("passed")
+    run = Run(*(inputs, (source,), folder, folder, ReconstructOptions(), Clock(), no_progress))
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(keep_frames(every, frames), dict(enumerate(masks)), 4)
-    cut = select_tracks(cut, some)
     moving = dict(zip(names, masks, strict=True))
-    found = follow_behind(run, moving, cut, placed)
+    return Passed(run, moving, select_tracks(cut, some), placed, left)
 
-    assert len(found.frame) > 1.1 * len(cut.frame)
-    ends, taken_up = (
-        np.flatnonzero((np.diff(tracks.frame) > 5) & (np.diff(tracks.track) == 0))
-        for tracks in (cut, found)
-    )
-    assert len(ends) < 10
-    assert len(taken_up) > 100
+
+def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The observations before gaps of five and more frames, and pixels by which tracks are off
+    behind some of them."""
+    before = np.flatnonzero((np.diff(tracks.frame) > 5) & (np.diff(tracks.track) == 0))
     scene = render_scene.build_scene()
     off = []
-    for row in taken_up[::3]:
-        frames_of_gap = found.frame[[row, row + 1]].tolist()
-        xy, _ = render_scene.transfer(scene, found.xy[[row]].astype(float), *frames_of_gap)
-        off.append(np.linalg.norm(xy[0] - found.xy[row + 1]))
-    assert np.median(off) < 0.5
-    on_it = (found.xy[:, 0] >= left[found.frame] + 1) & (found.xy[:, 0] < left[found.frame] + 99)
+    for row in before[::3]:
+        xy, _ = render_scene.transfer(
+            scene, tracks.xy[[row]].astype(float), *tracks.frame[[row, row + 1]].tolist()
+        )
+        off.append(np.linalg.norm(xy[0] - tracks.xy[row + 1]))
+    return before, np.array(off)
+
+
+def test_tracks_are_followed_behind_what_passes(passed: Passed) -> None:
+    found = follow_behind(passed.run, passed.moving, passed.tracks, passed.placed)
+    assert len(found.frame) > 1.1 * len(passed.tracks.frame)
+    assert len(off_behind(passed.tracks)[0]) < 10
+    taken_up, off = off_behind(found)
+    assert len(taken_up) > 80
+    assert np.median(off) < 0.25
+    assert np.quantile(off, 0.9) < 1
+    left = passed.left[found.frame]
+    on_it = (found.xy[:, 0] >= left + 1) & (found.xy[:, 0] < left + 99)
     assert on_it.mean() < 0.001
+
+
+@pytest.mark.parametrize("pixels", [1, 7])
+def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) -> None:
+    """What lies where a track is expected in vain is not followed from there on."""
+    turn = Rotation.from_euler("y", pixels / 520).as_matrix()
+    images = [
+        replace(image, cam_from_world=turn @ image.cam_from_world) if frame >= 20 else image
+        for frame, image in enumerate(passed.placed.images)
+    ]
+    early = keep_frames(passed.tracks, np.arange(20, dtype=np.int32))
+    found = follow_behind(passed.run, passed.moving, early, replace(passed.placed, images=images))
+    first = np.repeat(found.offsets[:-1], np.diff(found.offsets))
+    late = np.flatnonzero(found.frame >= 20)
+    if pixels > 1:  # beyond what is searched
+        assert len(late) < 10
+        return
+    assert len(late) > 100
+    scene = render_scene.build_scene()
+    off = []
+    for row in late[::40]:
+        frames = found.frame[[first[row], row]].tolist()
+        xy, _ = render_scene.transfer(scene, found.xy[[first[row]]].astype(float), *frames)
+        off.append(np.linalg.norm(xy[0] - found.xy[row]))
+    assert np.median(off) < 0.4
 
 
 def test_points_are_looked_for_where_they_should_be_seen() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from colmap_av1.tracks.corners import follow_corners
+from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
 
 SIZE = (320, 240)
@@ -108,6 +108,17 @@ def test_large_pictures_are_followed_in_their_own_pixels() -> None:
     found = follow_corners(guide_along(shifts, STARTS * 5), pictures, all_count)
     assert found.xy[:, 0].max() > SIZE[0] * 4
     assert np.percentile(motion_of(found, shifts), 95) < 0.5
+
+
+def test_more_corners_are_followed_where_more_are_wanted() -> None:
+    pictures = [(k, view(texture(1), shift)) for k, shift in enumerate(SLOW)]
+    few, many = (
+        follow_corners(guide_along(SLOW, STARTS), pictures, all_count, density=density)
+        for density in (CornerDensity(most=50), CornerDensity(most=300, spacing=6))
+    )
+    assert np.bincount(few.frame).max() <= 50
+    assert 150 < np.bincount(many.frame).max() <= 300
+    assert np.median(motion_of(many, SLOW)) < 0.1
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -14,7 +14,7 @@ from colmap_av1.model.reconstruct_poses import FOR_CORNERS, PosedImages, triangu
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.resection import resect, sightings_of
 from colmap_av1.model.track_points import seen_in
-from colmap_av1.tracks.corners import follow_corners
+from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.progress import progress_in
@@ -22,6 +22,9 @@ from colmap_av1.util.progress import progress_in
 # Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
 # more than a shutter's read-out bends a picture, so that no part of it decides alone.
 _LOSS_SCALE = 2.0
+# Of pictures in which what masks leave out changes: what passes cuts what it hides to half the
+# length, and short tracks hold fewer images together.
+_CUT_SHORT = CornerDensity(most=1500, spacing=8)
 # Error beyond which a corner is lost, wherever it is.
 _LOST = 8.0
 
@@ -57,7 +60,8 @@ def corners_in_images(
             use="corners are followed",
         )
         report = progress_in(run.progress, "refinement", len(own))
-        corners = follow_corners(guide, decoded, partial(_keeps, mask_of), report)
+        density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()
+        corners = follow_corners(guide, decoded, partial(_keeps, mask_of), report, density=density)
         found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
     return found, place_anew(run, found, placed)
 

@@ -49,7 +49,8 @@ def follow_behind(
 
     A point is looked for where the poses put it in images that do not see it yet, from the first
     that does to shortly after the last, but not on what moves. It is seen where the picture looks
-    alike.
+    like one that shows it, and followed from there: what lies where it is looked for in vain would
+    agree with the poses whatever these are.
 
     Args:
         run: what every stage is given.
@@ -77,12 +78,15 @@ def follow_behind(
             progress=no_progress,
         )
         expected, is_expected = expect_in_views(seen, view, points, views, frames)
-        corrected = _on_pictures(run, video, expected, int(placed.first_frame[video]))
+        first_frame = int(placed.first_frame[video])
+        corrected = _on_pictures(run, video, expected, is_expected, first_frame)
         found = join_tracks(found, keep_observations(corrected, corrected.confirmed | ~is_expected))
     return found
 
 
-def _on_pictures(run: Run, video: int, tracks: Tracks, first_frame: int) -> Tracks:
+def _on_pictures(
+    run: Run, video: int, tracks: Tracks, expected: NDArray[np.bool_], first_frame: int
+) -> Tracks:
     """Tracks of a video, of frames that are counted through, corrected on its pictures."""
     frame = tracks.frame - np.int32(first_frame)
     wanted = frozenset(np.unique(frame).tolist())
@@ -92,7 +96,7 @@ def _on_pictures(run: Run, video: int, tracks: Tracks, first_frame: int) -> Trac
     own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
     decoded = decodable_frames(pictures, num_frames, run.options.match, wanted=wanted)
     report = progress_in(run.progress, "refinement", len(wanted))
-    found = refine_tracks(own, decoded, _LK, report)
+    found = refine_tracks(own, decoded, _LK, report, expected=expected)
     return replace(tracks, xy=found.xy, sigma=found.sigma, confirmed=found.confirmed)
 
 
