@@ -506,6 +506,8 @@ def movers(rows: list[Row]) -> str:
         words("`--moving`", "moving"),
         figure("images", "registered", ".0f"),
         figure("ATE", "ate_mm", ".2f", " mm"),
+        figure("least", "ate_mm_least", ".2f"),
+        figure("largest", "ate_mm_most", ".2f"),
         figure("points", "points", ",.0f"),
         figure("on people", "points_on_people", ".2%"),
         figure("IoU of masks", "iou", ".2f"),
