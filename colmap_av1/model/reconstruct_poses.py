@@ -51,10 +51,11 @@ _RESECTED = DensityOptions(
 _FEWEST_VIEWS = 3
 # Poses follow from rays, however uncertain the points are that these meet in.
 FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
-# Beside corners, which say where an image is, motion that is off by more tells nothing; a corner is
-# where the picture shows it, and where a shutter bends this, all of it is to count.
+# Beside corners, which say where an image is, motion that is off by more tells nothing. A corner is
+# where the picture shows it, and where a shutter bends this, all of it is to count; a link, too:
+# where poses do not hold together it is as far off as they are.
 _BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.7)
-FOR_CORNERS = replace(FOR_POSES, max_reprojection_error=8.0)
+FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
 def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
@@ -282,12 +283,13 @@ def adjustment_stage(
         if follow is not None:
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
-        spread = join_tracks(spread, keep_frames(links, placed.frames))
-        sets = [(spread, FOR_POSES)]
+        linked = keep_frames(links, placed.frames)
+        sets = [(join_tracks(spread, linked), FOR_POSES)]
         if corners is not None:
             with run.clock.measure("refinement"):
-                followed, placed = corners(spread, placed)
-            sets = [(spread, _BESIDE_CORNERS), (followed, FOR_CORNERS)]
+                followed, placed = corners(join_tracks(spread, linked), placed)
+            seen = join_tracks(linked, followed)
+            sets = [(spread, _BESIDE_CORNERS), (seen, FROM_PICTURES)]
         with run.clock.measure("adjustment"):
             folder = partial / "adjusted"
             folder.mkdir()
@@ -312,7 +314,7 @@ def adjustment_stage(
         }
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
-    kinds = (_BESIDE_CORNERS, FOR_CORNERS) if corners is not None else (FOR_POSES,)
+    kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
     given = (_ADJUSTED, kinds, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,

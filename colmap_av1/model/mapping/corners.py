@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.masks import Mask
-from colmap_av1.model.reconstruct_poses import FOR_CORNERS, PosedImages, triangulate_in
+from colmap_av1.model.reconstruct_poses import FROM_PICTURES, PosedImages, triangulate_in
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.resection import resect, sightings_of
 from colmap_av1.model.track_points import seen_in
@@ -78,7 +78,7 @@ def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
         placed: the images that have a pose.
     """
     seen, view = seen_in(corners, placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=FOR_CORNERS)
+    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
     if len(points.xyz) == 0:
         return placed
     images = list(placed.images)
