@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -11,10 +12,22 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import ReconstructOptions
-from colmap_av1.model.colmap_model import ModelImage
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.takes import Takes
+from colmap_av1.model.colmap_model import (
+    ModelImage,
+    camera_centres,
+    no_points,
+    posed_images,
+    read_model,
+    write_model,
+)
 from colmap_av1.model.mapping.corners import place_anew
-from colmap_av1.model.reconstruct_poses import PosedImages
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.model.reconstruct_poses import PosedImages, adjustment_stage
+from colmap_av1.options import MapperOptions
+from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.stages import Kept
 
 NUM_IMAGES, NUM_POINTS, FOCAL = 9, 200, 500.0
 WRONG = 4
@@ -82,3 +95,46 @@ def test_without_corners_all_stays() -> None:
         confirmed=corners.confirmed[:0],
     )
     assert place_anew(RUN, none, placed) is placed
+
+
+def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
+    placed, seen = scene()
+    joint = 4  # the image before it
+    after = placed.frames > joint
+    # All after the joint is 6 px up there, more than motion may be off.
+    off = np.column_stack([np.eye(3), [0, 0.07, 0]])
+    images = [
+        replace(i, cam_from_world=np.column_stack([i.cam_from_world[:, :3], moved]))
+        if is_after
+        else i
+        for i, is_after, moved in (
+            (i, is_after, i.cam_from_world[:, :3] @ off[:, 3] + i.cam_from_world[:, 3])
+            for i, is_after in zip(placed.images, after, strict=True)
+        )
+    ]
+    number = np.repeat(np.arange(NUM_POINTS), NUM_IMAGES)
+    later = seen.frame > joint
+    tracks = keep_observations(seen, ((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
+    links = keep_observations(seen, (number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
+    (tmp_path / "placed").mkdir()
+    write_model(tmp_path / "placed", placed.cameras, images, no_points())
+    options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
+    run = SimpleNamespace(
+        options=options, stages=tmp_path, clock=Clock(), progress=no_progress, positions=None
+    )
+    takes = Takes(
+        ("",),
+        ChosenImages([image.name for image in images], placed.frames),
+        placed.take,
+        placed.first_frame,
+        placed.masks,
+    )
+    adjusted = adjustment_stage(
+        *(cast(Any, run), tracks, links, takes, Kept({"poses": "placed"}, "", resumed=False)),
+        corners=lambda _, known: (tracks, known),
+    )
+    found = posed_images(read_model(tmp_path / adjusted.facts["poses"]))
+    centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))
+    steps = np.diff(centres, axis=0)
+    usual = np.median(steps, axis=0)
+    assert np.linalg.norm(steps[joint] - usual) < 0.05 * np.linalg.norm(usual)
