@@ -311,15 +311,18 @@ def _match_images(
     """Match the images along their tracks, verify that, and link what motion does not connect."""
     takes, videos = images.takes, images.videos
     shares = [own.tracked.inter_share for own in videos]
-    paired = [
-        pair_images(
-            *(own.source.pictures.path, own.tracks, own.chosen, options),
-            needed=takes.num_takes == 1 and not may_link(share, own.chosen.frames, options.links),
-            clock=clock,
-            progress=progress,
+    paired = []
+    for own, share in zip(videos, shares, strict=True):
+        num_tracks = len(own.tracks.offsets) - 1
+        linked_anyway = may_link(share, own.chosen.frames, num_tracks, options.links)
+        paired.append(
+            pair_images(
+                *(own.source.pictures.path, own.tracks, own.chosen, options),
+                needed=takes.num_takes == 1 and not linked_anyway,
+                clock=clock,
+                progress=progress,
+            )
         )
-        for own, share in zip(videos, shares, strict=True)
-    ]
     together = pairs_of_takes(paired, takes)
     cameras = _cameras(images, together, database, listed, options, clock=clock)
     matched = verify_images(together, cameras.of_images, options, clock=clock, progress=progress)

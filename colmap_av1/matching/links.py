@@ -55,6 +55,9 @@ _ENOUGH_OF_USUAL = 0.3
 _NUM_BROKEN_PROBES = 2
 # Features of a picture below which it shows nothing: others have hundreds.
 _FEW_FEATURES = 20
+# Images of a video without any motion whose pictures are looked at, to tell whether they show
+# anything.
+_NUM_GLANCED = 3
 # Gaps that a warning names.
 _NUM_NAMED = 4
 
@@ -227,6 +230,8 @@ def link_images(
         anywhere = bool(linked.report.doubtful_gaps)
         linked = link(thorough_plan(plan, takes, matched, images_apart, anywhere=anywhere))
     if len(linked.matched.pairs) == 0:
+        if options.links.links != "none" and not found["light"]:
+            look_at(np.linspace(0, len(takes.take) - 1, _NUM_GLANCED).round().astype(int), "light")
         sizes = [len(features.xy) for features in found["light"].values()]
         if sizes and np.median(sizes) < _FEW_FEATURES:
             raise VideoError(

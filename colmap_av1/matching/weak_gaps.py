@@ -58,9 +58,12 @@ def weak_gaps(
 
 
 def may_link(
-    inter_share: NDArray[np.float32], frames: NDArray[np.int32], options: LinkOptions
+    inter_share: NDArray[np.float32],
+    frames: NDArray[np.int32],
+    num_tracks: int,
+    options: LinkOptions,
 ) -> bool:
-    """Whether pictures may connect images that share no track."""
+    """Whether pictures may connect images that share no track, or show why there is none."""
     return options.links == "sift" or (
-        options.links == "auto" and bool(weak_gaps(inter_share, frames).any())
+        options.links == "auto" and (num_tracks == 0 or bool(weak_gaps(inter_share, frames).any()))
     )

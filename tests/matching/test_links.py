@@ -5,6 +5,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -274,14 +275,17 @@ def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
     assert all((frame[a] <= 13) == (frame[b] <= 13) for a, b in pairs)
 
 
-def test_frames_of_one_colour(encode: Encode, tmp_path: Path) -> None:
+@pytest.mark.parametrize("links", ["auto", "sift"])
+def test_frames_of_one_colour(
+    encode: Encode, tmp_path: Path, links: Literal["auto", "sift"]
+) -> None:
     """Links are looked for and there is nothing to see."""
     grey = np.full((12, 128, 192, 3), 90, np.uint8)
     with pytest.raises(VideoError, match="hardly any detail, 0 features each, so there is nothing"):
         match(
             tmp_path / "a.db",
             encode(grey, tmp_path / "grey.mp4"),
-            options=MatchOptions(links=LinkOptions(links="sift"), images=ImageOptions(every=1)),
+            options=MatchOptions(links=LinkOptions(links=links), images=ImageOptions(every=1)),
         )
 
 
