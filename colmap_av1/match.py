@@ -212,13 +212,15 @@ def match(
                 num_written = _write_images(images, folder, options, progress)
 
     with clock.measure("database"):
+        positions = image_positions(images.takes, inputs.videos, inputs.photos)
         write_matched_images(
             *(database, images.takes.images.names, cameras.new, linked.matched),
             on_existing=options.on_existing,
-            places=image_positions(images.takes, inputs.videos, inputs.photos).places,
+            places=positions.places,
         )
     videos = images.videos
     notes = inputs.with_names([own.tracked.warnings for own in videos])
+    notes += positions.warnings
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),

@@ -221,6 +221,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
     notes = [
         *run.inputs.warnings,
+        *positions.warnings,
         *run.inputs.with_names([stage.facts["warnings"] for stage in tracked]),
         *facts["link_warnings"],
         *facts["place_warnings"],

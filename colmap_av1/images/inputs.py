@@ -19,6 +19,8 @@ from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
+from colmap_av1.video.lens import doubtful_lens
+from colmap_av1.video.positions import doubtful_place
 from colmap_av1.video.spherical import check_is_plane, hint
 from colmap_av1.video.unchanged import FileState
 
@@ -93,12 +95,7 @@ class Inputs:
 
     def with_names(self, of_videos: Sequence[Sequence[str]]) -> list[str]:
         """What is to be said of each video, with its name where there are several."""
-        several = len(self.videos) > 1
-        return [
-            f"{video}: {note}" if several else note
-            for video, notes in zip(self.videos, of_videos, strict=True)
-            for note in notes
-        ]
+        return _with_names(self.videos, of_videos)
 
     def conversion(self, of_videos: Sequence[str | None]) -> str | None:
         """How videos were converted, in words; None where none was."""
@@ -109,6 +106,15 @@ class Inputs:
     def name(self) -> str:
         """What messages call them all."""
         return ", ".join(str(video) for video in self.videos)
+
+
+def _with_names(videos: Sequence[Video], of_videos: Sequence[Sequence[str]]) -> list[str]:
+    several = len(videos) > 1
+    return [
+        f"{video}: {note}" if several else note
+        for video, notes in zip(videos, of_videos, strict=True)
+        for note in notes
+    ]
 
 
 def paths_of(video: _Path | Sequence[_Path]) -> list[Path]:
@@ -156,7 +162,9 @@ def read_inputs(
     _check_one_camera(videos, found, options)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
-    notes = (*hints, *((warning,) if warning is not None else ()))
+    said = [(doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
+    doubts = _with_names(videos, [[note for note in own if note is not None] for own in said])
+    notes = (*hints, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
     if options.masks.mask_path is None:
         return inputs

@@ -25,11 +25,13 @@ class ImagePositions:
         gravity: float64 [num_images, 3] direction of gravity in axes of the camera, see
             `Positions`; NaN where unknown.
         place: the one position of a whole video; None: none is said, or there are others.
+        warnings: what the user should know of them.
     """
 
     places: NDArray[np.float64]
     gravity: NDArray[np.float64]
     place: tuple[float, float, float] | None
+    warnings: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -54,10 +56,12 @@ def image_positions(
     places = np.full((len(takes.take), 3), np.nan)
     gravity = np.full_like(places, np.nan)
     one: list[tuple[float, float, float]] = []
+    notes: list[str] = []
     for number, video in enumerate(videos):
         found = read_positions(video)
         if found is None:
             continue
+        notes += [found.left_out] if found.left_out is not None else []
         one += [found.place] if found.place is not None else []
         if not (len(found.times) or len(found.gravity_times)):
             continue
@@ -72,7 +76,7 @@ def image_positions(
         if photo.place is not None and are_places(np.array([photo.place]))[0]:
             places[index] = photo.place
     no_path = not np.isfinite(places).any() and one
-    return ImagePositions(places, gravity, one[0] if no_path else None)
+    return ImagePositions(places, gravity, one[0] if no_path else None, tuple(notes))
 
 
 def _times_since_start(video: Video) -> NDArray[np.float64] | None:

@@ -1,4 +1,4 @@
-"""Text files that users write, one entry a line."""
+"""Text files that users write, one entry a line, and texts of files in messages."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from pathlib import Path
 # No list of frames, images or poses comes near it.
 _LARGEST = 1 << 28
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def shown(text: str, most: int = 40) -> str:
+    """The start of a text of a file, for messages: without what would steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text[:most])
 
 
 def read_lines(path: str | os.PathLike[str]) -> list[str]:

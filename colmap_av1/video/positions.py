@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
+from colmap_av1.util.texts import shown
 from colmap_av1.video.container import VideoFile, open_container
 from colmap_av1.video.gpmf import Payload, read_payload
 
@@ -36,6 +37,8 @@ _ALTITUDES = (
     re.compile(rf"\bBAROMETER\s*:\s*({_NUMBER})"),
     re.compile(rf"\bH\s+({_NUMBER})m"),
 )
+# What a subtitle holds that is to say a place.
+_SAYS_PLACE = re.compile(r"\blatitude\b|\bGPS\s*\(")
 # The key that every packet of GoPro's track begins with: PyAV does not name the codec of data.
 _GPMF = b"DEVC"
 # FFmpeg's AVDISCARD_DEFAULT and AVDISCARD_ALL.
@@ -60,6 +63,7 @@ class Positions:
         stream: index of the stream of the video that holds times and places; None: another file
             does, or none.
         first_picture: time in seconds of the video's first picture as players count it.
+        left_out: what is said and cannot be used, in words; None: nothing.
     """
 
     source: str
@@ -70,10 +74,27 @@ class Positions:
     gravity: NDArray[np.float64]
     stream: int | None = None
     first_picture: float = 0.0
+    left_out: str | None = None
+
+
+def doubtful_place(tags: tuple[tuple[str, str], ...]) -> str | None:
+    """The one position that a container says and that can be none, in words; None: there is none.
+
+    Args:
+        tags: names in lower case, and values, of what the container says.
+    """
+    said = dict(tags)
+    text = next((said[tag].strip() for tag in _TAGS if said.get(tag, "").strip()), None)
+    if text is None or _one_place(said) is not None:
+        return None
+    return (
+        f"the container says that it was filmed at '{shown(text)}', which is no place on "
+        "Earth: that is left out"
+    )
 
 
 def read_positions(video: VideoFile) -> Positions | None:
-    """Read the positions of a video; None where nothing says any, or nothing that can be one.
+    """Read the positions of a video; None where nothing says any, or no tag one that can be one.
 
     Raises:
         VideoError: the file cannot be opened.
@@ -84,7 +105,9 @@ def read_positions(video: VideoFile) -> Positions | None:
     if video.has_telemetry:
         with open_container(video.path, apply_edits=True) as container:
             start = _first_picture(video, container)
-            found = _of_data(container, start) or _of_subtitles(container, start)
+            found = _of_data(container, start)
+            if found is None or found.left_out is not None:
+                found = _of_subtitles(container, start) or found
     beside = _file_beside(video.path)
     if found is None and beside is not None:
         with contextlib.suppress(VideoError), open_container(beside) as container:
@@ -198,15 +221,33 @@ def _of_data(container: Any, start: float) -> Positions | None:
     gravity_times, gravity = _spread(payloads, lambda payload: payload.gravity)
     kept = are_places(places)
     held = np.linalg.norm(gravity, axis=1) > 0.5
-    if not kept.any() and not held.any():
+    source = f"the GoPro track of {container.name}"
+    left_out = _left_out(source, places[~kept])
+    if not kept.any() and left_out is None and any(_has_receiver(data) for *_, data in found):
+        left_out = f"{source} holds no position: the receiver had no fix, or the track is damaged"
+    if not kept.any() and not held.any() and left_out is None:
         return None
     return Positions(
-        f"the GoPro track of {container.name}",
+        source,
         *_ascending(times[kept], places[kept]),
         None,
         *_ascending(gravity_times[held], gravity[held]),
         stream=found[0][0],
+        left_out=left_out,
     )
+
+
+def _has_receiver(payload: bytes) -> bool:
+    """Whether a packet of GoPro's is to hold positions, or what is said of their fix."""
+    return any(key in payload for key in (b"GPS5", b"GPS9", b"GPSF"))
+
+
+def _left_out(source: str, refused: NDArray[np.float64], unreadable: int = 0) -> str | None:
+    """What is said of positions [n, 3] that can be none; those of no fix go without saying."""
+    count = int((np.nan_to_num(refused[:, :2]) != 0).any(axis=1).sum()) + unreadable
+    if count == 0:
+        return None
+    return f"{source}: {count} of its positions can be none on Earth: they are left out"
 
 
 def _spread(
@@ -227,19 +268,21 @@ def _spread(
 def _of_subtitles(container: Any, start: float) -> Positions | None:
     """The positions in DJI's subtitles."""
     for stream in container.streams.subtitles:
-        found = [
-            (time - start, place)
+        texts = [
+            (time - start, data.decode("utf-8", "replace"))
             for _, time, _, data in _packets(container, [stream])
-            if (place := _place_in(data.decode("utf-8", "replace"))) is not None
         ]
+        found = [(time, place) for time, text in texts if (place := _place_in(text)) is not None]
         places = np.array([place for _, place in found]).reshape(-1, 3)
         kept = are_places(places)
-        if kept.any():
+        source = f"the subtitles of {container.name}"
+        unreadable = sum(_SAYS_PLACE.search(text) is not None for _, text in texts) - len(found)
+        left_out = _left_out(source, places[~kept], unreadable)
+        if kept.any() or left_out is not None:
             times = np.array([time for time, _ in found])
             nothing = np.empty(0), np.empty((0, 3))
-            source = f"the subtitles of {container.name}"
             own = _ascending(times[kept], places[kept])
-            return Positions(source, *own, None, *nothing, stream=stream.index)
+            return Positions(source, *own, None, *nothing, stream=stream.index, left_out=left_out)
     return None
 
 

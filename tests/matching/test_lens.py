@@ -10,7 +10,7 @@ from conftest import Ffmpeg
 from colmap_av1 import CameraOptions, MatchOptions, match
 from colmap_av1.database.reading import read_cameras
 from colmap_av1.matching.image_matches import Shape, _focal_length_of
-from colmap_av1.video.lens import said_focal_length
+from colmap_av1.video.lens import doubtful_lens, said_focal_length
 
 TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -23,6 +23,23 @@ def test_equivalent_of_film(said: str, focal_length: float | None) -> None:
     found = said_focal_length(((TAG, said),), (1920, 1080))
     assert found == (None if focal_length is None else pytest.approx(focal_length, abs=0.1))
     assert said_focal_length((("comment", said),), (1920, 1080)) is None
+
+
+@pytest.mark.parametrize("said", ["0", "10000", "-26", "wide\x1b[2J"])
+def test_a_focal_length_of_no_lens_is_told(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, said: str
+) -> None:
+    assert doubtful_lens(((TAG, "26"),)) is None
+    assert doubtful_lens((("comment", said),)) is None
+    tags = ["-metadata", f"{TAG}={said}", "-metadata", "location=+95.0000+018.0686/"]
+    how = ["-i", clip, "-c", "copy", "-movflags", "use_metadata_tags", *tags]
+    report = match(tmp_path / "a.db", ffmpeg(*how, tmp_path / "phone.mp4"))
+    place, lens = report.warnings
+    assert "filmed at '+95.0000+018.0686/', which is no place on Earth" in place
+    assert f"a focal length of '{said[:4]}" in lens
+    assert lens.isprintable()
+    (camera,) = read_cameras(tmp_path / "a.db").values()
+    assert not camera.has_prior_focal_length
 
 
 def test_which_of_both_wins() -> None:

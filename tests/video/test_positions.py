@@ -18,7 +18,7 @@ from colmap_av1.images.takes import count_through
 from colmap_av1.video.container import read_file
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.gpmf import read_payload
-from colmap_av1.video.positions import Positions, read_positions
+from colmap_av1.video.positions import Positions, doubtful_place, read_positions
 
 PLACES = np.array([[59.33 + k * 1e-5, 18.07 - k * 2e-5, 20 + k * 0.1] for k in range(10)])
 
@@ -57,6 +57,68 @@ def test_no_position_that_can_be_one(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path,
     words.append(f"com.apple.quicktime.location.ISO6709={said}")
     path = ffmpeg("-i", clip, "-c", "copy", *words, tmp_path / "phone.mp4")
     assert read_positions(read_file(path)) is None
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ("+95.0000+218.0686/", "at '+95.0000+218.0686/', which is no place on Earth"),
+        ("+00.0000+000.0000/", "no place on Earth"),
+        ("at home\x1b[2J" + 60 * "!", "at 'at home?[2J!!!"),
+        ("-33.8568+151.2153/", None),
+        ("", None),
+    ],
+)
+def test_a_place_that_is_none_is_told(said: str, why: str | None) -> None:
+    told = doubtful_place((("com.apple.quicktime.location.iso6709", said),))
+    if why is None:
+        assert told is None
+        return
+    assert told is not None
+    assert why in told
+    assert told.isprintable()
+    assert len(told) < 140
+
+
+def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) -> None:
+    wrong, no_fix = PLACES + np.array([40.0, 0, 0]), PLACES * [0, 0, 1]
+    payload = gps5(PLACES)
+    video = tmp_path / "DJI_0001.mp4"
+    shutil.copyfile(clip, video)
+    beside = video.with_suffix(".srt")
+
+    def of_gopro(body: bytes) -> tuple[int, str | None]:
+        found = read_positions(read_file(with_gpmf(clip, tmp_path / "gopro.mp4", [(0.6, body)])))
+        return (len(found.times), found.left_out) if found is not None else (0, None)
+
+    def of_drone(text: str) -> tuple[int, str | None]:
+        beside.write_text(text)
+        found = read_positions(read_file(video))
+        return (len(found.times), found.left_out) if found is not None else (0, None)
+
+    count, told = of_gopro(gps5(np.vstack([PLACES, wrong[:3]])))
+    assert count == len(PLACES)
+    assert told is not None
+    assert told.endswith("gopro.mp4: 3 of its positions can be none on Earth: they are left out")
+    for body in (gps5(no_fix), gps5(PLACES, fix=0), payload[:100]):
+        count, told = of_gopro(body)
+        assert count == 0
+        assert told is not None
+        assert told.endswith("holds no position: the receiver had no fix, or the track is damaged")
+    assert of_gopro(grav(np.eye(3))) == (0, None)
+
+    count, told = of_drone(dji_text(np.vstack([PLACES, wrong[:2]]), 25))
+    assert count == len(PLACES)
+    assert told is not None
+    assert "2 of its positions can be none on Earth" in told
+    stamp = "1\n00:00:00,000 --> 00:00:01,000\n"
+    count, told = of_drone(f"{stamp}[latitude: abc] [longitude: ] GPS(--,nan,1e999)\n\n")
+    assert count == 0
+    assert told is not None
+    assert "1 of its positions can be none on Earth" in told
+    # Without a fix, and subtitles of another kind.
+    assert of_drone(dji_text(no_fix, 25)) == (0, None)
+    assert of_drone(f"{stamp}Hello there\n\n") == (0, None)
 
 
 def test_subtitles_beside_a_video_and_in_it(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
