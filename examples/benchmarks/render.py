@@ -500,22 +500,45 @@ def rolling_shutter(rows: list[Row]) -> str:
 
 
 def movers(rows: list[Row]) -> str:
-    """Models of a scene that people walk through."""
-    columns = [
-        words("people cover", "people"),
-        words("`--moving`", "moving"),
-        figure("images", "registered", ".0f"),
-        figure("ATE", "ate_mm", ".2f", " mm"),
-        figure("least", "ate_mm_least", ".2f"),
-        figure("largest", "ate_mm_most", ".2f"),
-        figure("points", "points", ",.0f"),
-        figure("on people", "points_on_people", ".2%"),
-        figure("IoU of masks", "iou", ".2f"),
-        figure("of people", "covered", ".1%"),
-        figure("of what stands still", "static_lost", ".1%"),
-        figure("CPU s", "cpu_s", ".1f"),
-    ]
-    return f"{markdown(columns, rows, left=2)}\n{measured_at(rows, 'people')}"
+    """Models of a scene that people walk through: means over encodings, and the range of ATE."""
+    of_cases: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        of_cases.setdefault((row["people"], row["moving"]), []).append(row)
+    cases = list(of_cases.values())
+    without = min(mean(own, "ate_mm") for own in cases if own[0]["people"] == "0%")
+
+    def average(name: str, spelling: str, unit: str = "") -> list[str]:
+        return [f"{mean(own, name):{spelling}}{unit}" if own[0].get(name) else "-" for own in cases]
+
+    def spread(own: list[Row]) -> str:
+        ate = [float(row["ate_mm"]) for row in own]
+        return f"{min(ate):.2f} to {max(ate):.2f} mm"
+
+    cells = {
+        "people cover": [own[0]["people"] for own in cases],
+        "`--moving`": [own[0]["moving"] for own in cases],
+        "encodings": [str(len(own)) for own in cases],
+        "images": average("registered", ".0f"),
+        "ATE": average("ate_mm", ".2f", " mm"),
+        "of that without": [f"{mean(own, 'ate_mm') / without:.2f}" for own in cases],
+        "ATE from, to": [spread(own) for own in cases],
+        "points": average("points", ",.0f"),
+        "on people": average("points_on_people", ".2%"),
+        "IoU of masks": average("iou", ".2f"),
+        "of people": average("covered", ".1%"),
+        "of what stands still": average("static_lost", ".1%"),
+        "CPU s": average("cpu_s", ".1f"),
+    }
+    made = [dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True)]
+    return (
+        f"{markdown([words(heading, heading) for heading in cells], made, left=2)}\n"
+        f"{measured_at(rows, 'people')}"
+    )
+
+
+def mean(rows: list[Row], name: str) -> float:
+    """The mean of a figure."""
+    return sum(float(row[name]) for row in rows) / len(rows)
 
 
 def loops(rows: list[Row]) -> str:
