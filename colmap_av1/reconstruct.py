@@ -211,9 +211,10 @@ def _run_stages(run: Run) -> ReconstructReport:
     run = replace(run, positions=positions)
     kept = {stage_of_video(run, video): tracked[video] for video in numbers}
     posed = mended_poses(run, videos, takes, tracked)
+    del videos  # as large as the tracks that the poses agree with
     kept |= posed.stages
     kept |= written_model(run, posed, takes)
-    further, unplaced = further_models(run, videos, posed, takes)
+    further, unplaced = further_models(run, posed, takes)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
     facts = {"moving": None} | facts
     facts |= {"num_images": len(takes.take), "masked": takes.masked}

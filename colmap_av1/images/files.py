@@ -226,7 +226,11 @@ def write_images(
         video = read_video(video, operating_point)
         with unchanged(video.state):
             decoded = decode_frames(
-                video, operating_point=operating_point, num_threads=num_threads, display=display
+                video,
+                operating_point=operating_point,
+                num_threads=num_threads,
+                display=display,
+                wanted=wanted,
             )
             with contextlib.closing(decoded):
                 _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)

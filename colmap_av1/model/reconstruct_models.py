@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from colmap_av1.model.placing.stage import place_stage
 from colmap_av1.model.reconstruct_model import model_stage
 from colmap_av1.model.reconstruct_posed import Posed, believed_tracks, refined_poses
 from colmap_av1.model.reconstruct_poses import read_posed_images
-from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, VideoTracks
+from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
 from colmap_av1.tracks.tracks import join_tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, run_stage
@@ -59,9 +58,7 @@ def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
     return {"place": placed, "model": model_stage(run, tracks, takes, posed.moving, placed)}
 
 
-def further_models(
-    run: Run, videos: Sequence[VideoTracks], first: Posed, takes: Takes
-) -> tuple[tuple[FurtherModel, ...], int]:
+def further_models(run: Run, first: Posed, takes: Takes) -> tuple[tuple[FurtherModel, ...], int]:
     """Write the models of images that nothing connects with those of the first.
 
     Images may be in two of them, undistorted by other intrinsics: hence a folder each.
@@ -81,6 +78,7 @@ def further_models(
         own = _run_of_model(run, len(found) + 1)
         stages = {"poses": _poses_of_model(run, own, mapped, poses)}
         some, key = _named(takes, known | left), _named(keyed, known)
+        videos = [read_tracks(run, video) for video in range(len(run.sources))]
         posed = refined_poses(own, stages, believed_tracks(run, videos, takes), some, key)
         images = [image.name for image in read_posed_images(own, posed.last, takes).images]
         left -= set(images)

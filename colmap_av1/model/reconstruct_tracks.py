@@ -50,6 +50,8 @@ from colmap_av1.video.unchanged import FileState, check_unchanged
 LEAST_IMAGES = 3
 # Frames that the images of a long video are chosen among, to one of these, at least.
 _CANDIDATES = 2
+# Width in pixels of the squares that tracks start in which they are chosen by.
+_SEEDING = 8
 # Of its images, that see a track at least.
 _FEWEST_SEEN = 2
 
@@ -231,8 +233,9 @@ def _images_of_long_video(run: Run, video: int) -> ChosenImages | None:
     step = max(1, num_frames // (_CANDIDATES * most))
     candidates = np.arange(0, num_frames, step, dtype=np.int32)
     with run.clock.measure("choice"):
-        # Tracks that poses come from are enough, and take a third of the time.
-        options = replace(run.options.match, refine=RefineOptions())
+        # A quarter of the tracks that poses come from is enough: no more are held of all frames.
+        chaining = replace(run.options.match.tracks, seeding=_SEEDING)
+        options = replace(run.options.match, tracks=chaining, refine=RefineOptions())
         tracked = _track(run, video, options, frames=candidates, clock=Clock())
         tracks = tracked.tracks
         candidates = candidates[candidates < tracks.num_frames]

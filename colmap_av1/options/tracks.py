@@ -91,8 +91,9 @@ class TrackOptions(Options):
     seeding: int = option(
         4,
         "width in pixels of the squares of a frame in which a track is started where they hold "
-        "none, not less than cell. Motion is coded for squares of 4",
-        among=_CELLS,
+        "none, not less than cell. Motion is coded for squares of 4; of 8, tracks are a quarter as "
+        "many",
+        among=(8, *_CELLS),
         unit="pixels",
     )
 

@@ -331,14 +331,15 @@ class _Templates:
     ) -> None:
         """Make the picture around positions the tracks' templates, where there is texture."""
         self.drop(track)
+        if len(track) == 0:
+            return
         half = self.tile // 2
         corner = np.floor(xy).astype(np.int64) - half
         last = np.array(image.shape[::-1]) - self.tile
-        softness, contrast = _texture(image, self.tile - 2 * _MARGIN)
         centre = np.clip(corner + half, 0, np.array(image.shape[::-1]) - 1)
-        soft = softness[centre[:, 1], centre[:, 0]]
-        usable = ((corner >= 0) & (corner <= last)).all(axis=1) & (soft <= _MAX_SOFTNESS)
-        track, xy, corner, centre = track[usable], xy[usable], corner[usable], centre[usable]
+        softness, contrast = _texture_at(image, centre, self.tile - 2 * _MARGIN)
+        usable = ((corner >= 0) & (corner <= last)).all(axis=1) & (softness <= _MAX_SOFTNESS)
+        track, xy, corner = track[usable], xy[usable], corner[usable]
         self.num_free -= len(track)
         slot = self.free[self.num_free : self.num_free + len(track)]
         left = self.tile * (slot % self.columns)
@@ -349,9 +350,24 @@ class _Templates:
         )
         self.slot[track] = slot
         self.point[track] = np.stack([left, top], axis=1) + (xy - corner) - 0.5
-        self.softness[track] = softness[centre[:, 1], centre[:, 0]]
-        self.contrast[track] = contrast[centre[:, 1], centre[:, 0]]
+        self.softness[track] = softness[usable]
+        self.contrast[track] = contrast[usable]
         self.misses[track] = 0
+
+
+def _texture_at(
+    image: NDArray[np.uint8], at: NDArray[np.int64], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The texture, see `_texture`, around some pixels (x, y) [n, 2] of a picture."""
+    width = 2 * (window + 1) + 1  # two windows, one around every pixel of the other, and a gradient
+    if len(at) * width**2 >= image.size:
+        softness, contrast = _texture(image, window)
+        return softness[at[:, 1], at[:, 0]], contrast[at[:, 1], at[:, 0]]
+    # Patches below each other, as one picture.
+    framed = np.pad(image, width // 2, mode="reflect")
+    patches = np.lib.stride_tricks.sliding_window_view(framed, (width, width))
+    softness, contrast = _texture(patches[at[:, 1], at[:, 0]].reshape(-1, width), window)
+    return softness[width // 2 :: width, width // 2], contrast[width // 2 :: width, width // 2]
 
 
 def _texture(

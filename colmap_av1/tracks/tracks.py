@@ -315,13 +315,14 @@ def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
     """The tracks in pictures that are scaled to another (width, height) in pixels."""
     if size == (tracks.width, tracks.height):
         return tracks
-    factor = np.array([size[0] / tracks.width, size[1] / tracks.height])
+    # All in numbers of four bytes: the arrays are the largest of a whole run.
+    factor = np.array([size[0] / tracks.width, size[1] / tracks.height], np.float32)
     return replace(
         tracks,
         width=size[0],
         height=size[1],
-        xy=(tracks.xy * factor).astype(np.float32),
-        sigma=(tracks.sigma * math.sqrt(float(factor.prod()))).astype(np.float32),
+        xy=tracks.xy * factor,
+        sigma=tracks.sigma * np.float32(math.sqrt(float(factor.prod()))),
     )
 
 

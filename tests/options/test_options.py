@@ -106,7 +106,7 @@ REFUSED: list[tuple[type, dict[str, Any], str]] = [
     (TrackOptions, {"interpolation": -1.0}, "interpolation is -1.0"),
     (TrackOptions, {"bridge": -1.0}, "bridge is -1.0"),
     (TrackOptions, {"cell": 3}, "cell is 3: give 4, 2 or 1 pixels, or None"),
-    (TrackOptions, {"seeding": 8}, "seeding is 8: give 4, 2 or 1 pixels"),
+    (TrackOptions, {"seeding": 3}, "seeding is 3: give 8, 4, 2 or 1 pixels"),
     (TrackOptions, {"seeding": 2, "cell": 4}, "seeding is 2, below cell 4"),
     (RefineOptions, {"refine": "sift"}, "refine is 'sift': give none, lk"),
     (RefineOptions, {"refine_window": 8}, "refine_window is 8: give an odd number from 5 to 101"),

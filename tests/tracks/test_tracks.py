@@ -533,7 +533,9 @@ def test_squares_are_not_larger_than_those_of_seeding() -> None:
     assert len(fine.offsets) > 3 * len(build_tracks(frames, OPEN).offsets)
 
 
-@pytest.mark.parametrize(("cell", "seeding"), [(4, 4), (2, 4), (1, 4), (2, 2), (1, 2), (1, 1)])
+@pytest.mark.parametrize(
+    ("cell", "seeding"), [(4, 8), (1, 8), (4, 4), (2, 4), (1, 4), (2, 2), (1, 2), (1, 1)]
+)
 def test_a_track_starts_in_every_empty_square(cell: int, seeding: int) -> None:
     steps = [(1.0, 0.5)] * 3
     options = replace(OPEN, min_length=1, cell=cell, seeding=seeding)

@@ -14,8 +14,10 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
       chainer_(options, grid_),
       store_(options.min_length, options.observed) {
   const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
-  if (!is_part(options.cells) || !is_part(options.seeding) || options.seeding > options.cells) {
-    throw std::invalid_argument("cells and seeding are 1, 2 or 4, seeding not above cells");
+  const int size = options.seeding;
+  if (!is_part(options.cells) || !(is_part(size) || size == 2 * options.cells) ||
+      size > 2 * options.cells) {
+    throw std::invalid_argument("cells are 1, 2 or 4, seeding one of these, to twice as many");
   }
 }
 
@@ -114,8 +116,9 @@ void TrackBuilder::seed(ChainedFrame& frame) const {
   const int size = options_.seeding;
   const float half = grid_.half_cell * static_cast<float>(size);
   const auto is_empty = [&](int row, int col) {
-    for (int r = row; r < row + size; ++r) {
-      for (int c = col; c < col + size; ++c) {
+    // Squares larger than a unit may reach beyond the frame.
+    for (int r = row; r < std::min(row + size, frame.cell_rows); ++r) {
+      for (int c = col; c < std::min(col + size, frame.cell_cols); ++c) {
         if (frame.cells[r * frame.cell_cols + c].track != kNoTrack) return false;
       }
     }

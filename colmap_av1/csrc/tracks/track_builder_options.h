@@ -22,7 +22,8 @@ struct TrackBuilderOptions {
   std::optional<double> interpolation;
   std::optional<double> bridge;
   int cells = 1;    // along either side of a unit
-  int seeding = 1;  // along either side of a square of them that a track starts in; divides cells
+  // Along either side of a square of them that a track starts in; divides cells, or twice as many.
+  int seeding = 1;
   // Display indices of the frames whose observations are kept; without a value those of all.
   std::optional<std::vector<std::int32_t>> observed;
 

@@ -89,6 +89,7 @@ def _adjust(settings: dict[str, Any]) -> None:
     options.refine_extra_params = settings["refine_intrinsics"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = settings["loss_scale"]
+    options.ceres.max_num_images_direct_dense_cpu_solver = settings["most_dense_images"]
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]
