@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.options import RefineOptions
+from colmap_av1.tracks.texture import texture_at
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 # Pixels around a template's window: one for its gradients, two for the way back.
@@ -337,7 +338,7 @@ class _Templates:
         corner = np.floor(xy).astype(np.int64) - half
         last = np.array(image.shape[::-1]) - self.tile
         centre = np.clip(corner + half, 0, np.array(image.shape[::-1]) - 1)
-        softness, contrast = _texture_at(image, centre, self.tile - 2 * _MARGIN)
+        softness, contrast = texture_at(image, centre, self.tile - 2 * _MARGIN)
         usable = ((corner >= 0) & (corner <= last)).all(axis=1) & (softness <= _MAX_SOFTNESS)
         track, xy, corner = track[usable], xy[usable], corner[usable]
         self.num_free -= len(track)
@@ -353,59 +354,6 @@ class _Templates:
         self.softness[track] = softness[usable]
         self.contrast[track] = contrast[usable]
         self.misses[track] = 0
-
-
-def _texture_at(
-    image: NDArray[np.uint8], at: NDArray[np.int64], window: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The texture, see `_texture`, around some pixels (x, y) [n, 2] of a picture."""
-    width = 2 * (window + 1) + 1  # two windows, one around every pixel of the other, and a gradient
-    if len(at) * width**2 >= image.size:
-        softness, contrast = _texture(image, window)
-        return softness[at[:, 1], at[:, 0]], contrast[at[:, 1], at[:, 0]]
-    # Patches below each other, as one picture.
-    framed = np.pad(image, width // 2, mode="reflect")
-    patches = np.lib.stride_tricks.sliding_window_view(framed, (width, width))
-    softness, contrast = _texture(patches[at[:, 1], at[:, 0]].reshape(-1, width), window)
-    return softness[width // 2 :: width, width // 2], contrast[width // 2 :: width, width // 2]
-
-
-def _texture(
-    image: NDArray[np.uint8], window: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The texture of the window around every pixel.
-
-    Returns:
-        float32 [height, width] standard deviation in pixels of a match in the worst direction
-        where every pixel has a noise of one grey level, and mean deviation in grey levels.
-    """
-    grey = image.astype(np.float32)
-    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-    size = (window, window)
-    # In place: new memory for arrays of large pictures takes longer than what is done in it.
-    product = np.multiply(dx, dy)
-    xy = cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)
-    xx = cv2.boxFilter(np.multiply(dx, dx, out=product), cv2.CV_32F, size, dx, normalize=False)
-    yy = cv2.boxFilter(np.multiply(dy, dy, out=product), cv2.CV_32F, size, dy, normalize=False)
-    # The smaller eigenvalue: (xx + yy - sqrt((xx - yy)^2 + 4 xy^2)) / 2.
-    root = np.subtract(xx, yy, out=product)
-    root *= root
-    xy *= xy
-    xy *= 4
-    root += xy
-    np.sqrt(root, out=root)
-    xx += yy
-    xx -= root
-    xx *= 0.5
-    np.maximum(xx, 1e-6, out=xx)
-    np.sqrt(xx, out=xx)
-    softness = np.divide(1, xx, out=xx)
-    mean = cv2.boxFilter(grey, cv2.CV_32F, size)
-    np.subtract(grey, mean, out=mean)
-    np.abs(mean, out=mean)
-    contrast = cv2.boxFilter(mean, cv2.CV_32F, size)
-    return np.asarray(softness, np.float32), np.asarray(contrast, np.float32)
 
 
 @dataclass(frozen=True)

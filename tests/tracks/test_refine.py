@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import RefineOptions
-from colmap_av1.tracks.refine import _texture, _texture_at, refine_tracks
+from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.refine_spread import refine_spread_tracks
+from colmap_av1.tracks.texture import texture_at, texture_of
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.video.decoding import decode_frames
 
@@ -246,6 +247,6 @@ def test_texture_of_some_windows_is_that_of_the_whole_picture() -> None:
     at = np.random.default_rng(3).integers(9, (160 - 9, 120 - 9), (12, 2))
     for some in (at, np.repeat(at, 3, axis=0)):  # the latter in the whole picture, in less time
         for found, of_all in zip(
-            _texture_at(picture, some, 15), _texture(picture, 15), strict=True
+            texture_at(picture, some, 15), texture_of(picture, 15), strict=True
         ):
             np.testing.assert_allclose(found, of_all[some[:, 1], some[:, 0]], rtol=1e-4)
