@@ -21,8 +21,8 @@ from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
-# Poses that are nearly right need no more steps: those after the seventh or eighth lower the error by
-# less than a thousandth each, and bring cameras no nearer to their true places.
+# Poses that are nearly right need no more steps: those after the seventh or eighth lower the error
+# by less than a thousandth each, and bring cameras no nearer to their true places.
 _ADJUSTMENT_STEPS = 20
 _ADJUSTMENT_TOLERANCE = 1e-3
 # Images up to which the matrix of all cameras is taken as dense: tracks of many images fill it, and
