@@ -535,10 +535,17 @@ def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:
     assert any("the camera only rotates or the scene is flat" in w for w in report.warnings)
 
 
-def test_camera_that_stands_still(encode: Encode, tmp_path: Path) -> None:
+@pytest.mark.parametrize("walker", [False, True])
+def test_camera_that_stands_still(encode: Encode, tmp_path: Path, walker: bool) -> None:
+    """Somebody who walks past is no motion of the camera."""
     rng = np.random.default_rng(5)
     wall = cv2.resize(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8), (320, 240))
-    video = encode(np.stack([wall] * 8), tmp_path / "still.mp4")
+    frames = np.stack([wall] * 8)
+    if walker:
+        coat = cv2.resize(rng.integers(0, 256, (40, 20, 3), dtype=np.uint8), (60, 120))
+        for i, frame in enumerate(frames):
+            frame[60:180, 40 + 9 * i : 100 + 9 * i] = coat
+    video = encode(frames, tmp_path / "still.mp4")
     with pytest.raises(ModelError, match=r"finds no initial pair: too little parallax, in \d+ of"):
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import Ffmpeg
 
+from colmap_av1 import match
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.info import inspect
 from colmap_av1.video.container import packets, read_file
@@ -33,6 +34,32 @@ def test_a_video_stands_for_its_path(clip: Path) -> None:
     times = frame_times(video)
     assert times is not None
     assert times.tolist() == [p.pts for p in packets(video)]
+
+
+@pytest.mark.parametrize("said", [0, 1, 0xFFFFFFF0])
+def test_a_container_that_lies_about_its_duration(clip: Path, tmp_path: Path, said: int) -> None:
+    data = bytearray(clip.read_bytes())
+    for box in (b"mvhd", b"mdhd", b"tkhd"):
+        at = data.index(box) + 4 + (20 if box == b"tkhd" else 16)  # ISO/IEC 14496-12, version 0
+        data[at : at + 4] = said.to_bytes(4, "big")
+    path = tmp_path / "lies.mp4"
+    path.write_bytes(data)
+    true, lies = (frame_times(read_video(own)) for own in (clip, path))
+    assert true is not None
+    assert lies is not None
+    assert lies.tolist() == true.tolist()
+    assert inspect(path).num_shown == inspect(clip).num_shown == 16
+
+
+@pytest.mark.parametrize("rate", ["0.025", "100000"])
+def test_a_container_that_lies_about_its_rate(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, rate: str
+) -> None:
+    scale = str(25 / float(rate))
+    path = ffmpeg("-itsscale", scale, "-i", clip, "-c", "copy", tmp_path / "lies.mp4")
+    assert inspect(path).num_shown == 16
+    true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
+    assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
 
 
 def test_a_video_is_as_it_was_when_opened(clip: Path, tmp_path: Path) -> None:
