@@ -18,6 +18,7 @@ from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
+from colmap_av1.model.agreement.crossings import model_crossings
 from colmap_av1.model.agreement.far_views import FarViews, model_far_views
 from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import MODEL_FILES, posed_images, read_model
@@ -143,7 +144,7 @@ def map_database(
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
     missing = _missing(num_images, num_registered)
-    warnings = [*placement.warnings, missing, model_joints(model).warning]
+    warnings = [*placement.warnings, missing, *_about_joints(model, database)]
     far_views: FarViews | None = None
     try:
         with clock.measure("far views"):
@@ -163,6 +164,11 @@ def map_database(
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )
+
+
+def _about_joints(model: Any, database: Path) -> tuple[str | None, str | None]:
+    """What the user should know of a model whose parts hardly hold together, or wrongly."""
+    return model_joints(model).warning, model_crossings(model, database).warning
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:

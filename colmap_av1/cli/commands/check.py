@@ -11,6 +11,7 @@ from colmap_av1.cli.reports import check_rows, model_rows
 from colmap_av1.cli.terminal import progress_bars
 from colmap_av1.database.check import check
 from colmap_av1.errors import OptionError
+from colmap_av1.model.agreement.crossings import model_crossings
 from colmap_av1.model.agreement.far_views import model_far_views
 from colmap_av1.model.agreement.joints import model_joints
 from colmap_av1.model.colmap_model import read_model
@@ -33,7 +34,8 @@ def add_check(commands: Any) -> None:
         "--model",
         "--model_path",
         metavar="PATH",
-        help="folder of a COLMAP model: pictures of places seen again are held against its poses",
+        help="folder of a COLMAP model: pictures of places seen again are held against its poses, "
+        "and with --database the matches it was mapped from",
     )
     add_images(command, "folder of the model's images")
     command.add_argument(
@@ -65,7 +67,9 @@ def _check_model(namespace: argparse.Namespace) -> bool:
     model = read_model(namespace.model)
     with progress_bars(namespace.quiet) as report:
         far_views = model_far_views(model, Path(namespace.image_path), report)
-    told = (far_views.warning, model_joints(model).warning)
+    told = [far_views.warning, model_joints(model).warning]
+    if namespace.database is not None:
+        told.append(model_crossings(model, Path(namespace.database)).warning)
     warnings = tuple(warning for warning in told if warning is not None)
     print_result(namespace, model_rows(model_figures(model), far_views), warnings)
     return not warnings
