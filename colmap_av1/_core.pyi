@@ -89,6 +89,14 @@ def select_spread(
     min_length: int,
 ) -> NDArray[np.uint8]: ...
 def displacement(frame: FrameMotion, list_index: int) -> NDArray[np.float32]: ...
+def correlate_patches(
+    one: NDArray[np.uint8],
+    at_one: NDArray[np.float32],
+    two: NDArray[np.uint8],
+    at_two: NDArray[np.float32],
+    *,
+    min_deviation: float,
+) -> NDArray[np.float32]: ...
 def triangulate(
     *,
     cam_from_world: NDArray[np.float64],

@@ -39,6 +39,7 @@ from colmap_av1.model.track_points import (
     cloud_of,
     mean_error,
     seen_in,
+    to_model_points,
     triangulate_tracks,
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
@@ -197,8 +198,9 @@ def densify(
         with clock.measure("points"):
             points = _triangulate(seen, view, views, options, progress)
         agreeing = _agreement(model, points)
+        of_tracks = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
         cloud = _coloured_cloud(
-            *(points, seen, view, views, pictures),
+            *(of_tracks, views, takes.take, pictures),
             options=options,
             clock=clock,
             progress=progress,
@@ -207,7 +209,6 @@ def densify(
         covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
         _write(output, cameras, images, cloud, overwrite)
-    wanted = _write_gaussians(gaussians, cloud, views, clock)
     return DensifyReport(
         output=output,
         model=model,
@@ -221,7 +222,7 @@ def densify(
         coverage=covered,
         model_coverage=coverage_of_model(reconstruction),
         mean_error=mean_error(cloud),
-        gaussians=wanted,
+        gaussians=_write_gaussians(gaussians, cloud, views, clock),
         seconds=clock.seconds,
         warnings=(*inputs.warnings, *inputs.with_names([own.warnings for own in tracked])),
     )
@@ -269,20 +270,23 @@ def _triangulate(
 
 
 def _coloured_cloud(
-    points: TriangulatedPoints,
-    seen: Tracks,
-    view: NDArray[np.int64],
+    tracked: ModelPoints,
     views: Sequence[PosedCamera],
+    take: NDArray[np.int32],
     pictures: Pictures,
     *,
     options: DensifyOptions,
     clock: Clock,
     progress: Progress,
 ) -> ModelPoints:
-    """Those of the points that are written, in the colours of the pictures."""
-    with clock.measure("cloud"):
-        xy = seen.xy[points.observation].astype(np.float64)
-        cloud = cloud_of(points, view, xy, views, options.triangulate)
+    """The points that are written, in the colours of the pictures."""
+    cloud = cloud_of(
+        *(tracked, views, take, pictures(list(range(len(views))))),
+        options=options.triangulate,
+        num_threads=options.match.run.num_threads,
+        clock=clock,
+        progress=progress,
+    )
     with clock.measure("colours"):
         colours = Colours(cloud, [own.size for own in views])
         for done, (image, picture) in enumerate(pictures(list(range(len(views)))), start=1):

@@ -51,18 +51,20 @@ def errors(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def test_points_lie_on_the_surfaces(dense: Path) -> None:
-    """Those of tracks, and those that fill holes, as shares of the distance from the cameras."""
+    """Those of tracks and of pictures, and those that fill holes, as shares of the distance."""
     model = pycolmap.Reconstruction(dense)
     xyz = point_cloud(model)
     centres = np.array([model.images[i].projection_center() for i in sorted(model.images)])
     away = np.linalg.norm(xyz[:, None] - centres[None, ::5], axis=2).min(axis=1)
     off = np.abs(render_scene.surface_distance(render_scene.build_scene(), xyz)) / away
-    of_tracks = errors(model) >= 0
-    assert of_tracks.sum() > 10_000
-    assert 20 < (~of_tracks).sum() < 0.1 * len(xyz)
-    assert np.median(off[of_tracks]) < 0.005
-    assert np.quantile(off[of_tracks], 0.95) < 0.1
-    assert np.quantile(off[~of_tracks], 0.9) < 0.1
+    is_seen = errors(model) >= 0
+    assert is_seen.sum() > 10_000
+    assert 20 < (~is_seen).sum() < 0.03 * len(xyz)
+    assert np.median(off[is_seen]) < 0.005
+    assert np.quantile(off[is_seen], 0.95) < 0.1
+    # What is left to fill is what pictures do not tell: few points, so few that are far off.
+    assert np.median(off[~is_seen]) < 0.05
+    assert (off[~is_seen] > 0.1).sum() < 0.003 * len(xyz)
 
 
 def test_no_point_is_nearer_than_the_nearest_surface(dense: Path, truth: Truth) -> None:

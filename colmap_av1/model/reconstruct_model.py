@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from colmap_av1.model.track_points import (
     cloud_of,
     mean_error,
     seen_in,
+    to_model_points,
 )
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.model.undistort import (
@@ -40,6 +41,7 @@ from colmap_av1.model.undistort import (
     undistortion,
 )
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -59,7 +61,11 @@ class _DenseCloud:
 
 
 def _dense_cloud(
-    run: Run, placed: PosedImages, views: list[PosedCamera], seen: Tracks, view: NDArray[np.int64]
+    run: Run,
+    placed: PosedImages,
+    views: list[PosedCamera],
+    seen: Tracks,
+    view: NDArray[np.int64],
 ) -> _DenseCloud:
     options, clock = run.options.triangulate, run.clock
     pinholes = [own.camera for own in views]
@@ -71,11 +77,59 @@ def _dense_cloud(
             progress=run.progress,
         )
         check_agreement(len(points.xyz), points.num_tracks)
-    with clock.measure("cloud"):
-        xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
-        cloud = cloud_of(points, view, xy, views, options)
+    xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
+    cloud = cloud_of(
+        *(to_model_points(points, view, xy), views, placed.take),
+        _pinhole_pictures(run, placed, views),
+        options=options,
+        num_threads=run.options.match.run.num_threads,
+        clock=clock,
+        progress=run.progress,
+    )
     with clock.measure("coverage"):
         return _DenseCloud(points, cloud, coverage(views, cloud.xyz))
+
+
+def _pinhole_pictures(
+    run: Run, placed: PosedImages, views: Sequence[PosedCamera]
+) -> Iterator[tuple[int, _Image]]:
+    """The images of videos with their undistorted pictures, in order."""
+    undistort = _undistortions(placed, views)
+    for video, source in enumerate(run.sources):
+        own = np.flatnonzero(placed.take == video)
+        image_of = dict(
+            zip(
+                (placed.frames[own] - placed.first_frame[video]).tolist(), own.tolist(), strict=True
+            )
+        )
+        if not image_of:
+            continue
+        decoded = decodable_frames(
+            *(source.pictures, max(image_of) + 1, run.options.match),
+            wanted=image_of,
+            use="pictures are compared",
+        )
+        for frame, picture in decoded:
+            yield image_of[frame], undistort(image_of[frame], picture)
+
+
+def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
+    """The undistorted cameras by their ids."""
+    return {int(view.camera.camera_id): view.camera for view in views}
+
+
+def _undistortions(
+    placed: PosedImages, views: Sequence[PosedCamera]
+) -> Callable[[int, _Image], _Image]:
+    """What undistorts the picture of an image, by its index."""
+    pinholes = _pinholes(views)
+    of_camera = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+
+    def undistort(image: int, picture: _Image) -> _Image:
+        how = of_camera[placed.images[image].camera_id]
+        return how(picture) if how is not None else picture
+
+    return undistort
 
 
 def _on_pinholes(
@@ -85,7 +139,7 @@ def _on_pinholes(
     image: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Pixels of observations [n, 2] by images [n] in the undistorted pictures of these."""
-    pinholes = {int(own.camera.camera_id): own.camera for own in views}
+    pinholes = _pinholes(views)
     change = {i: partial(on_pinhole, camera, pinholes[i]) for i, camera in placed.cameras.items()}
     return by_camera(xy, np.array([own.camera_id for own in placed.images]), image, change)
 
@@ -103,8 +157,8 @@ def _write_images(
         How far views from far apart disagree; and the points in colours.
     """
     options, progress = run.options, run.progress
-    pinholes = {int(view.camera.camera_id): view.camera for view in views}
-    undistort = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+    pinholes = _pinholes(views)
+    undistort = _undistortions(placed, views)
     far = FarViewCheck(placed.images, pinholes, lambda image: points_seen(cloud, image))
     colours = Colours(cloud, [view.size for view in views])
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
@@ -112,8 +166,7 @@ def _write_images(
 
     def change(first: int, frame: int, picture: _Image) -> _Image:
         index = index_of_frame[first + frame]
-        how = undistort[placed.images[index].camera_id]
-        shown = how(picture) if how is not None else picture
+        shown = undistort(index, picture)
         colours.add(index, shown)
         far.add(index, shown, views[index].mask)
         return shown

@@ -332,8 +332,7 @@ def _black_points(
     """Points of tracks in the images that have a pose, without colours."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=options)
-    black = np.zeros((len(points.xyz), 3), np.uint8)
-    return to_model_points(points, black, view, seen.xy[points.observation].astype(np.float64))
+    return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
 
 
 @dataclass(frozen=True)

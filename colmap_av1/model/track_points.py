@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import ModelPoints
+from colmap_av1.model.colmap_model import ModelPoints, joined_points
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.splats.cloud import splat_cloud
 from colmap_av1.model.splats.points import splat_points
+from colmap_av1.model.splats.sweep import swept_points
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames
-from colmap_av1.util.progress import Progress
+from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.progress import Clock, Progress, progress_in
 
 _Image = NDArray[np.uint8]
 
@@ -146,18 +148,38 @@ class Colours:
 
 
 def cloud_of(
-    points: TriangulatedPoints,
-    view: NDArray[np.int64],
-    xy: NDArray[np.float64],
+    tracked: ModelPoints,
     images: Sequence[PosedCamera],
+    takes: NDArray[np.int32],
+    pictures: Iterable[tuple[int, _Image]],
+    *,
     options: TriangulateOptions,
+    num_threads: int | None,
+    clock: Clock,
+    progress: Progress,
 ) -> ModelPoints:
-    """The points, of splats those that a trainer needs, in black; `xy` as in `to_model_points`."""
-    black = np.zeros((len(points.xyz), 3), np.uint8)
-    cloud = to_model_points(points, black, view, xy)
+    """The points that are written, in black: of splats those that a trainer needs.
+
+    Args:
+        tracked: points of tracks.
+        images: the images, by the index that observations have.
+        takes: int32 [num_images] the video of each.
+        pictures: of the images, see `swept_points`; not read for a survey.
+        options: which points.
+        num_threads: see `RunOptions`.
+        clock: measures the stages "sweep" and "cloud".
+        progress: called with a stage's name, what is done, and of how much.
+    """
     if options.points == "survey":
-        return cloud
-    return splat_cloud(cloud, images, options.max_points)
+        return tracked
+    with clock.measure("sweep"):
+        swept = swept_points(
+            *(tracked, images, takes, pictures),
+            num_threads=threads_or_cpus(num_threads),
+            progress=progress_in(progress, "sweep", len(images)),
+        )
+    with clock.measure("cloud"):
+        return splat_cloud(joined_points([tracked, swept]), images, options.max_points)
 
 
 def mean_error(cloud: ModelPoints) -> float:
@@ -166,10 +188,10 @@ def mean_error(cloud: ModelPoints) -> float:
 
 
 def to_model_points(
-    points: TriangulatedPoints,
-    rgb: _Image,
-    view: NDArray[np.int64],
-    xy: NDArray[np.float64],
+    points: TriangulatedPoints, view: NDArray[np.int64], xy: NDArray[np.float64]
 ) -> ModelPoints:
-    """The points as a model holds them; `xy` are the pixels of their observations."""
-    return ModelPoints(points.xyz, rgb, points.error, points.offsets, view[points.observation], xy)
+    """The points as a model holds them, in black; `xy` are the pixels of their observations."""
+    black = np.zeros((len(points.xyz), 3), np.uint8)
+    return ModelPoints(
+        points.xyz, black, points.error, points.offsets, view[points.observation], xy
+    )

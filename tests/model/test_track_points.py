@@ -141,10 +141,9 @@ def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
 def test_points_of_a_model_name_the_images_that_see_them() -> None:
     points = make_points([[4, 1], [0, 3, 5]])
     view = np.array([0, 1, 2, 0, 1, 2])
-    rgb = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.uint8)
     xy = np.arange(10.0).reshape(5, 2)
-    made = to_model_points(points, rgb, view, xy)
+    made = to_model_points(points, view, xy)
     assert made.image.tolist() == [1, 1, 0, 0, 2]
     assert made.offsets.tolist() == [0, 2, 5]
-    assert made.rgb is rgb
+    assert made.rgb.tolist() == [[0, 0, 0]] * 2
     assert made.xy is xy

@@ -9,8 +9,10 @@
 #include <cstdint>
 #include <optional>
 #include <utility>
+#include <vector>
 
 #include "bindings/arrays.h"
+#include "model/patches.h"
 #include "model/triangulate.h"
 
 namespace nb = nanobind;
@@ -53,6 +55,31 @@ nb::tuple triangulate(const InputArray<double, nb::shape<-1, 3, 4>>& cam_from_wo
                         points.num_tracks);
 }
 
+using Picture = InputArray<std::uint8_t, nb::ndim<2>>;
+
+model::GreyPicture grey_picture(const Picture& pixels) {
+  return {.pixels = {pixels.data(), pixels.size()},
+          .width = static_cast<std::int64_t>(pixels.shape(1)),
+          .height = static_cast<std::int64_t>(pixels.shape(0))};
+}
+
+nb::object correlate_patches(const Picture& one, const InputArray<float, nb::shape<-1, 2>>& at_one,
+                             const Picture& two,
+                             const InputArray<float, nb::shape<-1, -1, 2>>& at_two,
+                             float min_deviation) {
+  if (at_one.shape(0) != at_two.shape(0)) {
+    throw nb::value_error("at_one and at_two are of different lengths");
+  }
+  std::vector<float> found;
+  {
+    const nb::gil_scoped_release release;
+    found =
+        model::correlate_patches(grey_picture(one), {at_one.data(), at_one.size()},
+                                 grey_picture(two), {at_two.data(), at_two.size()}, min_deviation);
+  }
+  return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
+}
+
 }  // namespace
 
 void bind_model(nb::module_& m) {
@@ -62,6 +89,10 @@ void bind_model(nb::module_& m) {
         "error_to_sigma"_a,
         "Points of the tracks from `first` to before `last`: (xyz, error, count, observation, "
         "num_agreeing, num_tracks).");
+  m.def("correlate_patches", &correlate_patches, "one"_a, "at_one"_a, "two"_a, "at_two"_a,
+        nb::kw_only(), "min_deviation"_a,
+        "Correlations [n, d] of the patches around positions [n, 2] in one grey picture with those "
+        "around positions [n, d, 2] in another.");
 }
 
 }  // namespace colmap_av1
