@@ -315,8 +315,7 @@ def _match_images(
     shares = [own.tracked.inter_share for own in videos]
     paired = []
     for own, share in zip(videos, shares, strict=True):
-        num_tracks = len(own.tracks.offsets) - 1
-        linked_anyway = may_link(share, own.chosen.frames, num_tracks, options.links)
+        linked_anyway = may_link(share, own.chosen.frames, own.tracks, options)
         paired.append(
             pair_images(
                 *(own.source.pictures.path, own.tracks, own.chosen, options),

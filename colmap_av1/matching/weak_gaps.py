@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.options import LinkOptions
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.tracks import Tracks, least_length
 
 # Frames on either side that a frame is compared with.
 _NEIGHBOURS = 8
@@ -60,10 +61,15 @@ def weak_gaps(
 def may_link(
     inter_share: NDArray[np.float32],
     frames: NDArray[np.int32],
-    num_tracks: int,
-    options: LinkOptions,
+    tracks: Tracks,
+    options: MatchOptions,
 ) -> bool:
-    """Whether pictures may connect images that share no track, or show why there is none."""
-    return options.links == "sift" or (
-        options.links == "auto" and (num_tracks == 0 or bool(weak_gaps(inter_share, frames).any()))
+    """Whether pictures may connect images that share no track, or show why there is none.
+
+    A video that is too short for a track needs no pictures to say so.
+    """
+    links = options.links.links
+    lacks_tracks = len(tracks.offsets) == 1 and tracks.num_frames >= least_length(options.tracks)
+    return links == "sift" or (
+        links == "auto" and (lacks_tracks or bool(weak_gaps(inter_share, frames).any()))
     )

@@ -160,8 +160,7 @@ def _paired_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> Pai
             sparse = select_tracks(
                 keep_frames(pose_tracks(run, own.tracks), chosen.frames), density
             )
-        num_tracks = len(sparse.offsets) - 1
-        linked_anyway = may_link(own.inter_share, chosen.frames, num_tracks, options.links)
+        linked_anyway = may_link(own.inter_share, chosen.frames, sparse, options)
         paired.append(
             pair_images(
                 *(run.sources[video].pictures.path, sparse, chosen, options),
