@@ -91,7 +91,8 @@ def test_mp4_does_not_depend_on_what_lies_in_memory(clip: Path, tmp_path: Path) 
         words = [*(sys.executable, "-m", "colmap_av1", "view", "--video", str(clip), "--quiet")]
         # glibc fills memory that is given out with this number.
         environment = os.environ | {"MALLOC_PERTURB_": number}
-        subprocess.run([*words, "--output", str(output)], check=True, env=environment)
+        words += ["--output", str(output)]
+        subprocess.run(words, check=True, env=environment, cwd=tmp_path)
         written.append(output.read_bytes())
     assert written[0] == written[1]
 

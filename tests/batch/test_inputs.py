@@ -174,6 +174,7 @@ def server() -> Iterator[str]:
     threading.Thread(target=web.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{web.server_port}"
     web.shutdown()
+    web.server_close()
 
 
 def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:

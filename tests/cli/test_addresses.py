@@ -36,6 +36,7 @@ def server(clip: Path, tmp_path: Path) -> Iterator[str]:
     threading.Thread(target=web.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{web.server_port}"
     web.shutdown()
+    web.server_close()
 
 
 @pytest.fixture
