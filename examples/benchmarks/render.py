@@ -24,6 +24,10 @@ SPANS = (1, 2, 4, 8, 16)
 LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
 REFERENCE = "sift-exhaustive"
 
+# Ways whose renderings are compared, the one first that the other is held against.
+SPLAT_WAYS = ("SIFT sequential", "reconstruct")
+_QUALITIES = ("psnr_y", "ssim_db", "vmaf")
+
 Row = dict[str, str]
 
 
@@ -558,6 +562,67 @@ def loops(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def splats(rows: list[Row]) -> str:
+    """Renderings of Gaussians trained from both ways' folders, means of the seeds.
+
+    Shares are of the CPU time that SIFT's training takes to its end, until its last figure is
+    reached: between two measurements along the line that joins them.
+    """
+    lines: list[Row] = []
+    for clip in dict.fromkeys(row["clip"] for row in rows):
+        curves = {
+            way: _curves([r for r in rows if (r["clip"], r["way"]) == (clip, way)])
+            for way in SPLAT_WAYS
+        }
+        for way, own in curves.items():
+            if not own:
+                continue
+            line: Row = {"clip": clip, "way": way, "commit": own[-1]["commit"]}
+            line |= {name: own[-1][name] for name in ("gaussians", *_QUALITIES, "machine")}
+            line["points"] = own[0]["gaussians"]
+            for name in ("psnr_y", "vmaf"):
+                line[f"{name}_share"] = _share_of_time(own, curves[SPLAT_WAYS[0]], name)
+            lines.append(line)
+    columns = [
+        words("clip, way", "clip", "way"),
+        figure("points", "points", ",.0f"),
+        figure("PSNR-Y", "psnr_y", ".2f", " dB"),
+        figure("SSIM", "ssim_db", ".2f", " dB"),
+        figure("VMAF", "vmaf", ".1f"),
+        words("SIFT's PSNR-Y after", "psnr_y_share"),
+        words("SIFT's VMAF after", "vmaf_share"),
+    ]
+    return f"{markdown(columns, lines)}\n{measured_at(rows, 'clip')}"
+
+
+def _curves(rows: list[Row]) -> list[Row]:
+    """Means of the seeds at each number of iterations, in order."""
+    counts = sorted({int(row["iterations"]) for row in rows})
+    means: list[Row] = []
+    for count in counts:
+        own = [row for row in rows if int(row["iterations"]) == count]
+        names = ("cpu_s", "gaussians", *_QUALITIES)
+        means.append(own[0] | {name: str(mean(own, name)) for name in names})
+    return means
+
+
+def _share_of_time(own: list[Row], base: list[Row], name: str) -> str:
+    """CPU time until the last figure of `base` is reached, as a share of its own."""
+    if not base or own[0]["way"] == base[0]["way"]:
+        return "-"
+    aim, spent = float(base[-1][name]), float(base[-1]["cpu_s"])
+    reached = [float(row[name]) for row in own]
+    first = next((i for i, value in enumerate(reached) if value >= aim), None)
+    if first is None:
+        return "never"
+    at = float(own[first]["cpu_s"])
+    if first > 0:
+        before = float(own[first - 1]["cpu_s"])
+        rise = reached[first] - reached[first - 1]
+        at -= (at - before) * (reached[first] - aim) / rise
+    return f"{at / spent:.2f}"
+
+
 def plain(rows: list[Row]) -> str:
     """A table whose columns are those of the file, in its words."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
@@ -582,6 +647,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "movers": movers,
     "read_memory": plain,
     "rolling_shutter": rolling_shutter,
+    "splats": splats,
     "long_video": plain,
     "batch": plain,
     "image_pairs": plain,

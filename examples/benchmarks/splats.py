@@ -1,0 +1,111 @@
+"""Measure how 3D Gaussians trained from `reconstruct`'s folder look, beside those from SIFT's.
+
+python examples/benchmarks/splats.py --cache benchmark_phone
+
+For each clip the two folders of `phone_to_folder.py` are made, in its cache, and Gaussians are
+trained on half of the images of each, from its own poses and points, and rendered for the others.
+The trainer is a small one for CPUs, `../shared/tools/gs_cpu`: what it gives is to be compared with
+what it gives for another cloud, not with other trainers' figures. Its time is of training alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import clips as ruler
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import phone_to_folder
+import render
+from phone_to_folder import Clip
+from results import Value, add_results, read_rows, save
+from rich.console import Console
+
+from colmap_av1 import ImageOptions
+
+TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
+# Which frames become images, where that differs from the other benchmark.
+IMAGES = {"kitchen": ImageOptions(every=4)}
+WIDTH, ITERATIONS = 225, 3000
+MILESTONES = (100, 200, 300, 400, 600, 800, 1000, 1250, 1500, 2000, 2500, ITERATIONS)
+FIGURES = {"iter": "iterations", "cpu_s": "cpu_s", "gaussians": "gaussians"} | {
+    name: name for name in ("psnr_y", "ssim_db", "vmaf")
+}
+
+
+def main() -> int:
+    """Train on every clip, both ways, and keep and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and results")
+    parser.add_argument(
+        "--clips",
+        nargs="+",
+        default=["log_building", "ditch", "holiday_display", "kitchen"],
+        metavar="NAME",
+        help="sequences of ../shared",
+    )
+    parser.add_argument("--ways", nargs="+", choices=list(render.SPLAT_WAYS), metavar="WAY")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N")
+    add_results(parser, "splats")
+    arguments = parser.parse_args()
+    console = Console(stderr=True)
+    for name in arguments.clips:
+        ours = name if name not in IMAGES else f"{name}_{IMAGES[name].every}"
+        folder = arguments.cache.resolve() / ours
+        clip = phone_to_folder.clip_of(name, folder)
+        clip = replace(clip, images=IMAGES.get(name, clip.images))
+        for way in arguments.ways or render.SPLAT_WAYS:
+            console.print(f"{name}: {way}", markup=False)
+            images, model = folder_of(clip, folder, way)
+            for seed in arguments.seeds:
+                rows = train(images, model, folder / "splats" / way.replace(" ", "_"), seed)
+                about: dict[str, Value] = {"clip": name, "way": way, "seed": seed}
+                key = ("clip", "way", "seed", "iterations")
+                save(arguments.results, [about | row for row in rows], key)
+    print(render.splats(read_rows(arguments.results)), end="")
+    return 0
+
+
+def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
+    """The images without distortion, and the model, that one way makes of a clip."""
+    *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
+    if way == "reconstruct":
+        return output / "images", output / "sparse" / "0"
+    names = sorted(path.name for path in (output / "images").iterdir())
+    _, model, images = phone_to_folder.sift_of(clip, folder / "sift", names)
+    if model is None:
+        raise SystemExit(f"{clip.name}: SIFT gave no model")
+    straight = folder / "sift" / "undistorted"
+    shutil.rmtree(straight, ignore_errors=True)
+    model, images = phone_to_folder.undistorted(model, images, straight)
+    return images, model
+
+
+def train(images: Path, model: Path, folder: Path, seed: int) -> Iterator[dict[str, Value]]:
+    """Train from a model's points, and give what is measured on the way."""
+    cloud, output = folder / "cloud.npz", folder / f"seed_{seed}"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    run = [sys.executable, str(TRAINER / "colmap_to_npz.py"), str(model), str(cloud)]
+    subprocess.run([*run, "--images", str(images)], check=True, capture_output=True)
+    run = [sys.executable, str(TRAINER / "gs_train.py"), str(cloud), str(images), str(output)]
+    run += ["--width", str(WIDTH), "--iters", str(ITERATIONS), "--reset-every", "0"]
+    run += ["--threads", "1", "--seed", str(seed), "--milestones", ",".join(map(str, MILESTONES))]
+    with (output / "log.txt").open("w") as log:
+        subprocess.run(run, check=True, stdout=log, stderr=log)
+    for line in (output / "log.jsonl").read_text().splitlines():
+        entry = json.loads(line)
+        if entry["kind"] == "eval":
+            yield {ours: entry[name] for name, ours in FIGURES.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
