@@ -85,7 +85,7 @@ TrackBuilderOptions read_options(Input& input) {
   if ((choice & 2) != 0) options.interpolation = 2;
   if ((choice & 1) != 0) options.bridge = 2;
   options.cells = 1 << (((choice >> 3) & 1) + ((choice >> 5) & 1));
-  options.seeding = (choice & 64) != 0 ? options.cells : 1;
+  if ((choice & 64) != 0) options.seeding = (choice & 128) != 0 ? 2 * options.cells : options.cells;
   return options;
 }
 
