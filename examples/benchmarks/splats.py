@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
-    """The images without distortion, and the model, that one way makes of a clip."""
+    """The images and the model that one way makes of a clip; the trainer undistorts SIFT's."""
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
     if way == "reconstruct":
         return output / "images", output / "sparse" / "0"
@@ -83,9 +83,6 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     _, model, images = phone_to_folder.sift_of(clip, folder / "sift", names)
     if model is None:
         raise SystemExit(f"{clip.name}: SIFT gave no model")
-    straight = folder / "sift" / "undistorted"
-    shutil.rmtree(straight, ignore_errors=True)
-    model, images = phone_to_folder.undistorted(model, images, straight)
     return images, model
 
 
