@@ -339,6 +339,13 @@ def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floa
     return algebraic, gradient
 
 
+def essential_of_poses(a: _Floats, b: _Floats) -> _Floats:
+    """The essential matrix of two images by their poses [3, 4], x_cam = R x_world + t."""
+    rotation = b[:, :3] @ a[:, :3].T
+    x, y, z = b[:, 3] - rotation @ a[:, 3]
+    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
+
+
 def transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
     """Matches that H maps to within `max_error` of their place in the second image."""
     mapped = H[:, :2] @ xa + H[:, 2:]

@@ -73,6 +73,11 @@ class PosedCamera:
         """Whether pixels [n, 2] of the image count."""
         return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
 
+    def rays(self, xy: _Floats) -> _Floats:
+        """Float64 [n, 3] the rays in the camera of pixels [n, 2], 1 deep."""
+        rays = np.asarray(self.camera.cam_from_img(xy)).reshape(-1, 2)
+        return np.column_stack([rays, np.ones(len(rays))])
+
     def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
         """The points that lie in the picture.
 
@@ -164,12 +169,26 @@ def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
         float64 [rows, columns]; inf where there is none.
     """
     _, xy, depth = view.project(xyz)
-    width, height = view.size
-    columns, rows = -(-width // CELL), -(-height // CELL)
-    grid = np.full(rows * columns, np.inf)
+    return nearest_in_cells(view.size, xy, depth)
+
+
+def nearest_in_cells(size: tuple[int, int], xy: _Floats, depth: _Floats) -> _Floats:
+    """Least of the depths [n] at pixels [n, 2] in each cell of a (width, height), see above."""
+    columns, rows = (-(-length // CELL) for length in size)
     column, row = (xy // CELL).astype(np.int64).T
-    np.minimum.at(grid, row * columns + column, depth)
+    # What is seen at the very edge is of the last cell.
+    cell = np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1)
+    grid = np.full(rows * columns, np.inf)
+    np.minimum.at(grid, cell, depth)
     return grid.reshape(rows, columns)
+
+
+def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_side: int) -> _Floats:
+    """Centres in pixels [n, 2] of the squares that cells are divided into, cell by cell."""
+    places = (np.arange(per_side) + 0.5) * (CELL / per_side)
+    x = columns[:, None] * CELL + np.tile(places, per_side)
+    y = rows[:, None] * CELL + np.repeat(places, per_side)
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
 
 
 def without_gaps(grid: _Floats) -> _Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,6 @@ from colmap_av1.model.undistort import (
     undistortion,
 )
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -66,6 +65,8 @@ def _dense_cloud(
     views: list[PosedCamera],
     seen: Tracks,
     view: NDArray[np.int64],
+    *,
+    pictures: Iterable[tuple[int, _Image]],
 ) -> _DenseCloud:
     options, clock = run.options.triangulate, run.clock
     pinholes = [own.camera for own in views]
@@ -80,7 +81,7 @@ def _dense_cloud(
     xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
     cloud = cloud_of(
         *(to_model_points(points, view, xy), views, placed.take),
-        _pinhole_pictures(run, placed, views),
+        pictures,
         options=options,
         num_threads=run.options.match.run.num_threads,
         clock=clock,
@@ -91,26 +92,17 @@ def _dense_cloud(
 
 
 def _pinhole_pictures(
-    run: Run, placed: PosedImages, views: Sequence[PosedCamera]
+    run: Run, takes: Takes, placed: PosedImages, views: Sequence[PosedCamera]
 ) -> Iterator[tuple[int, _Image]]:
     """The images of videos with their undistorted pictures, in order."""
     undistort = _undistortions(placed, views)
-    for video, source in enumerate(run.sources):
-        own = np.flatnonzero(placed.take == video)
-        image_of = dict(
-            zip(
-                (placed.frames[own] - placed.first_frame[video]).tolist(), own.tolist(), strict=True
-            )
-        )
-        if not image_of:
-            continue
-        decoded = decodable_frames(
-            *(source.pictures, max(image_of) + 1, run.options.match),
-            wanted=image_of,
-            use="pictures are compared",
-        )
-        for frame, picture in decoded:
-            yield image_of[frame], undistort(image_of[frame], picture)
+    place = {frame: i for i, frame in enumerate(placed.frames.tolist())}
+    of_videos = takes.take < len(run.sources)
+    frames = takes.images.frames.tolist()
+    wanted = [k for k in np.flatnonzero(of_videos).tolist() if frames[k] in place]
+    for index, picture in run.pictures(takes)(wanted):
+        own = place[frames[index]]
+        yield own, undistort(own, picture)
 
 
 def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
@@ -245,7 +237,8 @@ def model_stage(
         counting = undistorted_masks(joined, placed.camera_of_image, cameras)
         views = views_of(images, cameras, counting)
         seen, view = seen_in(tracks, placed.frames)
-        dense = _dense_cloud(run, placed, views, seen, view)
+        pictures = _pinhole_pictures(run, takes, placed, views)
+        dense = _dense_cloud(run, placed, views, seen, view, pictures=pictures)
         points, cloud = dense.points, dense.cloud
         far_views, cloud = _write_images(run, partial / "images", placed, views, cloud)
         check_unchanged(*run.files)

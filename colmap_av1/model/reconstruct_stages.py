@@ -15,7 +15,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
-from colmap_av1.images.takes import Takes, pictures_of
+from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     NewCameras,
@@ -205,13 +205,11 @@ def _match_images(
 ) -> LinkedImages:
     """The images matched along some tracks of each video and by links."""
     options, clock, progress = run.options.match, run.clock, run.progress
-    files = [source.pictures for source in run.sources]
     matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
     shares = [own.inter_share for own in videos]
-    photos = [photo.path for photo in run.inputs.photos]
     return link_images(
         *(takes, matched, cameras, np.concatenate([*shares, run.inputs.no_motion])),
-        pictures_of(takes, [(file, None) for file in files], photos, options),
+        run.pictures(takes),
         name=run.inputs.name,
         images_apart=images_apart,
         options=options,

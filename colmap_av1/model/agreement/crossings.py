@@ -19,7 +19,8 @@ from colmap_av1.database.reading import (
 )
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.names import natural_order
-from colmap_av1.matching.two_view_models import epipolar_terms
+from colmap_av1.matching.mapper_limits import MIN_INLIERS
+from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
 from colmap_av1.model.colmap_model import ModelImage, posed_images
 
 _Floats = NDArray[np.float64]
@@ -29,9 +30,8 @@ _MAX_ERROR = 4.0
 # Share of the matches across a gap that have to fit: models that are straight have 87 % and more
 # everywhere, one that a mapper had joined wrongly 55 %.
 _LEAST_FITTING = 0.75
-# Matches that say anything, and those of a pair that a mapper takes.
+# Matches that say anything.
 _FEWEST = 30
-_FEWEST_OF_PAIR = 15
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _fitting(
                 rays[image_id] = np.asarray(camera.cam_from_img(xy)).T
         for pair_id, *row in connection.execute(
             "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows >= ?",
-            (_FEWEST_OF_PAIR,),
+            (MIN_INLIERS,),
         ):
             a, b = image_ids_from_pair_id(pair_id)
             if a not in rays or b not in rays:
@@ -152,8 +152,5 @@ def _fitting(
 
 def _errors(a: _Floats, b: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
     """Sampson distance of matched rays [2, n] by the poses of two images, float64 [n]."""
-    rotation = b[:, :3] @ a[:, :3].T
-    x, y, z = b[:, 3] - rotation @ a[:, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    algebraic, squared = epipolar_terms(cross @ rotation, xa, xb)
+    algebraic, squared = epipolar_terms(essential_of_poses(a, b), xa, xb)
     return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-24)))

@@ -16,7 +16,7 @@ from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features import FeatureExtractor, Features, masked_features
 from colmap_av1.matching.link_matches import match_pairs
-from colmap_av1.matching.two_view_models import epipolar_terms
+from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
 from colmap_av1.model.coverage import evenly_spread
 from colmap_av1.options import RunOptions, VerifyOptions
@@ -143,15 +143,12 @@ class FarViewCheck:
     def _errors(self, i: int, j: int, xa: NDArray[Any], xb: NDArray[Any]) -> _Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
         a, b = self._images[i].cam_from_world, self._images[j].cam_from_world
-        rotation = b[:, :3] @ a[:, :3].T
-        t = b[:, 3] - rotation @ a[:, 3]
-        cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
         normalised = [
             np.asarray(camera.cam_from_img(xy.astype(np.float64))).T
             for camera, xy in ((self._cameras[i], xa), (self._cameras[j], xb))
         ]
         focal = np.mean([self._cameras[k].mean_focal_length() for k in (i, j)])
-        algebraic, squared = epipolar_terms(cross @ rotation, *normalised)
+        algebraic, squared = epipolar_terms(essential_of_poses(a, b), *normalised)
         # Per image: each has a part of the distance.
         distance = np.sqrt(2) * focal * np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-12))
         # A distorted position may have no ray.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.images.positions import ImagePositions
-from colmap_av1.images.takes import Takes, pictures_of
+from colmap_av1.images.takes import Takes
 from colmap_av1.model.colmap_model import ModelImage, no_points, write_model
 from colmap_av1.model.placing.placement import (
     PLACE_FILE,
@@ -85,12 +85,6 @@ def _surroundings(
 
     def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         images = dict(some_spread([*zip(own, placed.images, strict=True)]))
-        pictures = pictures_of(
-            takes,
-            [(source.pictures, None) for source in run.sources],
-            [photo.path for photo in run.inputs.photos],
-            run.options.match,
-        )
         return [
             vertical_lines(
                 picture,
@@ -98,7 +92,7 @@ def _surroundings(
                 images[i].cam_from_world,
                 up,
             )
-            for i, picture in pictures(sorted(images))
+            for i, picture in run.pictures(takes)(sorted(images))
         ]
 
     gravity = positions.gravity[own]

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.model.colmap_model import ModelPoints, take_rows
-from colmap_av1.model.coverage import CELL, PosedCamera, evenly_spread, nearest_depth, without_gaps
+from colmap_av1.model.coverage import (
+    CELL,
+    PosedCamera,
+    evenly_spread,
+    nearest_depth,
+    squares_of_cells,
+    without_gaps,
+)
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -203,10 +210,7 @@ def _squares(
 ) -> tuple[_Floats, _Ints, NDArray[np.bool_]]:
     """Centres in pixels of the squares in cells, the cell of each, and whether it is its first."""
     per_cell = CELL // _FILLING
-    places = (np.arange(per_cell) + 0.5) * _FILLING
-    x = columns[:, None] * CELL + np.tile(places, per_cell)
-    y = rows[:, None] * CELL + np.repeat(places, per_cell)
-    xy = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
+    xy = squares_of_cells(rows, columns, per_cell)
     cell = np.repeat(np.arange(len(rows)), per_cell**2)
     # Cells at the edge may reach beyond it; one square of each lies within.
     first = np.arange(len(xy)) % per_cell**2 == 0
@@ -225,8 +229,7 @@ def _behind(
     others: Sequence[tuple[PosedCamera, _Floats]],
 ) -> _Floats:
     """Points at pixels and depths of an image, farther where they would hide what others see."""
-    rays = np.asarray(view.camera.cam_from_img(xy)).reshape(-1, 2)
-    rays = np.column_stack([rays, np.ones(len(rays))]) @ view.cam_from_world[:, :3]
+    rays = view.rays(xy) @ view.cam_from_world[:, :3]
     xyz = view.centre + rays * np.maximum(depth, farthest)[:, None]
     left = np.arange(len(xy))
     for factor in _PUSHED:

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.model.colmap_model import ModelPoints, joined_points, no_points
-from colmap_av1.model.coverage import CELL, PosedCamera, evenly_spread
+from colmap_av1.model.coverage import (
+    CELL,
+    PosedCamera,
+    evenly_spread,
+    nearest_in_cells,
+    squares_of_cells,
+)
 from colmap_av1.model.splats.cloud import take_points
 
 _Floats = NDArray[np.float64]
@@ -91,7 +97,7 @@ class _Swept:
 
     def xyz(self, view: PosedCamera) -> _Floats:
         """The points in the world."""
-        own = _rays(view, self.xy) * self.depth[:, None] - view.cam_from_world[:, 3]
+        own = view.rays(self.xy) * self.depth[:, None] - view.cam_from_world[:, 3]
         return np.asarray(own @ view.cam_from_world[:, :3])
 
 
@@ -153,9 +159,14 @@ class _Grey:
         return (xy / self.factor).astype(np.float32)
 
 
+def _factor(size: tuple[int, int]) -> int:
+    """How much smaller pictures of a (width, height) are made."""
+    return math.ceil(math.sqrt(math.prod(size) / _MOST_PIXELS))
+
+
 def _smaller(picture: NDArray[np.uint8]) -> _Grey:
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    factor = math.ceil(math.sqrt(grey.size / _MOST_PIXELS))
+    factor = _factor(grey.shape[::-1])
     height, width = (length // factor for length in grey.shape)
     # Cut to whole squares, or all of it would be drawn closer by a fraction of a pixel.
     grey = np.ascontiguousarray(grey[: height * factor, : width * factor])
@@ -174,12 +185,7 @@ def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list
         own = by_image[bounds[image] : bounds[image + 1]]
         axis = view.cam_from_world[2]
         depth = points.xyz[owner[own]] @ axis[:3] + axis[3]
-        columns, rows = (-(-length // CELL) for length in view.size)
-        column, row = (points.xy[own] // CELL).astype(np.int64).T
-        cell = np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1)
-        grid = np.full(rows * columns, np.inf)
-        np.minimum.at(grid, cell, depth)
-        grids.append(grid.reshape(rows, columns))
+        grids.append(nearest_in_cells(view.size, points.xy[own], depth))
     return grids
 
 
@@ -199,8 +205,7 @@ def _others(
         return 0 <= key + steps < len(views) and takes[key + steps] == takes[key]
 
     def motion(image: int) -> float:
-        factor = math.ceil(math.sqrt(math.prod(views[key].size) / _MOST_PIXELS))
-        focal = views[key].camera.mean_focal_length() / factor
+        focal = views[key].camera.mean_focal_length() / _factor(views[key].size)
         return float(np.linalg.norm(views[image].centre - views[key].centre) * focal / near)
 
     step = 1
@@ -242,18 +247,9 @@ def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Float
     """Centres in pixels of the squares of cells that are looked at, four or one in each."""
     rows, columns = np.nonzero(cells)
     per_cell = 2 if factor <= CELL // _LEAST_SQUARE // 2 else 1
-    places = (np.arange(per_cell) + 0.5) * (CELL / per_cell)
-    x = columns[:, None] * CELL + np.tile(places, per_cell)
-    y = rows[:, None] * CELL + np.repeat(places, per_cell)
-    xy = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
+    xy = squares_of_cells(rows, columns, per_cell)
     xy = xy[(xy < view.size).all(axis=1)]
     return xy[view.keeps(xy)]
-
-
-def _rays(view: PosedCamera, xy: _Floats) -> _Floats:
-    """Float64 [n, 3] the rays of pixels, 1 deep."""
-    rays = np.asarray(view.camera.cam_from_img(xy)).reshape(-1, 2)
-    return np.column_stack([rays, np.ones(len(rays))])
 
 
 def _sweep(
@@ -277,7 +273,7 @@ def _sweep(
 
     def look(first: int) -> _Swept:
         own = xy[first : first + _CHUNK]
-        rays = _rays(view, own)
+        rays = view.rays(own)
         found = np.stack(
             [
                 _correlate(grey, own, greys[i], _seen_at(view, views[i], rays, inverse[None]))
