@@ -33,7 +33,7 @@ from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
-from colmap_av1.video.spherical import check_is_plane
+from colmap_av1.video.metadata.spherical import check_is_plane
 
 # Its cloud and its poses stand for the truth where none is given.
 PSEUDO_TRUTH = "sift-exhaustive"

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, ModelError, cannot_write
-from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
-from colmap_av1.images.files import size_of_images
+from colmap_av1.errors import ModelError, cannot_write
+from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
-from colmap_av1.images.masks import VideoMasks
-from colmap_av1.images.takes import Pictures, pictures_of
+from colmap_av1.images.of_videos import VideoImages, images_of_videos
+from colmap_av1.images.photos import Photo
+from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.model.colmap_model import (
     MODEL_FILES,
     ModelImage,
@@ -32,11 +32,11 @@ from colmap_av1.model.splats.gaussians import (
     initial_gaussians,
     write_gaussians,
 )
+from colmap_av1.model.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.model.track_points import (
     LEAST_AGREEING,
     Colours,
     chaining_for_points,
-    cloud_of,
     mean_error,
     seen_in,
     to_model_points,
@@ -59,10 +59,10 @@ from colmap_av1.tracks.video_tracks import (
     track_video,
 )
 from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.files import check_new_folder, whole_folder
+from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
-from colmap_av1.video.facts import Video
+from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
 
@@ -103,17 +103,6 @@ class DensifyReport:
     gaussians: Path | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _VideoImages:
-    """A video, the model's images of it by their names in a folder, their size and masks."""
-
-    video: Video
-    names: list[str]
-    folder: Path | None
-    size: tuple[int, int]
-    masks: VideoMasks | None
 
 
 @dataclass(frozen=True)
@@ -180,7 +169,7 @@ def densify(
     with unchanged(*inputs.states):
         # What can be refused is refused before the long work.
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
-        of_videos = _images_of_videos(model, sizes, inputs, folder, options)
+        of_videos = images_of_videos(model, sizes, inputs, folder, options)
         track = partial(_track, output=output, options=options, clock=clock, progress=progress)
         tracked = [track(own) for own in of_videos]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
@@ -191,20 +180,20 @@ def densify(
         )
         images = [posed[name] for name in takes.images.names]
         views = views_of(images, cameras, takes.masks)
-        files = [(own, None) for own in inputs.videos]
-        pictures = pictures_of(takes, files, [p.path for p in photos_there], options.match)
         row = tracks_in_a_row([own.tracks for own in tracked], takes.num_frames)
         seen, view = seen_in(row, takes.images.frames)
         with clock.measure("points"):
             points = _triangulate(seen, view, views, options, progress)
         agreeing = _agreement(model, points)
         of_tracks = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
-        cloud = _coloured_cloud(
-            *(of_tracks, views, takes.take, pictures),
-            options=options,
-            clock=clock,
-            progress=progress,
-        )
+        with scratch_folder(output) as scratch:
+            cloud = _coloured_cloud(
+                *(of_tracks, views, takes),
+                _pictures(takes, inputs, photos_there, scratch, options),
+                options=options,
+                clock=clock,
+                progress=progress,
+            )
     with clock.measure("coverage"):
         covered = coverage(views, cloud.xyz)
     with clock.measure("writing"):
@@ -229,7 +218,7 @@ def densify(
 
 
 def _track(
-    images: _VideoImages,
+    images: VideoImages,
     output: Path,
     options: DensifyOptions,
     *,
@@ -269,10 +258,19 @@ def _triangulate(
     )
 
 
+def _pictures(
+    takes: Takes, inputs: Inputs, photos: Sequence[Photo], scratch: Path, options: DensifyOptions
+) -> Pictures:
+    """What gives the pictures of images; a folder keeps those of videos."""
+    kept = [KeptPictures(scratch / f"{number}.nut") for number in range(len(inputs.videos))]
+    shown = [ShownVideo(own, kept=file) for own, file in zip(inputs.videos, kept, strict=True)]
+    return pictures_of(takes, shown, [photo.path for photo in photos], options.match)
+
+
 def _coloured_cloud(
     tracked: ModelPoints,
     views: Sequence[PosedCamera],
-    take: NDArray[np.int32],
+    takes: Takes,
     pictures: Pictures,
     *,
     options: DensifyOptions,
@@ -280,19 +278,25 @@ def _coloured_cloud(
     progress: Progress,
 ) -> ModelPoints:
     """The points that are written, in the colours of the pictures."""
-    cloud = cloud_of(
-        *(tracked, views, take, pictures(list(range(len(views))))),
-        options=options.triangulate,
-        num_threads=options.match.run.num_threads,
-        clock=clock,
-        progress=progress,
-    )
+
+    def show(stage: str, look: Look) -> None:
+        with clock.measure(stage):
+            for done, (image, picture) in enumerate(pictures(list(range(len(views)))), start=1):
+                progress(stage, done, len(views))
+                look(image, picture)
+
+    cloud = tracked
+    if options.triangulate.points == "splats":
+        cloud = swept_cloud(
+            *(tracked, views, takes.take, partial(show, "sweep")),
+            max_points=options.triangulate.max_points,
+            num_threads=options.match.run.num_threads,
+            clock=clock,
+        )
+    colours = Colours(cloud, [own.size for own in views])
+    show("colours", colours.add)
     with clock.measure("colours"):
-        colours = Colours(cloud, [own.size for own in views])
-        for done, (image, picture) in enumerate(pictures(list(range(len(views)))), start=1):
-            progress("colours", done, len(views))
-            colours.add(image, picture)
-    return replace(cloud, rgb=colours.rgb())
+        return replace(cloud, rgb=colours.rgb())
 
 
 def _choose(
@@ -384,63 +388,3 @@ def _read_inputs(
 
 def _size(camera: Any) -> tuple[int, int]:
     return int(camera.width), int(camera.height)
-
-
-def _images_of_videos(
-    model: Path,
-    sizes: Mapping[str, tuple[int, int]],
-    inputs: Inputs,
-    folder: Path | None,
-    options: DensifyOptions,
-) -> list[_VideoImages]:
-    """The model's images of each video, of (width, height) by their names; refuses others.
-
-    Raises:
-        ModelError: the model has an image of another video, or none of one.
-        ImageError: images do not fit their video.
-    """
-    photos = {photo.name for photo in inputs.photos}
-    of_label: dict[str, dict[str, tuple[int, int]]] = {label: {} for label in inputs.labels}
-    for name in sorted(sizes.keys() - photos):
-        label, _, own = name.partition("/") if len(of_label) > 1 else ("", "", name)
-        if label not in of_label:
-            raise ModelError(
-                f"{model}: image '{name}' lies in no folder of a video, "
-                f"{', '.join(of_label)}: give the video it comes from, or the photos as --images"
-            )
-        of_label[label][own] = sizes[name]
-    found = []
-    given = zip(inputs.videos, of_label.items(), inputs.masks_of_videos, strict=True)
-    for video, (label, listed), masks in given:
-        if not listed:
-            raise ModelError(f"{model}: has no image of {video}: leave that video out")
-        own_folder = folder / label if folder is not None else None
-        images = _images_of_video(model, video, listed, own_folder, options)
-        if masks is not None:
-            sizes_of_masks = [images.size, video.picture_size]
-            masks.check(sizes_of_masks, images.names, options.match.images)
-        found.append(replace(images, masks=masks))
-    return found
-
-
-def _images_of_video(
-    model: Path,
-    video: Video,
-    sizes: Mapping[str, tuple[int, int]],
-    folder: Path | None,
-    options: DensifyOptions,
-) -> _VideoImages:
-    """The model's images of a video; refuses those that do not fit it."""
-    check_frame_list(options.match.images)
-    if len(sizes) < 2:
-        raise ModelError(
-            f"{model}: only one image of {video} has a pose: give a model with two or more"
-        )
-    try:
-        size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
-    except ImageError as error:
-        raise ImageError(f"{model}: {error}") from error
-    missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
-    if missing is not None:
-        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
-    return _VideoImages(video, list(sizes), folder, size, None)

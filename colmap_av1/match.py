@@ -20,7 +20,7 @@ from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
-from colmap_av1.images.takes import Takes, pictures_of
+from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     PairedImages,
@@ -331,7 +331,7 @@ def _match_images(
         *(takes, matched, cameras.of_images, np.concatenate([*shares, images.inputs.no_motion])),
         pictures_of(
             takes,
-            [(own.source.pictures, own.display) for own in videos],
+            [ShownVideo(own.source.pictures, own.display) for own in videos],
             [photo.path for photo in images.inputs.photos],
             options,
         ),

@@ -29,11 +29,12 @@ from colmap_av1.model.track_points import LEAST_AGREEING
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.files import whole_file
+from colmap_av1.util.files import scratch_folder, whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import count_shown
+from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
@@ -185,6 +186,11 @@ def reconstruct(
                 )
             )
             for own, label in zip(inputs.videos, inputs.labels, strict=True)
+        )
+        scratch = opened.enter_context(scratch_folder(stages / "pictures"))
+        sources = tuple(
+            replace(own, kept=KeptPictures(scratch / f"{number}.nut"))
+            for number, own in enumerate(sources)
         )
         run = Run(inputs, sources, output, stages, options, clock, progress)
         try:

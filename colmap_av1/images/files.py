@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -29,6 +30,7 @@ from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
+from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
 # Images that others wrote are only read.
@@ -168,6 +170,7 @@ def write_images(
     operating_point: int = 0,
     change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
     display: Display | None = None,
+    kept: KeptPictures | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> int:
     """Write video frames as images, PNG or JPEG (quality 95) by the names' extensions.
@@ -185,6 +188,7 @@ def write_images(
         change: called with (display_index, picture) of each image that is not there yet, in
             display order; gives the picture to write.
         display: how pictures are cut and turned; None: as players do.
+        kept: what it holds is not decoded.
         progress: called with the number of images done so far.
 
     Returns:
@@ -232,6 +236,7 @@ def write_images(
                 display=display,
                 wanted=wanted,
             )
+            decoded = kept.of(wanted, decoded) if kept is not None else decoded
             with contextlib.closing(decoded):
                 _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)
     except VideoError:  # images of two videos would be kept as those of one
@@ -306,6 +311,20 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
+
+
+def read_images(paths: Sequence[Path], num_threads: int | None) -> Iterator[NDArray[np.uint8]]:
+    """Read image files on threads (None: one per CPU), in their order; see `read_image`."""
+    count = threads_or_cpus(num_threads)
+    waiting: deque[Future[NDArray[np.uint8]]] = deque()
+    # OpenCV releases the interpreter lock while it reads.
+    with ThreadPoolExecutor(max_workers=count) as executor:
+        for path in paths:
+            waiting.append(executor.submit(read_image, path))
+            if len(waiting) > count:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def image_size(path: Path) -> tuple[int, int]:

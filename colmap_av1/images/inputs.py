@@ -19,9 +19,9 @@ from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
-from colmap_av1.video.lens import doubtful_lens
-from colmap_av1.video.positions import doubtful_place
-from colmap_av1.video.spherical import check_is_plane, hint
+from colmap_av1.video.metadata.lens import doubtful_lens
+from colmap_av1.video.metadata.positions import doubtful_place
+from colmap_av1.video.metadata.spherical import check_is_plane, hint
 from colmap_av1.video.unchanged import FileState
 
 _Path = str | os.PathLike[str]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.takes import Takes
 from colmap_av1.video.facts import Video, picture_times
-from colmap_av1.video.positions import Positions, are_places, interpolate, read_positions
+from colmap_av1.video.metadata.positions import Positions, are_places, interpolate, read_positions
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video
+from colmap_av1.video.kept_pictures import KeptPictures
 
 Image = NDArray[np.uint8]
 # Gives the pictures of images, by index, ascending.
@@ -117,9 +118,24 @@ def count_through(
     )
 
 
+@dataclass(frozen=True)
+class ShownVideo:
+    """A video whose pictures are looked at.
+
+    Attributes:
+        video: the video.
+        display: how its pictures are cut and turned; None: as players do.
+        kept: keeps those that were decoded; None: they are decoded each time.
+    """
+
+    video: Video
+    display: Display | None = None
+    kept: KeptPictures | None = None
+
+
 def pictures_of(
     takes: Takes,
-    videos: Sequence[tuple[Video, Display | None]],
+    videos: Sequence[ShownVideo],
     photos: Sequence[Path],
     options: MatchOptions,
 ) -> Pictures:
@@ -127,7 +143,7 @@ def pictures_of(
 
     Args:
         takes: the images.
-        videos: the videos, and how their pictures are shown; None: as players show them.
+        videos: the videos.
         photos: the files of the photos.
         options: those of reading are used.
 
@@ -138,7 +154,7 @@ def pictures_of(
 
     def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
         left = set(wanted)
-        for number, (video, display) in enumerate(videos):
+        for number, shown in enumerate(videos):
             own = takes.of_video(number)
             first = takes.images_of(number).start
             image_of = {
@@ -147,12 +163,13 @@ def pictures_of(
                 if first + index in left
             }
             if image_of:
-                shown = decodable_frames(
-                    *(video, max(image_of) + 1, options, display),
+                decoded = decodable_frames(
+                    *(shown.video, max(image_of) + 1, options, shown.display),
                     wanted=image_of,
                     use="pictures are looked at",
+                    kept=shown.kept,
                 )
-                for frame, picture in shown:
+                for frame, picture in decoded:
                     yield image_of[frame], picture
         first_photo = len(takes.take) - len(photos)
         for index, photo in enumerate(photos, start=first_photo):

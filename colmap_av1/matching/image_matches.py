@@ -31,7 +31,7 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.facts import Video
-from colmap_av1.video.lens import said_focal_length
+from colmap_av1.video.metadata.lens import said_focal_length
 
 # Factor to which the focal lengths of tracks and containers agree, where these crop little.
 _AGREE = 1.2

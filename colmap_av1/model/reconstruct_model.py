@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.files import read_image, write_image, write_images
+from colmap_av1.images.files import read_image, read_images, write_image, write_images
 from colmap_av1.images.masks import Mask
+from colmap_av1.images.names import image_file
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
-from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
+from colmap_av1.model.colmap_model import (
+    ModelImage,
+    ModelPoints,
+    points_seen,
+    write_model,
+)
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.reconstruct_poses import (
     PosedImages,
@@ -25,10 +31,10 @@ from colmap_av1.model.reconstruct_poses import (
     triangulate_in,
 )
 from colmap_av1.model.reconstruct_tracks import Run
+from colmap_av1.model.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.model.track_points import (
     Colours,
     by_camera,
-    cloud_of,
     mean_error,
     seen_in,
     to_model_points,
@@ -50,59 +56,23 @@ _Image = NDArray[np.uint8]
 _MASKS = "masks"
 
 
-@dataclass(frozen=True)
-class _DenseCloud:
-    """Points of all tracks, those of them that are written, in black, and what these cover."""
-
-    points: TriangulatedPoints
-    cloud: ModelPoints
-    coverage: float
-
-
-def _dense_cloud(
+def _tracked_points(
     run: Run,
     placed: PosedImages,
-    views: list[PosedCamera],
+    views: Sequence[PosedCamera],
     seen: Tracks,
     view: NDArray[np.int64],
-    *,
-    pictures: Iterable[tuple[int, _Image]],
-) -> _DenseCloud:
-    options, clock = run.options.triangulate, run.clock
-    pinholes = [own.camera for own in views]
-    with clock.measure("points"):
-        points = triangulate_in(
-            *(run, placed, seen, view),
-            options=options,
-            pinholes=pinholes,
-            progress=run.progress,
-        )
-        check_agreement(len(points.xyz), points.num_tracks)
-    xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
-    cloud = cloud_of(
-        *(to_model_points(points, view, xy), views, placed.take),
-        pictures,
-        options=options,
-        num_threads=run.options.match.run.num_threads,
-        clock=clock,
+) -> tuple[TriangulatedPoints, ModelPoints]:
+    """Points of all tracks, and these as a model of the undistorted images has them, in black."""
+    points = triangulate_in(
+        *(run, placed, seen, view),
+        options=run.options.triangulate,
+        pinholes=[own.camera for own in views],
         progress=run.progress,
     )
-    with clock.measure("coverage"):
-        return _DenseCloud(points, cloud, coverage(views, cloud.xyz))
-
-
-def _pinhole_pictures(
-    run: Run, takes: Takes, placed: PosedImages, views: Sequence[PosedCamera]
-) -> Iterator[tuple[int, _Image]]:
-    """The images of videos with their undistorted pictures, in order."""
-    undistort = _undistortions(placed, views)
-    place = {frame: i for i, frame in enumerate(placed.frames.tolist())}
-    of_videos = takes.take < len(run.sources)
-    frames = takes.images.frames.tolist()
-    wanted = [k for k in np.flatnonzero(of_videos).tolist() if frames[k] in place]
-    for index, picture in run.pictures(takes)(wanted):
-        own = place[frames[index]]
-        yield own, undistort(own, picture)
+    check_agreement(len(points.xyz), points.num_tracks)
+    xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
+    return points, to_model_points(points, view, xy)
 
 
 def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
@@ -136,31 +106,27 @@ def _on_pinholes(
     return by_camera(xy, np.array([own.camera_id for own in placed.images]), image, change)
 
 
-def _write_images(
+def _written_images(
     run: Run,
     folder: Path,
     placed: PosedImages,
     views: Sequence[PosedCamera],
-    cloud: ModelPoints,
-) -> tuple[FarViews, ModelPoints]:
-    """Write the images, undistorted; look at their colours and at views from far apart on the way.
+    look: Look,
+) -> list[Path]:
+    """Write the images, undistorted, and look at those of videos on the way.
 
     Returns:
-        How far views from far apart disagree; and the points in colours.
+        Their files.
     """
     options, progress = run.options, run.progress
-    pinholes = _pinholes(views)
     undistort = _undistortions(placed, views)
-    far = FarViewCheck(placed.images, pinholes, lambda image: points_seen(cloud, image))
-    colours = Colours(cloud, [view.size for view in views])
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
     def change(first: int, frame: int, picture: _Image) -> _Image:
         index = index_of_frame[first + frame]
         shown = undistort(index, picture)
-        colours.add(index, shown)
-        far.add(index, shown, views[index].mask)
+        look(index, shown)
         return shown
 
     done = 0
@@ -168,27 +134,72 @@ def _write_images(
     def report(count: int) -> None:
         progress("images", done + count, len(names))
 
-    with run.clock.measure("images"):
-        for take in np.unique(placed.take).tolist():
-            own = np.flatnonzero(placed.take == take)
-            first = int(placed.first_frame[take])
-            if take < len(run.sources):
-                write_images(
-                    run.sources[take].pictures,
-                    folder,
-                    [names[i] for i in own],
-                    (placed.frames[own] - first).tolist(),
-                    num_threads=options.match.run.num_threads,
-                    operating_point=options.match.read.operating_point,
-                    change=partial(change, first),
-                    progress=report,
-                )
-            else:
-                photo = run.inputs.photos[take - len(run.sources)]
-                (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
-                write_image(folder / photo.name, change(first, 0, read_image(photo.path)))
-                report(1)
-            done += len(own)
+    for take in np.unique(placed.take).tolist():
+        own = np.flatnonzero(placed.take == take)
+        first = int(placed.first_frame[take])
+        if take < len(run.sources):
+            write_images(
+                run.sources[take].pictures,
+                folder,
+                [names[i] for i in own],
+                (placed.frames[own] - first).tolist(),
+                num_threads=options.match.run.num_threads,
+                operating_point=options.match.read.operating_point,
+                change=partial(change, first),
+                kept=run.sources[take].kept,
+                progress=report,
+            )
+        else:
+            photo = run.inputs.photos[take - len(run.sources)]
+            (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
+            write_image(folder / photo.name, undistort(int(own[0]), read_image(photo.path)))
+            report(1)
+        done += len(own)
+    return [image_file(folder, name) for name in names]
+
+
+def _written_cloud(
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    tracked: ModelPoints,
+) -> tuple[list[Path], ModelPoints]:
+    """Write the images; those points, in black, that the options want of tracks and pictures."""
+    options, clock = run.options.triangulate, run.clock
+    files: list[Path] = []
+
+    def show(look: Look) -> None:
+        with clock.measure("images"):
+            files.extend(_written_images(run, folder, placed, views, look))
+
+    if options.points == "survey":
+        show(lambda *_: None)
+        return files, tracked
+    cloud = swept_cloud(
+        *(tracked, views, placed.take, show),
+        max_points=options.max_points,
+        num_threads=run.options.match.run.num_threads,
+        clock=clock,
+    )
+    return files, cloud
+
+
+def _looked_at(
+    run: Run,
+    files: Sequence[Path],
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    cloud: ModelPoints,
+) -> tuple[FarViews, ModelPoints]:
+    """How far views from far apart disagree in the images, and the points in their colours."""
+    far = FarViewCheck(placed.images, _pinholes(views), lambda image: points_seen(cloud, image))
+    colours = Colours(cloud, [view.size for view in views])
+    with run.clock.measure("colours"):
+        for index, picture in enumerate(read_images(files, run.options.match.run.num_threads)):
+            colours.add(index, picture)
+            far.add(index, picture, views[index].mask)
+            run.progress("colours", index + 1, len(files))
     with run.clock.measure("far views"):
         return far.result(), replace(cloud, rgb=colours.rgb())
 
@@ -237,11 +248,13 @@ def model_stage(
         counting = undistorted_masks(joined, placed.camera_of_image, cameras)
         views = views_of(images, cameras, counting)
         seen, view = seen_in(tracks, placed.frames)
-        pictures = _pinhole_pictures(run, takes, placed, views)
-        dense = _dense_cloud(run, placed, views, seen, view, pictures=pictures)
-        points, cloud = dense.points, dense.cloud
-        far_views, cloud = _write_images(run, partial / "images", placed, views, cloud)
+        with clock.measure("points"):
+            points, tracked = _tracked_points(run, placed, views, seen, view)
+        files, cloud = _written_cloud(run, partial / "images", placed, views, tracked)
         check_unchanged(*run.files)
+        with clock.measure("coverage"):
+            covered = coverage(views, cloud.xyz)
+        far_views, cloud = _looked_at(run, files, placed, views, cloud)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
@@ -252,7 +265,7 @@ def model_stage(
         return {
             "num_points": len(cloud.xyz),
             "num_observations": len(cloud.image),
-            "coverage": dense.coverage,
+            "coverage": covered,
             "mean_error": mean_error(cloud),
             "focal_length": float(views[0].camera.params[0]),
             "far_views": far_views.median,

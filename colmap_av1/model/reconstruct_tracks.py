@@ -17,7 +17,7 @@ from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
-from colmap_av1.images.takes import Pictures, Takes, pictures_of
+from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.matching.link_plan import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
 from colmap_av1.model.track_points import chaining_for_points
@@ -94,7 +94,7 @@ class Run:
 
     def pictures(self, takes: Takes) -> Pictures:
         """What gives the pictures of images, see `pictures_of`."""
-        videos = [(source.pictures, None) for source in self.sources]
+        videos = [ShownVideo(own.pictures, kept=own.kept) for own in self.sources]
         photos = [photo.path for photo in self.inputs.photos]
         return pictures_of(takes, videos, photos, self.options.match)
 

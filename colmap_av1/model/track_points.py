@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import ModelPoints, joined_points
-from colmap_av1.model.coverage import PosedCamera
-from colmap_av1.model.splats.cloud import splat_cloud
+from colmap_av1.model.colmap_model import ModelPoints
 from colmap_av1.model.splats.points import splat_points
-from colmap_av1.model.splats.sweep import swept_points
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames
-from colmap_av1.util.cpus import threads_or_cpus
-from colmap_av1.util.progress import Clock, Progress, progress_in
+from colmap_av1.util.progress import Progress
 
 _Image = NDArray[np.uint8]
 
@@ -145,41 +141,6 @@ class Colours:
         owner = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
         order = np.lexsort((self._seen.astype(np.int64) @ _LUMA, owner))
         return np.asarray(self._seen[order[(offsets[:-1] + offsets[1:]) // 2]])
-
-
-def cloud_of(
-    tracked: ModelPoints,
-    images: Sequence[PosedCamera],
-    takes: NDArray[np.int32],
-    pictures: Iterable[tuple[int, _Image]],
-    *,
-    options: TriangulateOptions,
-    num_threads: int | None,
-    clock: Clock,
-    progress: Progress,
-) -> ModelPoints:
-    """The points that are written, in black: of splats those that a trainer needs.
-
-    Args:
-        tracked: points of tracks.
-        images: the images, by the index that observations have.
-        takes: int32 [num_images] the video of each.
-        pictures: of the images, see `swept_points`; not read for a survey.
-        options: which points.
-        num_threads: see `RunOptions`.
-        clock: measures the stages "sweep" and "cloud".
-        progress: called with a stage's name, what is done, and of how much.
-    """
-    if options.points == "survey":
-        return tracked
-    with clock.measure("sweep"):
-        swept = swept_points(
-            *(tracked, images, takes, pictures),
-            num_threads=threads_or_cpus(num_threads),
-            progress=progress_in(progress, "sweep", len(images)),
-        )
-    with clock.measure("cloud"):
-        return splat_cloud(joined_points([tracked, swept]), images, options.max_points)
 
 
 def mean_error(cloud: ModelPoints) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +33,7 @@ from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import EncodeReport, encode, stream_of
 from colmap_av1.video.facts import Video, frame_times, read_video, with_counted_packets
+from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
 
 _Image = NDArray[np.uint8]
@@ -51,12 +52,14 @@ class VideoSource:
         pictures: the video whose pictures become images: the same, or what it was made of.
         is_kept: the stream stays when the work is done.
         conversion: what the stream was made of and how, in words; None where it is the video.
+        kept: keeps the pictures that were decoded; None: they are decoded each time.
     """
 
     stream: Video
     pictures: Video
     is_kept: bool = True
     conversion: str | None = None
+    kept: KeptPictures | None = None
 
     @property
     def is_downscaled(self) -> bool:
@@ -343,7 +346,10 @@ def refine_in_images(
     with clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         wanted = frozenset(frames.tolist())
-        pictures = decodable_frames(source.pictures, int(frames[-1]) + 1, options, wanted=wanted)
+        num_frames = int(frames[-1]) + 1
+        pictures = decodable_frames(
+            source.pictures, num_frames, options, wanted=wanted, kept=source.kept
+        )
         tracks = refine_spread_tracks(
             tracked.tracks,
             frames,
@@ -360,12 +366,13 @@ def decodable_frames(
     options: MatchOptions,
     display: Display | None = None,
     *,
-    wanted: Container[int] | None = None,
+    wanted: Collection[int] | None = None,
     use: str = "tracks are refined",
+    kept: KeptPictures | None = None,
 ) -> Iterator[tuple[int, _Image]]:
     """The pictures of the frames that have tracks; those before a damage, with a warning.
 
-    `use` says in it what they are for.
+    `use` says in it what they are for. What `kept` holds is not decoded.
     """
     decoded = decode_frames(
         video,
@@ -374,6 +381,8 @@ def decodable_frames(
         display=display,
         wanted=wanted,
     )
+    if kept is not None and wanted is not None:
+        decoded = kept.of(wanted, decoded)
     count = 0
     try:
         for index, image in decoded:

@@ -40,9 +40,9 @@ from colmap_av1.video.encoders import (
     settings,
 )
 from colmap_av1.video.facts import with_counted_packets
-from colmap_av1.video.positions import read_positions
+from colmap_av1.video.metadata.positions import read_positions
+from colmap_av1.video.metadata.telemetry import carrying, loss_of
 from colmap_av1.video.stored_frames import count_frames
-from colmap_av1.video.telemetry import carrying, loss_of
 from colmap_av1.video.unchanged import unchanged
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}

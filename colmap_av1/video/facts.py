@@ -27,7 +27,7 @@ from colmap_av1.video.container import (
     open_stream,
 )
 from colmap_av1.video.display import Display, shown_size, turn_of_matrix
-from colmap_av1.video.spherical import projection_of
+from colmap_av1.video.metadata.spherical import projection_of
 from colmap_av1.video.stored_frames import decode_stream
 from colmap_av1.video.unchanged import file_state
 

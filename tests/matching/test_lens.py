@@ -10,7 +10,7 @@ from conftest import Ffmpeg
 from colmap_av1 import CameraOptions, MatchOptions, match
 from colmap_av1.database.reading import read_cameras
 from colmap_av1.matching.image_matches import Shape, _focal_length_of
-from colmap_av1.video.lens import doubtful_lens, said_focal_length
+from colmap_av1.video.metadata.lens import doubtful_lens, said_focal_length
 
 TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 

@@ -15,7 +15,7 @@ from colmap_av1 import _core
 from colmap_av1.images.masks import make_mask
 from colmap_av1.model.colmap_model import ModelPoints, no_points
 from colmap_av1.model.coverage import PosedCamera
-from colmap_av1.model.splats.sweep import swept_points
+from colmap_av1.model.splats.sweep import Sweep
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 CAMERA = pycolmap.Camera(
@@ -77,9 +77,13 @@ def on_wall(*, through: bool = False) -> ModelPoints:
     return ModelPoints(xyz, rgb, np.full(len(xyz), 0.1), offsets, image, xy)
 
 
-def sweep(points: ModelPoints, pictures=None, views=VIEWS, takes=ONE_VIDEO) -> ModelPoints:
-    shown = enumerate(PICTURES) if pictures is None else pictures
-    return swept_points(points, views, takes, shown, num_threads=2, progress=lambda _: None)
+def sweep(
+    points: ModelPoints, pictures=None, views=VIEWS, takes=ONE_VIDEO, num_threads=2
+) -> ModelPoints:
+    with Sweep(points, views, takes, num_threads=num_threads) as found:
+        for image, picture in enumerate(PICTURES) if pictures is None else pictures:
+            found.add(image, picture)
+        return found.result()
 
 
 def test_what_no_track_shows_is_found_where_it_is() -> None:
@@ -100,9 +104,7 @@ def test_what_no_track_shows_is_found_where_it_is() -> None:
 
 
 def test_the_number_of_threads_does_not_change_it() -> None:
-    one = swept_points(
-        *(on_wall(), VIEWS, ONE_VIDEO, enumerate(PICTURES)), num_threads=1, progress=lambda _: None
-    )
+    one = sweep(on_wall(), num_threads=1)
     two = sweep(on_wall())
     for a, b in zip(vars(one).values(), vars(two).values(), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -17,8 +17,8 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.takes import count_through
 from colmap_av1.video.container import read_file
 from colmap_av1.video.facts import read_video
-from colmap_av1.video.gpmf import read_payload
-from colmap_av1.video.positions import Positions, doubtful_place, read_positions
+from colmap_av1.video.metadata.gpmf import read_payload
+from colmap_av1.video.metadata.positions import Positions, doubtful_place, read_positions
 
 PLACES = np.array([[59.33 + k * 1e-5, 18.07 - k * 2e-5, 20 + k * 0.1] for k in range(10)])
 

@@ -14,7 +14,7 @@ from conftest import Encode, Ffmpeg, make_frames
 from colmap_av1.errors import VideoError
 from colmap_av1.match import match
 from colmap_av1.video.facts import read_video
-from colmap_av1.video.spherical import hint
+from colmap_av1.video.metadata.spherical import hint
 
 # Google's Spherical Video RFC, version 1: XML in a box of this type in the track.
 UUID = bytes.fromhex("ffcc8263f8554a938814587a02521fdd")

@@ -16,7 +16,7 @@ from colmap_av1.options import EncodeOptions
 from colmap_av1.video.container import read_file
 from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
-from colmap_av1.video.positions import read_positions
+from colmap_av1.video.metadata.positions import read_positions
 
 PLACES = np.array([[59.33 + k * 1e-5, 18.07 - k * 2e-5, 20 + k * 0.1] for k in range(10)])
 FAST = EncodeOptions(speed=9)

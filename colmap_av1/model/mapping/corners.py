@@ -58,6 +58,7 @@ def corners_in_images(
             *(run.sources[video].pictures, num_frames, run.options.match),
             wanted=mask_of,
             use="corners are followed",
+            kept=run.sources[video].kept,
         )
         report = progress_in(run.progress, "refinement", len(own))
         density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()

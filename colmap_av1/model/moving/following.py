@@ -90,11 +90,13 @@ def _on_pictures(
     """Tracks of a video, of frames that are counted through, corrected on its pictures."""
     frame = tracks.frame - np.int32(first_frame)
     wanted = frozenset(np.unique(frame).tolist())
-    pictures = run.sources[video].pictures
-    width, height = pictures.picture_size
+    source = run.sources[video]
+    width, height = source.pictures.picture_size
     num_frames = max(wanted) + 1
     own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
-    decoded = decodable_frames(pictures, num_frames, run.options.match, wanted=wanted)
+    decoded = decodable_frames(
+        source.pictures, num_frames, run.options.match, wanted=wanted, kept=source.kept
+    )
     report = progress_in(run.progress, "refinement", len(wanted))
     found = refine_tracks(own, decoded, _LK, report, expected=expected)
     return replace(tracks, xy=found.xy, sigma=found.sigma, confirmed=found.confirmed)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.model.colmap_model import ModelPoints, take_rows
+from colmap_av1.model.colmap_model import ModelPoints, joined_points, take_rows
 from colmap_av1.model.coverage import (
     CELL,
     PosedCamera,
@@ -79,13 +77,13 @@ def splat_cloud(
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
         kept = take_points(points, np.sort(order))
-        return _joined(kept, _filling(kept, images, keys))
+        return joined_points([kept, _filling(kept, images, keys)])
     # Holes come before detail, but not before the surfaces that tell how deep they are.
     kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
     filled = _filling(kept, images, keys)
     filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
     kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
-    return _joined(kept, filled)
+    return joined_points([kept, filled])
 
 
 def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
@@ -95,12 +93,6 @@ def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
         *(points.xyz[rows], points.rgb[rows], points.error[rows], offsets),
         *(points.image[seen], points.xy[seen]),
     )
-
-
-def _joined(one: ModelPoints, two: ModelPoints) -> ModelPoints:
-    pairs = zip(vars(one).values(), vars(two).values(), strict=True)
-    joined = ModelPoints(*(np.concatenate(pair) for pair in pairs))
-    return replace(joined, offsets=np.append(one.offsets, two.offsets[1:] + one.offsets[-1]))
 
 
 def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
@@ -160,7 +152,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) 
         there = [i for i in around if 0 <= i < len(images)]
         filled.append(_with_observations(xyz, images, there, keys[place]))
     order = np.argsort(~np.concatenate(is_first), kind="stable")
-    return take_points(reduce(_joined, filled), order)
+    return take_points(joined_points(filled), order)
 
 
 def _spread_order(count: int) -> list[int]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import VideoError
 from colmap_av1.util.texts import shown
 from colmap_av1.video.container import VideoFile, open_container
-from colmap_av1.video.gpmf import Payload, read_payload
+from colmap_av1.video.metadata.gpmf import Payload, read_payload
 
 # As Apple and Android spell one position: ISO 6709, annex H, in degrees.
 _TAGS = ("com.apple.quicktime.location.iso6709", "location", "location-eng", "xyz")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.video.container import VideoFile, open_container, read_file
-from colmap_av1.video.positions import Positions, read_positions
+from colmap_av1.video.metadata.positions import Positions, read_positions
 
 # Apple's and Android's names of tags, which FFmpeg writes to .mp4 files only when told to.
 _KEYS = "com."

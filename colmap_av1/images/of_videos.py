@@ -1,0 +1,86 @@
+"""Which images of a model are of which video, and of which size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from colmap_av1.errors import ImageError, ModelError
+from colmap_av1.images.choosing import check_frame_list
+from colmap_av1.images.files import size_of_images
+from colmap_av1.images.inputs import Inputs
+from colmap_av1.images.masks import VideoMasks
+from colmap_av1.options import DensifyOptions
+from colmap_av1.video.facts import Video
+
+
+@dataclass(frozen=True)
+class VideoImages:
+    """A video, the model's images of it by their names in a folder, their size and masks."""
+
+    video: Video
+    names: list[str]
+    folder: Path | None
+    size: tuple[int, int]
+    masks: VideoMasks | None
+
+
+def images_of_videos(
+    model: Path,
+    sizes: Mapping[str, tuple[int, int]],
+    inputs: Inputs,
+    folder: Path | None,
+    options: DensifyOptions,
+) -> list[VideoImages]:
+    """The model's images of each video, of (width, height) by their names; refuses others.
+
+    Raises:
+        ModelError: the model has an image of another video, or none of one.
+        ImageError: images do not fit their video.
+    """
+    photos = {photo.name for photo in inputs.photos}
+    of_label: dict[str, dict[str, tuple[int, int]]] = {label: {} for label in inputs.labels}
+    for name in sorted(sizes.keys() - photos):
+        label, _, own = name.partition("/") if len(of_label) > 1 else ("", "", name)
+        if label not in of_label:
+            raise ModelError(
+                f"{model}: image '{name}' lies in no folder of a video, "
+                f"{', '.join(of_label)}: give the video it comes from, or the photos as --images"
+            )
+        of_label[label][own] = sizes[name]
+    found = []
+    given = zip(inputs.videos, of_label.items(), inputs.masks_of_videos, strict=True)
+    for video, (label, listed), masks in given:
+        if not listed:
+            raise ModelError(f"{model}: has no image of {video}: leave that video out")
+        own_folder = folder / label if folder is not None else None
+        images = _images_of_video(model, video, listed, own_folder, options)
+        if masks is not None:
+            sizes_of_masks = [images.size, video.picture_size]
+            masks.check(sizes_of_masks, images.names, options.match.images)
+        found.append(replace(images, masks=masks))
+    return found
+
+
+def _images_of_video(
+    model: Path,
+    video: Video,
+    sizes: Mapping[str, tuple[int, int]],
+    folder: Path | None,
+    options: DensifyOptions,
+) -> VideoImages:
+    """The model's images of a video; refuses those that do not fit it."""
+    check_frame_list(options.match.images)
+    if len(sizes) < 2:
+        raise ModelError(
+            f"{model}: only one image of {video} has a pose: give a model with two or more"
+        )
+    try:
+        size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
+    except ImageError as error:
+        raise ImageError(f"{model}: {error}") from error
+    missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
+    if missing is not None:
+        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
+    return VideoImages(video, list(sizes), folder, size, None)

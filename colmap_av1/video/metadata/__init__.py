@@ -1,0 +1,1 @@
+"""What containers carry beside the pictures: where, by which lens and how they were taken."""
