@@ -26,6 +26,7 @@ from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.coverage import evenly_spread
 from colmap_av1.options import (
     ImageOptions,
     MatchOptions,
@@ -246,11 +247,17 @@ def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
     assert written[0][1].read_bytes() == written[1][1].read_bytes()
 
 
-def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
+@pytest.mark.parametrize("at_once", [True, False])
+def test_long_videos_have_fewer_images_than_frames(
+    at_once: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of 60 frames about as many as asked for become images, unless an option says which.
 
-    Of many more frames every n-th is looked at.
+    Of many more frames twice as many are looked at. Where their tracks are too many to be held,
+    the motion is read twice.
     """
+    if not at_once:
+        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._MOST_HELD", 0)
 
     def stop(stage: str, *_: object) -> None:
         if stage == "pairs":
@@ -268,11 +275,38 @@ def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
         with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
             chosen.append(file["frames"])
             np.testing.assert_array_equal(np.unique(file["frame"]), chosen[-1])
+            assert np.diff(file["offsets"]).min() >= (2 if name != "all" else 3)
             assert file["names"][1] == f"frame_{chosen[-1][1]:06d}.png"
     assert 25 <= len(chosen[0]) <= 30
     assert (chosen[0][0], chosen[0][-1], len(chosen[1])) == (0, 59, 60)
     assert 10 <= len(chosen[2]) <= 12
-    assert set(chosen[2].tolist()) <= set(range(0, 60, 3))
+    assert set(chosen[2].tolist()) <= set(evenly_spread(60, 20))
+
+
+def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tracks of the images are the same where all are kept, or those of more frames cut."""
+
+    def stop(stage: str, *_: object) -> None:
+        if stage == "pairs":
+            raise KeyboardInterrupt
+
+    tracks = []
+    for name, held in (("once", 1 << 40), ("twice", 0)):
+        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._MOST_HELD", held)
+        monkeypatch.setattr(
+            "colmap_av1.model.reconstruct_tracks.spread_images",
+            lambda *_: np.arange(0, 60, 5, dtype=np.int32),
+        )
+        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._CANDIDATES", 6)
+        options = ReconstructOptions(max_images=10)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+        with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
+            tracks.append({part: file[part] for part in file.files})
+    for part, values in tracks[0].items():
+        np.testing.assert_array_equal(values, tracks[1][part])
 
 
 def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:

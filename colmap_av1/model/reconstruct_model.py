@@ -39,7 +39,6 @@ from colmap_av1.model.track_points import (
     seen_in,
     to_model_points,
 )
-from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.model.undistort import (
     on_pinhole,
     pinhole_camera,
@@ -57,13 +56,14 @@ _MASKS = "masks"
 
 
 def _tracked_points(
-    run: Run,
-    placed: PosedImages,
-    views: Sequence[PosedCamera],
-    seen: Tracks,
-    view: NDArray[np.int64],
-) -> tuple[TriangulatedPoints, ModelPoints]:
-    """Points of all tracks, and these as a model of the undistorted images has them, in black."""
+    run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
+) -> tuple[ModelPoints, float]:
+    """Points of all tracks, as a model of the undistorted images has them, in black.
+
+    Returns:
+        The points, and the share of the tracks that agree with the poses.
+    """
+    seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(
         *(run, placed, seen, view),
         options=run.options.triangulate,
@@ -72,7 +72,8 @@ def _tracked_points(
     )
     check_agreement(len(points.xyz), points.num_tracks)
     xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
-    return points, to_model_points(points, view, xy)
+    agreeing = points.num_agreeing / max(points.num_tracks, 1)
+    return to_model_points(points, view, xy), agreeing
 
 
 def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
@@ -247,9 +248,8 @@ def model_stage(
         joined = placed.masks_with(moving)
         counting = undistorted_masks(joined, placed.camera_of_image, cameras)
         views = views_of(images, cameras, counting)
-        seen, view = seen_in(tracks, placed.frames)
         with clock.measure("points"):
-            points, tracked = _tracked_points(run, placed, views, seen, view)
+            tracked, agreeing = _tracked_points(run, placed, views, tracks)
         files, cloud = _written_cloud(run, partial / "images", placed, views, tracked)
         check_unchanged(*run.files)
         with clock.measure("coverage"):
@@ -271,7 +271,7 @@ def model_stage(
             "far_views": far_views.median,
             "far_views_largest": far_views.largest,
             "far_views_warning": far_views.warning,
-            "agreeing": points.num_agreeing / max(points.num_tracks, 1),
+            "agreeing": agreeing,
         }
 
     how = (options.triangulate, options.match.images.image_name, options.moving)

@@ -20,6 +20,7 @@ from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.matching.link_plan import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
+from colmap_av1.model.coverage import evenly_spread
 from colmap_av1.model.track_points import chaining_for_points
 from colmap_av1.options import (
     MatchOptions,
@@ -28,6 +29,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.tracks.tracks import (
     Tracks,
+    every_nth_track,
     in_frames_alone,
     keep_frames,
     keep_long_tracks,
@@ -49,9 +51,14 @@ from colmap_av1.video.unchanged import FileState, check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
-# Frames that the images of a long video are chosen among, to one of these, at least.
+# Frames that the images of a long video are chosen among, to one of these.
 _CANDIDATES = 2
-# Width in pixels of the squares that tracks start in which they are chosen by.
+# Observations that are held of them at most, and the pixels that one of these may be there for.
+_MOST_HELD = 24_000_000
+_PIXELS_OF_UNIT = 16
+# They are chosen by one in so many tracks, or by those of squares of so many pixels: a quarter of
+# those that poses come from.
+_FEWER = 4
 _SEEDING = 8
 # Of its images, that see a track at least.
 _FEWEST_SEEN = 2
@@ -172,19 +179,15 @@ def _track_and_choose(
 ) -> tuple[TrackedVideo, ChosenImages, bool]:
     """Chain the motion of a video into tracks, and choose its images.
 
-    Of a long video the images are chosen first, and no other frame's observations are kept, unless
-    the shutter is to be corrected by the motion between neighbours.
-
     Returns:
         The tracks, the images, and whether the video is long.
     """
     source, clock, progress = run.sources[video], run.clock, run.progress
-    chosen = _images_of_long_video(run, video) if not options.images.ways else None
-    is_long = chosen is not None
-    has_shutter = options.camera.rolling_shutter != "none"
-    some = None if chosen is None or has_shutter else chosen.frames
-    tracked = _track(run, video, options, frames=some, clock=clock)
-    if chosen is None:
+    is_long = not options.images.ways and count_frames(source) > run.options.max_images
+    if is_long:
+        tracked, chosen = _track_long(run, video, options)
+    else:
+        tracked = _track(run, video, options, frames=None, clock=clock)
         with clock.measure("choice"):
             chosen = choose_images(
                 pose_tracks(run, tracked.tracks),
@@ -199,10 +202,16 @@ def _track_and_choose(
     )
     masks = run.inputs.masks_of_videos[video]
     if masks is not None:
-        least = least_length(options.tracks) if some is None else _FEWEST_SEEN
+        all_there = not is_long or _has_shutter(options)
+        least = least_length(options.tracks) if all_there else _FEWEST_SEEN
         left = masks.on_tracks(tracked.tracks, chosen, least)
         tracked = replace(tracked, tracks=left)
     return tracked, chosen, is_long
+
+
+def _has_shutter(options: MatchOptions) -> bool:
+    """Whether the shutter is to be corrected, by the motion between all neighbouring frames."""
+    return options.camera.rolling_shutter != "none"
 
 
 def _track(
@@ -225,32 +234,50 @@ def _track(
     return replace(tracked, tracks=left, inter_share=masks.on_motion(tracked.inter_share))
 
 
-def _images_of_long_video(run: Run, video: int) -> ChosenImages | None:
-    """As many images as a trainer wants of a video with more frames, its key images among them.
+def _track_long(run: Run, video: int, options: MatchOptions) -> tuple[TrackedVideo, ChosenImages]:
+    """The tracks of a video with more frames than a trainer wants, in so many images alone.
 
-    Its motion is read once for this choice alone, so that observations in the other frames are
-    never held. Of very long videos every n-th frame is looked at.
-
-    Returns:
-        The images; None of a video that is not long.
+    These are chosen among frames that lie evenly. Where the tracks of all of these are too much to
+    be held, the motion is read once for the choice alone, by few tracks, and then again; so too
+    where the shutter is to be corrected or tracks are refined, which takes other frames.
     """
-    most, num_frames = run.options.max_images, count_frames(run.sources[video])
-    if num_frames <= most:
-        return None
-    step = max(1, num_frames // (_CANDIDATES * most))
-    candidates = np.arange(0, num_frames, step, dtype=np.int32)
-    with run.clock.measure("choice"):
-        # A quarter of the tracks that poses come from is enough: no more are held of all frames.
-        chaining = replace(run.options.match.tracks, seeding=_SEEDING)
-        options = replace(run.options.match, tracks=chaining, refine=RefineOptions())
-        tracked = _track(run, video, options, frames=candidates, clock=Clock())
-        tracks = tracked.tracks
-        candidates = candidates[candidates < tracks.num_frames]
-        names = image_names(options.images.image_name, candidates.tolist())
-        every = ChosenImages(names, candidates)
-        key = key_images_of_video(run, tracks, every, tracked.inter_share)
-        alone = in_frames_alone(tracks, candidates)
-        return every.some(spread_images(alone, min(most, len(candidates)), key))
+    source, clock = run.sources[video], run.clock
+    count = count_frames(source)
+    most = min(count, _CANDIDATES * run.options.max_images)
+    candidates = np.array(evenly_spread(count, most), dtype=np.int32)
+    width, height = source.stream.picture_size
+    held = len(candidates) * width * height / _PIXELS_OF_UNIT
+    is_plain = options.refine.refine == "none" and not _has_shutter(options)
+    if is_plain and held <= _MOST_HELD:
+        tracked = _track(run, video, options, frames=candidates, clock=clock)
+        with clock.measure("choice"):
+            few = every_nth_track(tracked.tracks, _FEWER)
+            chosen = _spread_in(run, video, replace(tracked, tracks=few), candidates)
+            tracks = keep_frames(tracked.tracks, chosen.frames)
+            return replace(tracked, tracks=keep_long_tracks(tracks, _FEWEST_SEEN)), chosen
+    with clock.measure("choice"):
+        sketch = replace(
+            run.options.match,
+            tracks=replace(run.options.match.tracks, seeding=_SEEDING),
+            refine=RefineOptions(),
+        )
+        tracked = _track(run, video, sketch, frames=candidates, clock=Clock())
+        chosen = _spread_in(run, video, tracked, candidates)
+    frames = None if _has_shutter(options) else chosen.frames
+    return _track(run, video, options, frames=frames, clock=clock), chosen
+
+
+def _spread_in(
+    run: Run, video: int, tracked: TrackedVideo, candidates: NDArray[np.int32]
+) -> ChosenImages:
+    """As many images as a trainer wants among some frames of a video, its key images with them."""
+    tracks = tracked.tracks
+    candidates = candidates[candidates < tracks.num_frames]
+    names = image_names(run.options.match.images.image_name, candidates.tolist())
+    every = ChosenImages(names, candidates)
+    key = key_images_of_video(run, tracks, every, tracked.inter_share)
+    most = min(run.options.max_images, len(candidates))
+    return every.some(spread_images(in_frames_alone(tracks, candidates), most, key))
 
 
 def key_images_of_video(

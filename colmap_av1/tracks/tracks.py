@@ -211,6 +211,12 @@ def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
     return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
 
 
+def every_nth_track(tracks: Tracks, n: int) -> Tracks:
+    """One in `n` of the tracks, in their former order."""
+    kept = np.arange(len(tracks.offsets) - 1) % n == 0
+    return keep_observations(tracks, np.repeat(kept, np.diff(tracks.offsets)))
+
+
 def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
     """The tracks, cut in two wherever they pass from one of these frames to the next.
 

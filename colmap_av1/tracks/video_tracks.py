@@ -222,7 +222,7 @@ def track_video(
         progress("motion", done, source.stream.likely_num_packets)
 
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("always", UserWarning)
         with clock.measure("tracks"):
             presented = source.pictures.presented
             stored = frames if frames is None or presented is None else presented[frames]
@@ -344,7 +344,7 @@ def refine_in_images(
     if not source.is_downscaled or options.refine.refine != "none":
         return tracked
     with clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("always", UserWarning)
         wanted = frozenset(frames.tolist())
         num_frames = int(frames[-1]) + 1
         pictures = decodable_frames(
