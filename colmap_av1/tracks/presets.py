@@ -23,7 +23,7 @@ class Limits:
 PRESETS = {
     # Poses need wide baselines; points do not, and long tracks take a mapper's time.
     "sparse": Limits(1500, spacing=12.0, min_images=3, max_sigma=0.8, wide_tracks=1000),
-    "default": Limits(2500, spacing=9.0, min_images=3, max_sigma=0.8, wide_tracks=300),
+    "default": Limits(3500, spacing=7.5, min_images=3, max_sigma=0.8, wide_tracks=300),
     "dense": Limits(0, spacing=0.0, min_images=1, max_sigma=0.0, wide_tracks=0),
 }
 

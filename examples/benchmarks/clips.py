@@ -64,6 +64,7 @@ CASES = (
     Case("kitchen", image_step=2),
     Case("log_building"),
     Case("ditch"),
+    Case("holiday_display"),
 )
 
 

@@ -111,7 +111,7 @@ def main() -> int:
         "--sequences",
         nargs="+",
         choices=[case.name for case in CASES],
-        default=["street", "shelfbox", "log_building", "kitchen"],
+        default=[case.name for case in CASES if case.name != "scene"],
     )
     parser.add_argument("--rounds", type=int, default=3)
     add_results(parser, "end_to_end")

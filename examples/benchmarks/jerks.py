@@ -136,6 +136,8 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, required=True, help="folder for models and clips")
     parser.add_argument("--places", type=int, default=50, help="how many are tried")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     add_results(parser, "jerks")
     arguments = parser.parse_args()
     console = Console(stderr=True)
@@ -145,11 +147,11 @@ def main() -> int:
     # By sequence, so that the pictures of one are held at a time.
     for place in sorted(places, key=lambda place: (place % len(SEQUENCES), place)):
         name = SEQUENCES[place % len(SEQUENCES)]
-        if not ruler.is_there(name):
+        if name not in arguments.sequences or not ruler.is_there(name):
             continue
         if whole is None or whole.name != name:
             whole = whole_sequence(name, cache / name, console)
-        for row in try_place(whole, place, cache / "place", console):
+        for row in try_place(whole, place, arguments.ways, cache / "place", console):
             save(arguments.results, [asdict(row)], ("place", "way"))
     print(render.jerks(read_rows(arguments.results)), end="")
     return 0
@@ -183,8 +185,10 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
     return Whole(name, pictures, camera, case.forward_motion, model, poses)
 
 
-def try_place(whole: Whole, place: int, folder: Path, console: Console) -> list[Row]:
-    """A clip with gaps by both ways."""
+def try_place(
+    whole: Whole, place: int, ways: Sequence[str], folder: Path, console: Console
+) -> list[Row]:
+    """A clip with gaps by some ways."""
     rng = np.random.default_rng(place)
     gaps = gaps_of(whole, rng)
     blur = int(rng.choice(BLURS)) if place % 2 else 0
@@ -203,7 +207,7 @@ def try_place(whole: Whole, place: int, folder: Path, console: Console) -> list[
         ],
     )
     rows = []
-    for way in WAYS:
+    for way in ways:
         made, said = way_of(way, whole, clip, folder)
         num_registered, ate = figures(whole, made, kept)
         row = Row(
