@@ -19,7 +19,7 @@ from colmap_av1.images.camera import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
-from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
+from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_chosen
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.image_matches import (
     MatchedImages,
@@ -205,11 +205,14 @@ def match(
         cameras, linked = _match_images(
             images, database, listed, options, clock=clock, progress=progress
         )
-        num_written = 0
+        num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
             with clock.measure("images"):
-                num_written = _write_images(images, folder, options, progress)
+                num_written = place_photos(inputs.photos, folder)
+                labelled = zip(inputs.labels, images.videos, strict=True)
+                of_videos, blurred = write_all_chosen(labelled, folder, options, progress)
+                num_written += of_videos
 
     with clock.measure("database"):
         positions = image_positions(images.takes, inputs.videos, inputs.photos)
@@ -236,7 +239,7 @@ def match(
         read_outs=tuple(own.tracked.read_out for own in videos),
         seconds=clock.seconds,
         links=linked.report,
-        warnings=(*inputs.warnings, *notes, *cameras.warnings, *linked.report.warnings),
+        warnings=(*inputs.warnings, *notes, *cameras.warnings, *linked.report.warnings, *blurred),
         **_figures([own.tracks for own in videos], linked.matched),
     )
 
@@ -287,18 +290,6 @@ def _prepare(
     ]
     takes = inputs.takes([own.chosen for own in videos], [own.tracks.num_frames for own in videos])
     return _Images(inputs, videos, takes)
-
-
-def _write_images(images: _Images, folder: Path, options: MatchOptions, progress: Progress) -> int:
-    """Write the images of the videos, and copy the photos; returns how many were not there."""
-    num_written = place_photos(images.inputs.photos, folder)
-    for label, own in zip(images.inputs.labels, images.videos, strict=True):
-        num_written += write_chosen(
-            *(own.source.pictures, folder / label, own.chosen, options),
-            display=own.display,
-            progress=progress,
-        )
-    return num_written
 
 
 def _match_images(

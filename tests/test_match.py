@@ -82,6 +82,11 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
     assert report.warnings == ()
 
 
+def test_images_hold_as_many_tracks_as_mappers_make_sifts_points_of(tmp_path: Path) -> None:
+    report = match(tmp_path / "a.db", PROJECT / "examples" / "scene.mp4")
+    assert 2500 < report.num_observations / report.num_images <= 3500
+
+
 @pytest.mark.parametrize("image_path", [None, "images"])
 def test_the_video_is_opened_once_and_passed_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image_path: str | None

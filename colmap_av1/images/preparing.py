@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.images.camera import make_camera
 from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import (
+    blur_warning,
     check_image_folder,
     check_images_there,
     existing_images,
@@ -278,6 +279,35 @@ def write_chosen(
         display=display,
         progress=lambda done: progress("images", done, len(chosen.names)),
     )
+
+
+def write_all_chosen(
+    videos: Iterable[tuple[str, PreparedImages]],
+    folder: Path,
+    options: MatchOptions,
+    progress: Progress,
+) -> tuple[int, list[str]]:
+    """Write the chosen frames of videos as images, see `write_chosen`.
+
+    Args:
+        videos: the folder of each video's images in that of all, and these.
+        folder: where the images go.
+        options: as of `write_chosen`.
+        progress: as of `write_chosen`.
+
+    Returns:
+        The number of images written, and what the user should know of all images.
+    """
+    num_written, warnings = 0, list[str]()
+    for label, own in videos:
+        num_written += write_chosen(
+            *(own.source.pictures, folder / label, own.chosen, options),
+            display=own.display,
+            progress=progress,
+        )
+        warning = blur_warning([folder / label / name for name in own.chosen.names])
+        warnings += [warning] if warning is not None else []
+    return num_written, warnings
 
 
 def _way_back(

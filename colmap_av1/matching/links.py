@@ -214,7 +214,7 @@ def link_images(
                 *(plan, takes, matched, cameras, features), options=options, progress=progress
             )
 
-    weak, maybe, probes = weak_and_probed_gaps(takes, inter_share, options.links)
+    weak, maybe, probes = weak_and_probed_gaps(takes, matched, inter_share, options.links)
     plan = plan_links(takes, matched, weak, images_apart, options.links)
     if options.links.links != "none" and (maybe.any() or probes):
         first = Plan.of_first_look(np.flatnonzero(maybe), probes, takes)

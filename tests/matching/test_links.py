@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -28,7 +29,13 @@ from colmap_av1.matching.retrieval import similar_images
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.weak_gaps import weak_frames, weak_gaps
 from colmap_av1.model.colmap_model import camera_centres
-from colmap_av1.options import ImageOptions, LinkOptions, MatchOptions, ReconstructOptions
+from colmap_av1.options import (
+    CameraOptions,
+    ImageOptions,
+    LinkOptions,
+    MatchOptions,
+    ReconstructOptions,
+)
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames
 
@@ -185,6 +192,21 @@ def test_nothing_is_decoded_where_motion_connects_all(
     monkeypatch.setattr("colmap_av1.images.takes.decodable_frames", refuse)
     report = match(tmp_path / "a.db", SCENE)
     assert report.links.num_images == 0
+
+
+@pytest.mark.shared
+def test_drive_whose_motion_is_rigid_needs_no_pictures(
+    shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of its units are intra coded, yet nearly all of its motion is that of a rigid scene."""
+    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:9]
+    drive = encode(np.array([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
+    street = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
+    options = MatchOptions(camera=street, images=ImageOptions(every=1))
+    assert match(tmp_path / "a.db", drive, options=options).links.num_images == 0
+    monkeypatch.setattr("colmap_av1.matching.link_plan._RIGID_SHARE", 1.1)
+    assert match(tmp_path / "b.db", drive, options=options).links.num_images > 0
+    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
 def test_gaps_that_only_seem_weak_need_few_pictures(

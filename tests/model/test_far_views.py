@@ -61,6 +61,16 @@ def test_bent_model_is_told(
     assert main([*whole, "--image_path", str(images)]) == 0
 
 
+def test_pictures_that_show_nothing_are_told(made: ReconstructReport, tmp_path: Path) -> None:
+    for path in (made.output / "images").iterdir():
+        blurred = cv2.blur(cv2.imread(str(path)), (61, 61))
+        cv2.imwrite(str(tmp_path / path.name), blurred)
+    found = model_far_views(read_model(made.output / "sparse" / "0"), tmp_path)
+    assert found.median is None
+    assert found.warning is not None
+    assert "show nothing in common" in found.warning
+
+
 def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: Path) -> None:
     for path in (made.output / "images").iterdir():
         cv2.imwrite(str(tmp_path / path.name), np.zeros((20, 30, 3), np.uint8))

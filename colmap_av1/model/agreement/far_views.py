@@ -41,6 +41,8 @@ _NUM_IMAGES = 16
 # Pixels that views from far apart in time may disagree by before it is said: the surfaces of
 # models that hold together agree to less than one, or two with long focal lengths.
 _FAR_APART = 4.0
+# Pairs without a match from which on it is said that there is none.
+_FEWEST_TRIED = 3
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,14 @@ class FarViews:
         pairs: (name, name) of the images of each pair that has matches.
         error: float64 [num_pairs] median distance in pixels of a pair's matched features from
             their epipolar lines, by the poses.
+        num_tried: pairs that by the poses see the same, whose pictures were matched.
+        num_features: median number of features of these pictures; 0 without any.
     """
 
     pairs: tuple[tuple[str, str], ...]
     error: _Floats
+    num_tried: int
+    num_features: int
 
     @property
     def median(self) -> float | None:
@@ -73,7 +79,14 @@ class FarViews:
 
     @property
     def warning(self) -> str | None:
-        """What the user should know of a model that does not hold together."""
+        """What the user should know of a model that does not hold together, or of its pictures."""
+        if not self.pairs and self.num_tried >= _FEWEST_TRIED:
+            return (
+                f"the pictures of {self.num_tried} pairs of images far apart in time, which by "
+                f"the poses see the same, show nothing in common, with {self.num_features} "
+                "features each, sharp ones have hundreds: they are blurred or plain, or the poses "
+                "are wrong"
+            )
         if self.largest is None or self.worst is None or self.largest <= _FAR_APART:
             return None
         first, second = self.worst
@@ -138,7 +151,13 @@ class FarViewCheck:
             if len(error):
                 names.append((self._images[i].name, self._images[j].name))
                 errors.append(float(np.median(error)))
-        return FarViews(tuple(names), np.array(errors))
+        sizes = [len(features.xy) for features in self._features.values()]
+        return FarViews(
+            tuple(names),
+            np.array(errors),
+            num_tried=len(self._pairs),
+            num_features=int(np.median(sizes)) if sizes else 0,
+        )
 
     def _errors(self, i: int, j: int, xa: NDArray[Any], xb: NDArray[Any]) -> _Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
