@@ -154,6 +154,7 @@ def read_inputs(
     for own in videos:
         check_is_plane(own.path, own.projection, own.picture_size[0])
     _check_different(videos)
+    _check_rates(videos, options)
     places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
     if folder is not None:
         places.append(os.path.abspath(folder))
@@ -162,7 +163,7 @@ def read_inputs(
     _check_one_camera(videos, found, options)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
-    said = [(doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
+    said = [(v.doubtful_times, doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
     doubts = _with_names(videos, [[note for note in own if note is not None] for own in said])
     notes = (*hints, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
@@ -225,6 +226,17 @@ def _check_different(videos: Sequence[Video]) -> None:
         for other in videos[:index]:
             if _are_same(video, other):
                 raise VideoError(f"{video} and {other} are the same video: give it once")
+
+
+def _check_rates(videos: Sequence[Video], options: MatchOptions) -> None:
+    """Refuse a read-out time in milliseconds where nothing says how long a frame is."""
+    shutter = options.camera.rolling_shutter
+    unknown = next((video for video in videos if video.frame_rate is None), None)
+    if unknown is not None and shutter not in ("none", "estimate"):
+        raise OptionError(
+            f"rolling_shutter is {shutter} milliseconds, but {unknown} does not say its frame "
+            "rate: leave it out, or give a copy of the video that does"
+        )
 
 
 def _are_same(a: Video, b: Video) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -106,6 +107,8 @@ def inspect(
         raise VideoError(f"{video}: shows no frame: give a video with pictures")
     # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
     opened = read_video(video)
+    if opened.doubtful_times is not None:
+        warnings.warn(f"{video}: {opened.doubtful_times}", stacklevel=2)
     num_presented = structure.num_shown
     if opened.presented is not None:
         num_presented = int((opened.presented < structure.num_shown).sum())

@@ -97,8 +97,10 @@ def read_motion(
             yield _frame_motion(event, display_index)
             count += 1
     except BitstreamError as error:
-        if options.strict or count == 0:
+        if options.strict:
             raise
+        if count == 0:
+            raise BitstreamError(f"{error}: no frame can be read: give another copy") from error
         warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
     if num_irregular:
         warnings.warn(

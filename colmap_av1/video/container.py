@@ -65,6 +65,7 @@ class VideoFile:
         stored_size: (width, height) in pixels of the pictures as they are stored.
         frame_rate: average frames per second; None where unknown.
         duration: length in seconds; None where unknown.
+        is_timed: the container says when its frames are shown.
         num_packets: packets of the video, usually one a frame; None where the container does
             not say.
         dynamic_range: name of the transfer function of high dynamic range that its pictures
@@ -81,6 +82,7 @@ class VideoFile:
     stored_size: tuple[int, int]
     frame_rate: float | None
     duration: float | None
+    is_timed: bool
     num_packets: int | None
     dynamic_range: str | None
     tags: tuple[tuple[str, str], ...]
@@ -122,7 +124,7 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         state: the file before it was opened.
     """
     rate = stream.average_rate or stream.guessed_rate
-    is_timed = not _is_ivf_without_rate(state.path)
+    is_timed = not (_is_ivf_without_rate(state.path) or _is_mp4_without_scale(container, stream))
     return VideoFile(
         path=state.path,
         state=state,
@@ -132,6 +134,7 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         stored_size=(stream.codec_context.width, stream.codec_context.height),
         frame_rate=float(rate) if rate and is_timed else None,
         duration=_stream_duration(container, stream) if is_timed else None,
+        is_timed=is_timed,
         num_packets=stream.frames or None,
         dynamic_range=_HIGH_RANGES.get(stream.codec_context.color_trc),
         tags=tuple((str(k).lower(), str(v)) for k, v in container.metadata.items()),
@@ -156,7 +159,6 @@ class VideoStream:
         try:
             self._stream = _find_av1_stream(self._container, path)
             self.file = describe(self._container, self._stream, state)
-            self._is_timed = not _is_ivf_without_rate(path)
             self.configuration = _configuration_obus(self._stream.codec_context.extradata)
         except BaseException:
             self.close()
@@ -202,7 +204,7 @@ class VideoStream:
                 continue
             if packet.is_corrupt:
                 raise BitstreamError(f"{self.file}: cut off inside packet {index + 1}")
-            is_timed = self._is_timed and packet.pts is not None
+            is_timed = self.file.is_timed and packet.pts is not None
             pts = float(packet.pts * packet.time_base) if is_timed else None
             last = packet
             yield Packet(memoryview(packet).toreadonly(), pts, index)
@@ -298,6 +300,16 @@ def _is_ivf_without_rate(path: Path) -> bool:
         header = file.read(_IVF_RATE_OFFSET + len(_IVF_ONE_TO_ONE))
     rate = header[_IVF_RATE_OFFSET:]
     return header.startswith(b"DKIF") and b"\0" * 4 in (rate[:4], rate[4:])
+
+
+def _is_mp4_without_scale(container: Any, stream: Any) -> bool:
+    """Whether units of time have no length, which FFmpeg takes for a second.
+
+    A frame lasts several units: no video has one that long for a unit.
+    """
+    rate = stream.average_rate
+    is_second = "mov" in container.format.name.split(",") and stream.time_base == 1
+    return bool(is_second and rate is not None and rate < 1)
 
 
 @contextmanager

@@ -34,6 +34,9 @@ from colmap_av1.video.unchanged import file_state
 # FFmpeg names it in its summary of a file; PyAV gives no other access to it.
 _CROPPING = re.compile(r"^ +Frame Cropping: (\d+)/(\d+)/(\d+)/(\d+)$", re.MULTILINE)
 
+# Of several, that an edit list shows: fewer make no video.
+_FEWEST_SHOWN = 2
+
 
 @dataclass(frozen=True, eq=False)
 class Video(VideoFile):
@@ -46,6 +49,8 @@ class Video(VideoFile):
             frames of the stream, where an edit list hides some, as of a trimmed clip; None: all
             of them. The others are frames all the same: motion runs through them. A frame that
             an edit list shows several times counts once.
+        doubtful_times: what of its container's times cannot be, and is left out, in words; None:
+            nothing.
         projection: how pictures of all directions lie in the plane, as `projection_of` numbers it;
             None: these are of a plane.
     """
@@ -53,6 +58,7 @@ class Video(VideoFile):
     picture_size: tuple[int, int]
     display: Display
     presented: NDArray[np.int32] | None
+    doubtful_times: str | None
     projection: int | None
 
 
@@ -78,18 +84,21 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
         aspect = float(stream.sample_aspect_ratio or 1)
         num_entries = len(stream.index_entries)
         frames = decode_stream(container, stream, path, operating_point, 1)
-        frame = next(frames, None)
-        frames.close()
+        frame = None
+        with contextlib.closing(frames), contextlib.suppress(BitstreamError):
+            frame = next(frames, None)
     if frame is None:
         raise BitstreamError(
             f"{path}: no frame can be decoded, it is damaged: give another copy of it"
         )
     display = _display(path, frame, crop, aspect)
+    presented, doubt = _believed_edits(file, num_entries)
     return Video(
         **vars(file),
         picture_size=shown_size((frame.width, frame.height), display),
         display=display,
-        presented=_presented_frames(path, num_entries) if "mov" in file.container else None,
+        presented=presented,
+        doubtful_times=doubt,
         projection=projection_of(frame.side_data),
     )
 
@@ -111,6 +120,26 @@ def _display(
             f"{path}: its container cuts off the whole picture: give another copy of it"
         )
     return Display(crop, turn, stored_aspect if turn[0][0] else 1 / stored_aspect)
+
+
+def _believed_edits(
+    file: VideoFile, num_entries: int
+) -> tuple[NDArray[np.int32] | None, str | None]:
+    """`Video.presented` and `Video.doubtful_times` of a file that lists a number of samples."""
+    if "mov" not in file.container:
+        return None, None
+    if not file.is_timed:
+        return None, (
+            "the container's time scale is 0, or cannot be: its times and its edit list are left "
+            "out, all frames are taken, and the frame rate is unknown"
+        )
+    presented = _presented_frames(file.path, num_entries)
+    if presented is None or len(presented) >= _FEWEST_SHOWN or num_entries < _FEWEST_SHOWN:
+        return presented, None
+    return None, (
+        f"the container's edit list shows {len(presented)} of {num_entries} frames, which is no "
+        "video: it is left out, all frames are taken"
+    )
 
 
 def _presented_frames(path: Path, num_entries: int) -> NDArray[np.int32] | None:

@@ -7,8 +7,9 @@ import pytest
 from conftest import Ffmpeg
 
 from colmap_av1 import match
-from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.errors import BitstreamError, OptionError, VideoError
 from colmap_av1.motion.info import inspect
+from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
 from colmap_av1.video.container import packets, read_file
 from colmap_av1.video.facts import frame_times, read_video, with_counted_packets
 from colmap_av1.video.unchanged import check_unchanged
@@ -49,6 +50,57 @@ def test_a_container_that_lies_about_its_duration(clip: Path, tmp_path: Path, sa
     assert lies is not None
     assert lies.tolist() == true.tolist()
     assert inspect(path).num_shown == inspect(clip).num_shown == 16
+
+
+def with_long(path: Path, data: bytes, box: bytes, offset: int, value: int) -> Path:
+    """Write a file in which the number of 4 bytes at an offset in a box's content is another."""
+    at = data.index(box) + 4 + offset
+    path.write_bytes(data[:at] + value.to_bytes(4, "big") + data[at + 4 :])
+    return path
+
+
+@pytest.mark.parametrize("scale", [0, 0xFFFFFFFF])
+def test_a_container_whose_time_scale_cannot_be(clip: Path, tmp_path: Path, scale: int) -> None:
+    path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"mdhd", 12, scale)
+    with pytest.warns(UserWarning, match="time scale is 0, or cannot be: .* all frames are taken"):
+        told = inspect(path)
+    assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, None)
+    assert frame_times(read_video(path)) is None
+    true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
+    assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
+    assert [w for w in lies.warnings if w not in true.warnings] == [read_video(path).doubtful_times]
+    by_fps = MatchOptions(images=ImageOptions(fps=5.0))
+    with pytest.raises(OptionError, match="no time stamps: give every"):
+        match(tmp_path / "c.db", path, options=by_fps)
+    by_time = MatchOptions(camera=CameraOptions(rolling_shutter="20"))
+    with pytest.raises(OptionError, match=r"20 milliseconds, but .*lies\.mp4 does not say"):
+        match(tmp_path / "d.db", path, options=by_time)
+    assert not (tmp_path / "c.db").exists()
+    assert not (tmp_path / "d.db").exists()
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 0), (12, 0x7FFFFF00)])
+def test_an_edit_list_that_shows_nothing(
+    clip: Path, tmp_path: Path, offset: int, value: int
+) -> None:
+    """Of no length, or from a time on at which the video is over."""
+    path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"elst", offset, value)
+    with pytest.warns(UserWarning, match="edit list shows 0 of 16 frames, .* all frames are taken"):
+        told = inspect(path)
+    assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, 25.0)
+    true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
+    assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
+    assert read_video(path).doubtful_times in lies.warnings
+
+
+@pytest.mark.parametrize("box", [b"stco", b"stsz"])
+def test_a_sample_table_that_points_elsewhere(clip: Path, tmp_path: Path, box: bytes) -> None:
+    path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), box, 8 if box == b"stco" else 12, 0)
+    with pytest.raises(BitstreamError, match=r"lies\.mp4: .*: give another copy"):
+        inspect(path)
+    with pytest.raises(BitstreamError, match=r"lies\.mp4: .* damaged: give another copy"):
+        match(tmp_path / "a.db", path)
+    assert not (tmp_path / "a.db").exists()
 
 
 @pytest.mark.parametrize("rate", ["0.025", "100000"])
