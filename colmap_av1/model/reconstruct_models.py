@@ -79,7 +79,8 @@ def further_models(run: Run, first: Posed, takes: Takes) -> tuple[tuple[FurtherM
         stages = {"poses": _poses_of_model(run, own, mapped, poses)}
         some, key = _named(takes, known | left), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
-        posed = refined_poses(own, stages, believed_tracks(run, videos, takes), some, key)
+        believed = believed_tracks(run, videos, takes)
+        posed = refined_poses(own, stages, believed, some, key, in_place=first.in_place)
         images = [image.name for image in read_posed_images(own, posed.last, takes).images]
         left -= set(images)
         facts = written_model(own, posed, takes)["model"].facts

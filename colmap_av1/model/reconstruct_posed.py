@@ -29,12 +29,15 @@ class Posed:
         tracks: the tracks of all videos, cut where motion is not believed.
         links: links as tracks.
         moving: by the names of images, masks that leave out what moves by itself.
+        in_place: tracks lie where the pictures show them; what a shutter's read-out has moved does
+            not.
     """
 
     stages: dict[str, Kept]
     tracks: Tracks
     links: Tracks
     moving: dict[str, Mask]
+    in_place: bool
 
     @property
     def last(self) -> Kept:
@@ -101,7 +104,10 @@ def _pose_stages(
     matched = match_stage(run, videos, takes, tracked, doubted)
     keyed = takes.some(matched.facts["key_images"])
     stages = {"matches": matched, "poses": pose_stage(run, matched, takes, keyed)}
-    return refined_poses(run, stages, believed_tracks(run, videos, takes), takes, keyed)
+    # Where no read-out is found nothing has been moved, whether one was looked for or not.
+    in_place = not any(stage.facts["read_out"] for stage in tracked)
+    believed = believed_tracks(run, videos, takes)
+    return refined_poses(run, stages, believed, takes, keyed, in_place=in_place)
 
 
 def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:
@@ -112,9 +118,24 @@ def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tu
 
 
 def refined_poses(
-    run: Run, stages: dict[str, Kept], believed: tuple[Tracks, Tracks], takes: Takes, keyed: Takes
+    run: Run,
+    stages: dict[str, Kept],
+    believed: tuple[Tracks, Tracks],
+    takes: Takes,
+    keyed: Takes,
+    *,
+    in_place: bool,
 ) -> Posed:
-    """Place what lies between the key images that a mapper placed, and adjust."""
+    """Place what lies between the key images that a mapper placed, and adjust.
+
+    Args:
+        run: what every stage is given.
+        stages: those up to the mapper, which the further ones join.
+        believed: the tracks and links, see `believed_tracks`.
+        takes: the images.
+        keyed: those of them that were mapped.
+        in_place: see `Posed`.
+    """
     (tracks, links), posed = believed, stages["poses"]
     if len(keyed.take) < len(takes.take):
         stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
@@ -124,8 +145,6 @@ def refined_poses(
         moving = read_moving(run.stages)
     tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
     if run.options.mapping.adjust:
-        # What a shutter's read-out has moved does not lie where the pictures show it.
-        in_place = run.options.match.camera.rolling_shutter == "none"
         follows = in_place and (bool(moving) or has_moving_masks(takes))
         stages["adjustment"] = adjustment_stage(
             *(run, tracks, links, takes, posed),
@@ -133,4 +152,4 @@ def refined_poses(
             follow=partial(follow_behind, run, moving) if follows else None,
             corners=partial(corners_in_images, run, moving) if in_place else None,
         )
-    return Posed(stages, tracks, links, moving)
+    return Posed(stages, tracks, links, moving, in_place)

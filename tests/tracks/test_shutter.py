@@ -7,10 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Ffmpeg
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_av1 import CameraOptions, MatchOptions, OptionError, match
+from colmap_av1 import (
+    CameraOptions,
+    ImageOptions,
+    MatchOptions,
+    OptionError,
+    ReconstructOptions,
+    TriangulateOptions,
+    match,
+    reconstruct,
+)
 from colmap_av1.cli import main
 from colmap_av1.matching.shutter import of_video
 from colmap_av1.matching.shutter.correct import rows_down, without_shutter
@@ -175,3 +185,22 @@ def test_info_tells_the_read_out_time(
         f"rolling shutter\t{found.milliseconds:.1f} +- {found.error:.1f} ms from the first row to "
         "the last"
     )
+
+
+def test_poses_are_the_same_where_no_read_out_is_found(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    scene = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
+    video = ffmpeg("-i", scene, "-frames:v", "8", "-c", "copy", tmp_path / "short.mp4")
+    found = []
+    for wanted in ("none", "estimate"):
+        camera = CameraOptions(
+            camera_model="PINHOLE", camera_params="520,520,320,180", rolling_shutter=wanted
+        )
+        options = ReconstructOptions(
+            match=MatchOptions(images=ImageOptions(every=1), camera=camera),
+            triangulate=TriangulateOptions(points="survey"),
+            moving="keep",
+        )
+        report = reconstruct(video, tmp_path / wanted, options=options)
+        assert report.read_outs == (None,)
+        found.append((report.output / "sparse" / "0" / "images.bin").read_bytes())
+    assert found[0] == found[1]
