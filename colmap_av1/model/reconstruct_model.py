@@ -24,6 +24,7 @@ from colmap_av1.model.colmap_model import (
     write_model,
 )
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
+from colmap_av1.model.moving.short_tracks import surely_still
 from colmap_av1.model.reconstruct_poses import (
     PosedImages,
     check_agreement,
@@ -31,6 +32,7 @@ from colmap_av1.model.reconstruct_poses import (
     triangulate_in,
 )
 from colmap_av1.model.reconstruct_tracks import Run
+from colmap_av1.model.splats.cloud import take_points
 from colmap_av1.model.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.model.track_points import (
     Colours,
@@ -250,6 +252,8 @@ def model_stage(
         views = views_of(images, cameras, counting)
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
+            shows_moving = np.array([image.name in moving for image in images])
+            tracked = take_points(tracked, surely_still(tracked, shows_moving))
         files, cloud = _written_cloud(run, partial / "images", placed, views, tracked)
         check_unchanged(*run.files)
         with clock.measure("coverage"):

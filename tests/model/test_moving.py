@@ -19,11 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.images.masks import Mask, make_mask, mask_tracks
-from colmap_av1.model.colmap_model import ModelImage
+from colmap_av1.model.colmap_model import ModelImage, ModelPoints, no_points
 from colmap_av1.model.coverage import PosedCamera
 from colmap_av1.model.moving.contradictions import Contradictions, PlacedTracks, place_tracks
 from colmap_av1.model.moving.following import expect_in_views, follow_behind
-from colmap_av1.model.moving.regions import moving_cells, strong_patches
+from colmap_av1.model.moving.regions import moving_cells, shares_above_usual, strong_patches
+from colmap_av1.model.moving.short_tracks import surely_still
 from colmap_av1.model.reconstruct_poses import PosedImages
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.triangulate import (
@@ -165,6 +166,20 @@ def test_nothing_moves_in_a_still_scene(drift: float) -> None:
     assert not moving_cells(scene.placed, scene.views).any()
 
 
+def test_what_is_known_to_move_is_not_the_usual() -> None:
+    """Of a scene most of which moves, the rest says by itself what it usually says."""
+    placed = made(None).placed
+    _, _, columns = placed.shape
+    moving = np.zeros(placed.shape, np.bool_)
+    moving[:, :, : 2 * columns // 3] = True
+    within = placed.mean(moving[placed.image, placed.row, placed.column])
+    says = np.where(within > 0.5, 1.0, 0.3)
+    inside = (slice(None), slice(4, -4), slice(2 * columns // 3 + 6, -4))
+    for still, expected in ((~moving, 0.0), (np.ones_like(moving), -0.7)):
+        share = shares_above_usual(placed, says, still)[inside]
+        assert np.median(share) == pytest.approx(expected, abs=0.05)
+
+
 def test_patches_that_only_time_joins_to_what_moves_are_left_out() -> None:
     cells, share = np.zeros((2, 20, 30), np.bool_), np.full((2, 20, 30), 0.1)
     cells[:, 2:10, 3:9] = True
@@ -174,6 +189,21 @@ def test_patches_that_only_time_joins_to_what_moves_are_left_out() -> None:
     found = strong_patches(cells, share)
     assert found[:, 2:10, 3:9].all()
     assert found.sum() == 2 * 8 * 6
+
+
+def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None:
+    images = [[0, 1, 2], [2, 3, 4, 5], [3, 4, 5, 6, 7], [4, 5, 6, 8], [9, 10, 11]]
+    count = len(images)
+    points = ModelPoints(
+        *(np.zeros((count, 3)), np.zeros((count, 3), np.uint8), np.zeros(count)),
+        np.cumsum([0, *map(len, images)]),
+        *(np.concatenate(images), np.zeros((sum(map(len, images)), 2))),
+    )
+    shows_moving = np.isin(np.arange(12), range(2, 8))
+    assert surely_still(points, shows_moving).tolist() == [0, 2, 3, 4]
+    assert surely_still(points, np.ones(12, np.bool_)).tolist() == [2]
+    assert surely_still(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
+    assert len(surely_still(no_points(), shows_moving)) == 0
 
 
 # A poster of so many pixels that goes across the pictures of the rendered courtyard.

@@ -24,6 +24,8 @@ CAMERA = pycolmap.Camera(
 NUM_VIEWS, STEP = 9, 0.27
 # A square before a wall, its centre and half of its width; the right part of the wall is plain.
 NEAR, FAR, CENTRE, HALF, PLAIN_FROM = 3.0, 10.0, 1.08, 0.4, 4.0
+# Columns of the square that a mask of it lacks.
+EDGE = 14
 PIXELS_PER_UNIT = {NEAR: 250.0, FAR: 50.0}
 
 
@@ -137,6 +139,23 @@ def test_what_masks_leave_out_is_not_looked_for() -> None:
     kept = np.zeros((HEIGHT, WIDTH), np.bool_)
     views = [replace(view, mask=make_mask(kept)) for view in VIEWS]
     assert len(sweep(on_wall(), views=views).xyz) == 0
+
+
+def test_nothing_is_found_beside_masks() -> None:
+    """Masks of the square that leave out all of it but an edge."""
+    views = []
+    for number, view in enumerate(VIEWS):
+        low, high = (
+            int(FOCAL * (CENTRE + side - STEP * number) / NEAR + WIDTH / 2)
+            for side in (-HALF, HALF)
+        )
+        kept = np.ones((HEIGHT, WIDTH), np.bool_)
+        kept[:, max(low, 0) : max(high - EDGE, 0)] = False
+        views.append(replace(view, mask=make_mask(kept)))
+    on_square = np.abs(sweep(on_wall()).xyz[:, 2] - NEAR) < 0.5
+    assert on_square.sum() > 20
+    beside = sweep(on_wall(), views=views)
+    assert not (np.abs(beside.xyz[:, 2] - NEAR) < 0.5).any()
 
 
 @pytest.mark.parametrize("left", [[], [0], [0, 1], [0, 1, 2, 7], range(5)])

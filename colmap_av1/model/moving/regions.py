@@ -20,10 +20,11 @@ _BY_MOTION = 0.3
 # Width in cells of what is summed up, and tracks there at least.
 _AROUND = 5
 _FEWEST_TRACKS = 4
-# Share of the tracks, above that of the whole clip, from which on a cell may move, and from which
-# on it surely does, if other images see as many points behind as there are tracks: nobody has seen
-# what is behind the sky. A region has so many sure cells in all its images, and they are so large a
-# share of it: two fifths and more of people, a fifth at most of what encoders find no motion for.
+# Share of the tracks, above that of what stands still, from which on a cell may move, and from
+# which on it surely does, if other images see as many points behind as there are tracks: nobody has
+# seen what is behind the sky. A region has so many sure cells in all its images, and they are so
+# large a share of it: two fifths and more of people, a fifth at most of what encoders find no
+# motion for.
 _MAY, _SURELY = 0.27, 0.6
 _FEWEST_SURE = 400
 _SURE_SHARE = 0.3
@@ -31,7 +32,7 @@ _SURE_SHARE = 0.3
 # a region in time only, at the edges of what people passed, has fewer.
 _STRONG, _STRONG_SHARE = 0.35, 0.3
 # A track moves that is in such cells in most of its images, or in some and contradicts.
-_MOSTLY, _PARTLY = 0.5, 0.2
+_MOSTLY, _PARTLY = 0.55, 0.2
 # Width in cells in which most tracks, and so many, move.
 _NEAR = 3
 _FEWEST_MOVING = 2
@@ -59,7 +60,7 @@ def moving_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
         by_depth = found.by_depth(moving)
         behind = found.unseen(by_depth | moving)
         says = np.where(by_depth | surely, 1.0, np.where(by_motion, _BY_MOTION, 0.0))
-        share = _shares_above_usual(placed, says)
+        share = shares_above_usual(placed, says, ~cells)
         cells = _sure_regions(placed, share, behind)
         if not cells.any():
             return cells
@@ -74,12 +75,14 @@ def _sum_around(cells: _Floats, width: int) -> _Floats:
     return np.asarray(uniform_filter(cells, (1, width, width), mode="constant") * width**2)
 
 
-def _shares_above_usual(placed: PlacedTracks, says: _Floats) -> _Floats:
-    """How far the tracks around each cell say that it moves, above the median of the clip.
+def shares_above_usual(placed: PlacedTracks, says: _Floats, still: _Bools) -> _Floats:
+    """How far the tracks around each cell say that it moves, above the median of what is still.
 
     Args:
         placed: the tracks.
         says: float64 [num_tracks] how far each of them says that something moves.
+        still: bool [images, rows, columns] what is not known to move. Where people cover a third of
+            the pictures, the median of all cells is theirs in part, and hides their edges.
 
     Returns:
         float64 [images, rows, columns]; below 0 where there are too few tracks.
@@ -89,7 +92,8 @@ def _shares_above_usual(placed: PlacedTracks, says: _Floats) -> _Floats:
     if not enough.any():
         return np.full(placed.shape, -1.0)
     share = _sum_around(placed.counts(says), _AROUND) / np.maximum(tracks, 1.0)
-    return np.where(enough, share - float(np.median(share[enough])), -1.0)
+    usual = share[enough & still] if (enough & still).any() else share[enough]
+    return np.where(enough, share - float(np.median(usual)), -1.0)
 
 
 def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Bools:

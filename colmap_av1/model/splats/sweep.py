@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.masks import make_mask
 from colmap_av1.model.colmap_model import ModelPoints, joined_points, no_points
 from colmap_av1.model.coverage import (
     CELL,
@@ -126,7 +128,7 @@ class Sweep:
         if key not in greys or len(greys) <= LEAST_OTHERS:
             return
         view, views = self._views[key], self._views
-        cells = np.isinf(self._observed[key]) & view.counting_cells
+        cells = np.isinf(self._observed[key]) & _away_from_masks(view)
         xy = _squares(view, cells, greys[key].factor)
         nearest = self._near[key] * _NEARER
         swept = sweep_image(views, key, greys, xy, nearest, threads=self._threads)
@@ -176,6 +178,20 @@ def _others(
     ):
         step += 1
     return [key + number * step for number in _OTHERS if there(number * step)]
+
+
+def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
+    """The cells of an image that no masked pixel is in or beside.
+
+    What a mask leaves out moves, as a rule, and moves by little from one picture to the next: where
+    its edge shows, these agree on a depth that it does not have.
+    """
+    from scipy.ndimage import binary_dilation  # noqa: PLC0415 - slow to import
+
+    if view.mask is None:
+        return view.counting_cells
+    left_out = replace(view, mask=make_mask(~view.mask.kept)).counting_cells
+    return np.asarray(~binary_dilation(left_out, np.ones((3, 3))))
 
 
 def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Floats:
