@@ -528,6 +528,7 @@ def movers(rows: list[Row]) -> str:
         "ATE from, to": [spread(own) for own in cases],
         "points": average("points", ",.0f"),
         "on people": average("points_on_people", ".2%"),
+        "at most": [f"{max(float(row['points_on_people']) for row in own):.2%}" for own in cases],
         "IoU of masks": average("iou", ".2f"),
         "of people": average("covered", ".1%"),
         "of what stands still": average("static_lost", ".1%"),
