@@ -19,9 +19,10 @@ from colmap_av1.options.camera import (
 # Models that a pinhole camera is a first guess of, and those of them without distortion.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-# First guesses of the focal length, in longer sides of an image: COLMAP's own, which spans 45
-# degrees, and one for fisheye lenses, which span 115.
-_GUESS, _FISHEYE_GUESS = 1.2, 0.5
+# First guesses of the focal length, in longer sides of an image: for lenses of phones and drones,
+# which span about 60 degrees (COLMAP's own guess of 1.2, for 45 degrees, lets its mapper start with
+# models of garbage on their videos), and for fisheye lenses, which span 115.
+_GUESS, _FISHEYE_GUESS = 0.9, 0.5
 # Sides of an image in pixels that no camera and no image format has.
 _LONGEST_SIDE = 1 << 20
 # Encoders that scale pictures round their display size: a few tenths of a percent.
@@ -37,8 +38,8 @@ def make_camera(
 ) -> pycolmap.Camera:
     """Make the camera of new images.
 
-    Without parameters it is COLMAP's first guess, without a focal length prior: focal length
-    1.2 times the longer side (of fisheye models half of it), principal point in the centre, no
+    Without parameters it is a first guess, without a focal length prior: focal length
+    0.9 times the longer side (of fisheye models half of it), principal point in the centre, no
     distortion. Where pixels are
     not square, this holds for the picture as it is shown. Given parameters, and a focal length
     that is known otherwise, count as a prior.

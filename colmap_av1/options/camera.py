@@ -36,7 +36,7 @@ class CameraOptions(Options):
     camera_params: str | None = option(
         None,
         "its parameters in COLMAP's order, such as 'f,cx,cy,k'; None: the focal length estimated "
-        "from the tracks, else 1.2 times the longer side, 0.5 times with fisheye models, to be "
+        "from the tracks, else 0.9 times the longer side, 0.5 times with fisheye models, to be "
         "refined; principal point in the centre",
         common=True,
     )
