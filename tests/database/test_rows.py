@@ -520,10 +520,10 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
     assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
 
 
-def test_default_camera_is_colmaps_guess() -> None:
+def test_default_camera_is_a_guess() -> None:
     camera = make_camera(CameraOptions(), 450, 800)
     assert camera.model_name == "SIMPLE_RADIAL"
-    assert camera.params.tolist() == [960, 225, 400, 0]
+    assert camera.params.tolist() == [720, 225, 400, 0]
     assert not camera.has_prior_focal_length
 
 

@@ -301,8 +301,8 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
         ).fetchone()
     fx, fy, *_ = np.frombuffer(params)
     assert (model, prior) == (4, 0)  # OPENCV
-    # As far as the picture is shown, 288x128 or turned, it is COLMAP's guess.
-    assert (fx * aspect, fy) == pytest.approx((1.2 * 288 / 1.5 * (1.5 if angle == 0 else 1),) * 2)
+    # As far as the picture is shown, 288x128 or turned, it is the usual guess.
+    assert (fx * aspect, fy) == pytest.approx((0.9 * 288 / 1.5 * (1.5 if angle == 0 else 1),) * 2)
     # Images keep stored pixels, as ffmpeg cuts them.
     (first,) = cut_by_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
@@ -327,7 +327,7 @@ def test_images_whose_pixels_were_made_square(
     with sqlite3.connect(tmp_path / "a.db") as connection:
         row = connection.execute("SELECT model, width, height, params FROM cameras").fetchone()
     assert row[:3] == (2, 288, 128)
-    assert np.frombuffer(row[3])[0] == pytest.approx(1.2 * 288)
+    assert np.frombuffer(row[3])[0] == pytest.approx(0.9 * 288)
     match(tmp_path / "b.db", clip, options=ALL_TRACKS)
     for square, stored in zip(
         keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db"), strict=True
