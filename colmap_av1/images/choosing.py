@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.images.files import grey_within
 from colmap_av1.images.names import (
     check_new_name,
     frames_of_images,
@@ -375,9 +376,7 @@ def _sharpness(
     measured: list[float] = []
     for index, picture in pictures:
         if index in wanted:
-            scale = min(1.0, _SHARPNESS_SIZE / max(picture.shape[:2]))
-            grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-            small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            small = grey_within(picture, _SHARPNESS_SIZE)
             measured.append(float(cv2.Laplacian(small, cv2.CV_32F).var()))
         if len(measured) == len(frames):
             break

@@ -354,14 +354,20 @@ def blur_warning(files: Sequence[Path]) -> str | None:
 
 def _detail(picture: NDArray[np.uint8]) -> float:
     """Share of the pixels that are detail."""
-    scale = min(1.0, _DETAILED_SIZE / max(picture.shape[:2]))
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    grey = grey_within(picture, _DETAILED_SIZE)
     height, width = grey.shape
     half = (max(1, width // 2), max(1, height // 2))
     small = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
     again = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     return float(np.mean(cv2.absdiff(grey, again) > _VISIBLE))
+
+
+def grey_within(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """The grey picture of a BGR one, made smaller where its longer side has more pixels than so."""
+    scale = min(1.0, longest / max(picture.shape[:2]))
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey, np.uint8)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -17,12 +17,7 @@ from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import image_file
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
-from colmap_av1.model.colmap_model import (
-    ModelImage,
-    ModelPoints,
-    points_seen,
-    write_model,
-)
+from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.moving.short_tracks import surely_still
 from colmap_av1.model.reconstruct_poses import (
