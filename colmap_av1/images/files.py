@@ -45,6 +45,20 @@ _DETAILED_SIZE = 960
 # of 2.5 to 12 px none of ten thousand or two.
 _VISIBLE = 8.0
 _LEAST_DETAIL = 0.005
+# Detail along rows, columns and both diagonals, which motion blur leaves across its direction only:
+# second differences of grey values. Sharp videos have 12 % and more of that in the richest
+# direction in any other, those that were blurred along a line of 9 px 3 % at most, of 25 to 80 px
+# half a per cent, with noise of 3 grey levels, too.
+_SECOND_DIFFERENCES = tuple(
+    np.array(kernel, np.float32) / 4
+    for kernel in (
+        [[0, 0, 0], [-1, 2, -1], [0, 0, 0]],
+        [[0, -1, 0], [0, 2, 0], [0, -1, 0]],
+        [[-1, 0, 0], [0, 2, 0], [0, 0, -1]],
+        [[0, 0, -1], [0, 2, 0], [-1, 0, 0]],
+    )
+)
+_LEAST_OF_RICHEST = 0.02
 # Images that are looked at, of a video.
 _NUM_DETAILED = 5
 
@@ -344,22 +358,38 @@ def blur_warning(files: Sequence[Path]) -> str | None:
         ImageError: an image is missing or cannot be read.
     """
     some = [files[i] for i in np.linspace(0, len(files) - 1, _NUM_DETAILED).round().astype(int)]
-    if float(np.median([_detail(read_image(file)) for file in some])) >= _LEAST_DETAIL:
-        return None
-    return (
-        f"{files[0].parent}: the images are blurred, dark or plain, half their size would show as "
-        "much: tracks in them are few and inexact; film in focus, in good light and more slowly"
-    )
+    greys = [grey_within(read_image(file), _DETAILED_SIZE) for file in some]
+    if float(np.median([_detail(grey) for grey in greys])) < _LEAST_DETAIL:
+        return (
+            f"{files[0].parent}: the images are blurred, dark or plain, half their size would show "
+            "as much: tracks in them are few and inexact; film in focus, in good light and more "
+            "slowly"
+        )
+    directions = np.median([_detail_by_direction(grey) for grey in greys], axis=0)
+    if directions.min() < _LEAST_OF_RICHEST * directions.max():
+        return (
+            f"{files[0].parent}: the images are blurred along one direction, as by the camera's "
+            "motion: tracks in them are few and inexact; film more slowly, or in more light, which "
+            "makes exposures shorter"
+        )
+    return None
 
 
-def _detail(picture: NDArray[np.uint8]) -> float:
+def _detail(grey: NDArray[np.uint8]) -> float:
     """Share of the pixels that are detail."""
-    grey = grey_within(picture, _DETAILED_SIZE)
     height, width = grey.shape
     half = (max(1, width // 2), max(1, height // 2))
     small = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
     again = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     return float(np.mean(cv2.absdiff(grey, again) > _VISIBLE))
+
+
+def _detail_by_direction(grey: NDArray[np.uint8]) -> list[float]:
+    """Share of the pixels that are detail along rows, columns and both diagonals."""
+    return [
+        float(np.mean(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)) > _VISIBLE))
+        for kernel in _SECOND_DIFFERENCES
+    ]
 
 
 def grey_within(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:

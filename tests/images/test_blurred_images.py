@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import PROJECT, Encode
+from conftest import PROJECT, SHARED, Encode
 from numpy.typing import NDArray
 
 from colmap_av1.images.files import blur_warning
@@ -45,6 +45,38 @@ def test_blurred_images_are_told(sharp: list[NDArray[np.uint8]], tmp_path: Path)
     # One that is blurred among sharp ones is nothing to tell.
     for file, picture in zip(files[1:], sharp[1:], strict=True):
         cv2.imwrite(str(file), picture)
+    assert blur_warning(files) is None
+
+
+def along_a_line(picture: NDArray[np.uint8], length: int, radians: float) -> NDArray[np.uint8]:
+    """The picture as of a camera that moves meanwhile, with a sensor's noise."""
+    half = length / 2
+    ends = half + half * np.array([[-1], [1]]) * [np.cos(radians), np.sin(radians)]
+    kernel = np.zeros((length + 1, length + 1), np.float32)
+    cv2.line(kernel, *np.rint(ends).astype(int).tolist(), 1.0)
+    smeared = cv2.filter2D(picture, -1, kernel / kernel.sum())
+    noise = np.random.default_rng(length).normal(0, 2, picture.shape)
+    return np.clip(smeared + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("length", [25, 80])
+@pytest.mark.parametrize("radians", [0.0, 0.4, np.pi / 2, 2.0])
+def test_motion_blur_is_told(
+    sharp: list[NDArray[np.uint8]], tmp_path: Path, length: int, radians: float
+) -> None:
+    files = [tmp_path / f"{index}.png" for index in range(3)]
+    for file, picture in zip(files, sharp, strict=False):
+        cv2.imwrite(str(file), along_a_line(picture, length, radians))
+    told = blur_warning(files)
+    assert told is not None
+    assert "the images are blurred" in told
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["street", "shelfbox", "kitchen"])
+def test_sequences_are_sharp(name: str) -> None:
+    files = sorted((SHARED / "sequences" / name / "frames").iterdir())
+    assert len(files) > 30
     assert blur_warning(files) is None
 
 
