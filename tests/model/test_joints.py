@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -10,9 +11,11 @@ import pycolmap
 import pytest
 
 from colmap_av1.cli import main
+from colmap_av1.images.camera import make_camera
 from colmap_av1.model.agreement.crossings import model_crossings
 from colmap_av1.model.agreement.joints import model_joints
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.colmap_model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.options import CameraOptions
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1
@@ -83,3 +86,72 @@ def test_parts_that_are_joined_wrongly(
     words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
     assert main(["check", "--strict", "--database", str(database), *words]) == _FAILED_CHECK
     assert "joined wrongly there" in capsys.readouterr().err
+
+
+def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int = 0) -> list[str]:
+    """Write the model of a camera that walks, turns about itself and walks on.
+
+    Args:
+        folder: gets the model.
+        degrees: by which it turns.
+        aside: how far it moves meanwhile.
+        rest: images before it walks.
+
+    Returns:
+        The names of the images from the last before the turn to the first after it.
+    """
+    before, turning = 12, 20
+    share = np.concatenate([np.zeros(rest + before), np.linspace(0, 1, turning), np.ones(before)])
+    walked = np.concatenate([np.full(rest, -2), np.linspace(-2, 0, before)])
+    turned = aside * np.linspace(0, 1, turning)
+    along = np.concatenate([walked, turned, aside + np.linspace(0.2, 2, before)])
+    rng = np.random.default_rng(0)
+    direction = np.radians(rng.uniform(-60, 60 + degrees, 4000))
+    far = rng.uniform(5, 12, 4000)
+    xyz = np.column_stack(
+        [far * np.sin(direction), rng.uniform(-2, 2, 4000), far * np.cos(direction)]
+    )
+    camera = make_camera(CameraOptions("SIMPLE_PINHOLE", "600,320,240"), 640, 480)
+    images, seen, xy = [], [], []
+    for k, (turn, x) in enumerate(zip(np.radians(degrees) * share, along, strict=True)):
+        rotation = pycolmap.Rotation3d(
+            np.array([0, np.sin(-turn / 2), 0, np.cos(turn / 2)])
+        ).matrix()
+        pose = np.column_stack([rotation, -rotation @ [x, 0, 0]])
+        images.append(ModelImage(k + 1, f"frame_{k:06d}.png", 1, pose))
+        local = xyz @ rotation.T + pose[:, 3]
+        at = 600 * local[:, :2] / local[:, 2:] + [320, 240]
+        seen.append((local[:, 2] > 0) & (at > 0).all(axis=1) & (at < [640, 480]).all(axis=1))
+        xy.append(at)
+    point, image = np.nonzero(np.array(seen).T)
+    counts = np.count_nonzero(seen, axis=0)
+    points = ModelPoints(
+        *(xyz[counts > 0], np.zeros((np.count_nonzero(counts), 3), np.uint8)),
+        error=np.zeros(np.count_nonzero(counts)),
+        offsets=np.append(0, np.cumsum(counts[counts > 0])),
+        image=image,
+        xy=np.array(xy)[image, point],
+    )
+    write_model(folder, {1: camera}, images, points)
+    return [image.name for image in images[rest + before - 1 : rest + before + turning + 1]]
+
+
+@pytest.mark.parametrize(("degrees", "aside", "rest"), [(25, 0.0, 0), (80, 1.0, 0), (25, 0.0, 10)])
+def test_turns_that_something_is_seen_across(
+    tmp_path: Path, degrees: float, aside: float, rest: int
+) -> None:
+    _walk_with_a_turn(tmp_path, degrees, aside, rest)
+    joints = model_joints(read_model(tmp_path))
+    assert joints.unscaled == []
+    assert joints.warning is None
+
+
+def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
+    turn = _walk_with_a_turn(tmp_path, degrees=80)
+    joints = model_joints(read_model(tmp_path))
+    assert joints.weak == []
+    lost = {joints.pairs[i] for i in joints.unscaled}
+    assert len(lost) > len(turn) / 2
+    assert lost <= set(pairwise(turn))
+    assert joints.warning is not None
+    assert joints.warning.startswith("nothing carries the scale from 'frame_0000")
