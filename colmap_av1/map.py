@@ -18,6 +18,7 @@ from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
+from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
 from colmap_av1.model.agreement.crossings import model_crossings
 from colmap_av1.model.agreement.far_views import FarViews, model_far_views
 from colmap_av1.model.agreement.joints import model_joints
@@ -114,7 +115,7 @@ def map_database(
     check_folder(output, [database, image_path])
     log = output.resolve().with_name(f"{output.resolve().name}.log")
     check_files([log], [database, image_path], is_own=is_mapper_log, overwrite=overwrite)
-    num_images = _check_input(database, image_path)
+    num_images, thin_gaps = _check_input(database, image_path)
 
     try:
         with whole_folder(output, overwrite=overwrite) as partial:
@@ -144,7 +145,7 @@ def map_database(
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
     missing = _missing(num_images, num_registered)
-    warnings = [*placement.warnings, missing, *_about_joints(model, database)]
+    warnings = [*placement.warnings, missing, *_about_joints(model, database, thin_gaps)]
     far_views: FarViews | None = None
     try:
         with clock.measure("far views"):
@@ -166,9 +167,13 @@ def map_database(
     )
 
 
-def _about_joints(model: Any, database: Path) -> tuple[str | None, str | None]:
+def _about_joints(
+    model: Any, database: Path, thin_gaps: Sequence[ThinGap]
+) -> tuple[str | None, ...]:
     """What the user should know of a model whose parts hardly hold together, or wrongly."""
-    return model_joints(model).warning, model_crossings(model, database).warning
+    told = (model_joints(model).warning, model_crossings(model, database).warning)
+    # What the model itself shows says more than what it is made of.
+    return told if any(told) else (thin_gap_warning(thin_gaps),)
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
@@ -213,9 +218,10 @@ def _place(
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> int:
-    """Refuse what a mapper would stop at; returns the number of images."""
-    stops = [f.text for f in check(database).findings if f.severity == "error"]
+def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[ThinGap, ...]]:
+    """Refuse what a mapper would stop at; returns the number of images, and thin gaps."""
+    checked = check(database)
+    stops = [f.text for f in checked.findings if f.severity == "error"]
     if stops:
         raise DatabaseError(
             f"{database}: {stops[0]}: see 'colmap-av1 check', and match the images anew"
@@ -235,4 +241,4 @@ def _check_input(database: Path, image_path: Path) -> int:
             f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database "
             f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
         )
-    return len(images)
+    return len(images), checked.thin_gaps

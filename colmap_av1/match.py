@@ -30,6 +30,7 @@ from colmap_av1.matching.image_matches import (
     shape_of,
     verify_images,
 )
+from colmap_av1.matching.link_merging import about_thin_gaps
 from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.matching.weak_gaps import may_link
@@ -223,7 +224,9 @@ def match(
         )
     videos = images.videos
     notes = inputs.with_names([own.tracked.warnings for own in videos])
-    notes += positions.warnings
+    notes += (*positions.warnings, *cameras.warnings, *linked.report.warnings)
+    if options.on_existing != "append":  # what a database holds already may join the images, too
+        notes += about_thin_gaps(linked.matched, images.takes)
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),
@@ -239,7 +242,7 @@ def match(
         read_outs=tuple(own.tracked.read_out for own in videos),
         seconds=clock.seconds,
         links=linked.report,
-        warnings=(*inputs.warnings, *notes, *cameras.warnings, *linked.report.warnings, *blurred),
+        warnings=(*inputs.warnings, *notes, *blurred),
         **_figures([own.tracks for own in videos], linked.matched),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.finding import Finding
 from colmap_av1.database.findings import (
     frame_findings,
+    gap_findings,
     image_findings,
     keypoint_findings,
     motion_findings,
@@ -30,6 +31,7 @@ from colmap_av1.database.findings_values import value_findings
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.two_view_geometry import config_name
+from colmap_av1.matching.weak_gaps import ThinGap, thin_gaps
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.graphs import connected_components
 
@@ -59,6 +61,7 @@ class CheckReport:
         configs: number of pairs with inliers by COLMAP's name of their geometry.
         num_connected_images: images of the largest group that used pairs connect.
         parallax: of the widest pairs; None where no pair is used.
+        thin_gaps: gaps between images of a video that few matches cross.
         findings: what stands out, most severe first.
     """
 
@@ -81,6 +84,7 @@ class CheckReport:
     configs: dict[str, int]
     num_connected_images: int
     parallax: Parallax | None
+    thin_gaps: tuple[ThinGap, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -130,6 +134,11 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
+    rows = [
+        (camera, PurePosixPath(name).parent)
+        for camera, name in zip(images.camera_ids, images.names, strict=True)
+    ]
+    thin = thin_gaps(pairs.index[used], pairs.num_inliers[used], images.names, rows)
     findings = [
         *image_findings(images, cameras),
         *value_findings(images, pairs, cameras),
@@ -137,6 +146,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         *keypoint_findings(images, pairs),
         *pair_findings(pairs, images),
         *motion_findings(pairs, parallax, group, len(images.ids)),
+        *gap_findings(thin),
         *orphan_findings(connection, pairs),
     ]
     order = ("error", "warning", "note")
@@ -160,5 +170,6 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         configs={name: configs.count(name) for name in sorted(set(configs))},
         num_connected_images=group,
         parallax=parallax,
+        thin_gaps=thin,
         findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pycolmap
@@ -18,6 +18,7 @@ from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
+from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
 
 # Share of keypoints without a match that is worth a line.
 _NOTED_SHARE = 0.01
@@ -204,6 +205,13 @@ def motion_findings(
             "the camera moves along its axis: the incremental mapper starts only with "
             "--Mapper.init_max_forward_motion 1, and the focal length cannot be found",
         )
+
+
+def gap_findings(gaps: Sequence[ThinGap]) -> Iterator[Finding]:
+    """Gaps between images of a video that few matches cross, in one finding."""
+    text = thin_gap_warning(gaps)
+    if text is not None:
+        yield Finding("warning", text)
 
 
 def orphan_findings(connection: sqlite3.Connection, pairs: Pairs) -> Iterator[Finding]:

@@ -8,12 +8,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.takes import Takes
 from colmap_av1.matching.features import Features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import (
+    UNUSED_CONFIGS,
+    TwoViewConfig,
+    TwoViewGeometry,
+)
+from colmap_av1.matching.weak_gaps import thin_gap_warning, thin_gaps
 from colmap_av1.tracks.tracks import Tracks, no_tracks
 from colmap_av1.util.graphs import connected_components
 
@@ -120,6 +126,18 @@ def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
     return connected_components(
         len(matched.keypoints), matched.pairs[np.array(used, dtype=np.bool_)]
     )
+
+
+def about_thin_gaps(matched: MatchedImages, takes: Takes) -> list[str]:
+    """What the user should know of gaps between images of a video that few matches cross."""
+    counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
+    kinds = [geometry.config for geometry in matched.geometries]
+    used = (counts >= MIN_INLIERS) & ~np.isin(kinds, UNUSED_CONFIGS)
+    take = takes.take.tolist()
+    warning = thin_gap_warning(
+        thin_gaps(matched.pairs[used], counts[used], takes.images.names, take)
+    )
+    return [warning] if warning is not None else []
 
 
 def links_as_tracks(

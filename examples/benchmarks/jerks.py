@@ -322,7 +322,14 @@ def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) ->
 
 def about_the_model(warnings: Sequence[str]) -> list[str]:
     """What is said of models that fall apart or bend, and of images that are left out."""
-    signs = ("no pose", "join '", "fit the poses", "far apart in time", "nothing connects")
+    signs = (
+        "few matches",
+        "no pose",
+        "join '",
+        "fit the poses",
+        "far apart in time",
+        "nothing connects",
+    )
     return [warning for warning in warnings if any(sign in warning for sign in signs)]
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -171,7 +172,12 @@ def test_jerk_is_linked(jerk: Path, tmp_path: Path) -> None:
     assert report.links.weak_gaps == ((before, before + 1),)
     assert report.links.open_gaps == ()
     assert report.links.num_links > 20
-    assert report.warnings == ()
+    (warning,) = report.warnings
+    assert warning.startswith("few matches, down to ")
+    named = re.search("cross between 'frame_(.*).png' and 'frame_(.*).png', where", warning)
+    assert named is not None
+    assert before - 2 < int(named[1]) <= before < int(named[2]) < before + 3
+    assert ("warning", warning) in [(f.severity, f.text) for f in check(tmp_path / "a.db").findings]
     alone = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
     assert alone.links.num_images == 0
     assert report.num_pairs > alone.num_pairs
