@@ -179,11 +179,12 @@ def _about_joints(
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
     """What the user should know of images that the largest model lacks."""
     largest, *others = num_registered
-    if largest == num_images:
-        return None
     if not others:
-        return f"{num_images - largest} of {num_images} images have no pose"
+        left_out = num_images - largest
+        return f"{left_out} of {num_images} images have no pose" if left_out else None
     further = ", ".join(f"'{number}' {size}" for number, size in enumerate(others, start=1))
+    if largest == num_images:
+        return f"model '0' holds all {num_images} images, {further} of them again: leave that out"
     return (
         f"nothing holds all {num_images} images together: model '0' holds {largest}, {further}; "
         "each has coordinates of its own"

@@ -98,6 +98,27 @@ def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) ->
     assert any(said in warning for warning in report.warnings)
 
 
+def test_a_model_of_images_that_the_first_one_has_is_said(
+    database: Path,
+    images: Path,
+    made: ReconstructReport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A mapper may begin once more with two images."""
+
+    def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int, int]:
+        for number in range(2):
+            shutil.copytree(made.output / "sparse" / "0", output / str(number))
+        log.touch()
+        return NUM_IMAGES, 2
+
+    monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
+    report = map_database(database, images, tmp_path / "model")
+    said = f"model '0' holds all {NUM_IMAGES} images, '1' 2 of them again: leave that out"
+    assert said in report.warnings
+
+
 def test_intrinsics_are_kept_in_forward_motion(
     database: Path, images: Path, tmp_path: Path
 ) -> None:

@@ -178,6 +178,17 @@ def test_one_video_twice_is_refused(halves: tuple[Path, Path], tmp_path: Path) -
     assert not (tmp_path / "a.db").exists()
 
 
+def test_two_encodings_of_a_video_are_told(
+    halves: tuple[Path, Path], pictures: NDArray[np.uint8], encode: Encode, tmp_path: Path
+) -> None:
+    """Of other bytes, size and length."""
+    smaller = [cv2.resize(image, (288, 162)) for image in pictures[2 : FIRST.stop]]
+    again = encode(np.array(smaller), tmp_path / "again.mp4")
+    report = match(tmp_path / "a.db", [halves[0], again], options=QUICK)
+    assert report.links.same_videos == (("walk_in", "again"),)
+    assert any("'walk_in' and 'again' show the same pictures" in w for w in report.warnings)
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [

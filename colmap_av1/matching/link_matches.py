@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.masks import Mask
-from colmap_av1.images.takes import Pictures
+from colmap_av1.images.takes import Pictures, Takes
 from colmap_av1.matching.features import (
     FeatureExtractor,
     Features,
@@ -30,6 +30,11 @@ _MIN_GAP_INLIERS = 20
 _MIN_REVISIT_INLIERS = 25
 # Links of a place seen again come in groups: key images beside each other see it, too.
 _SUPPORT_REACH = 2
+# Two videos are the same that show so many of the pictures looked at, and this share of those of
+# either, in the same place, to pixels: another camera comes this near for one or two.
+_FEWEST_SAME = 3
+_SAME_SHARE = 0.3
+_SAME_PLACE = 1.0
 # The motion across a gap is believed where this share of its matches agrees with the pictures'
 # geometry, to this many pixels: 98 to 100 % of true motion does, of what only compresses well no
 # more than three quarters.
@@ -141,6 +146,30 @@ def supported_links(
     supported = {pair for pair in sure if is_supported(*pair)}
     kept = [k for k, pair in enumerate(pairs) if pair not in revisits or pair in supported]
     return Links(links.pairs[kept], [links.geometries[k] for k in kept])
+
+
+def same_videos(
+    links: Links, features: dict[int, Features], cameras: Sequence[Any], takes: Takes
+) -> list[tuple[int, int]]:
+    """Pairs of takes that show the same pictures, as encodings of one video do, first < second."""
+    alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
+        pair = int(takes.take[i]), int(takes.take[j])
+        if pair[0] == pair[1] or max(pair) >= len(takes.videos):
+            continue
+        a, b = geometry.inlier_matches.T
+        scale = cameras[i].width / cameras[j].width
+        apart = np.hypot(*(features[i].xy[a] - features[j].xy[b] * scale).T)
+        if np.median(apart) <= _SAME_PLACE:
+            alike.setdefault(pair, []).append((i, j))
+    looked_at = np.bincount(takes.take[sorted(features)], minlength=takes.num_takes)
+    found = []
+    for pair, images in sorted(alike.items()):
+        num_same = [len(set(own)) for own in zip(*images, strict=True)]
+        share = max(same / looked_at[take] for same, take in zip(num_same, pair, strict=True))
+        if min(num_same) >= _FEWEST_SAME and share >= _SAME_SHARE:
+            found.append(pair)
+    return found
 
 
 def broken_gaps(

@@ -23,6 +23,7 @@ from colmap_av1.matching.link_matches import (
     broken_gaps,
     extract_features,
     match_pairs,
+    same_videos,
     supported_links,
 )
 from colmap_av1.matching.link_merging import (
@@ -82,6 +83,7 @@ class LinkReport:
         videos: (name, first frame) of each video where there are several.
         parts: the videos, by groups that are connected, where nothing connects them all.
         unlinked_photos: names of photos that nothing connects with a video.
+        same_videos: (name, name) of videos that show the same pictures.
     """
 
     num_images: int = 0
@@ -96,11 +98,17 @@ class LinkReport:
     videos: tuple[tuple[str, int], ...] = ()
     parts: tuple[tuple[str, ...], ...] = ()
     unlinked_photos: tuple[str, ...] = ()
+    same_videos: tuple[tuple[str, str], ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know: images that nothing connects."""
-        return (*self._open_gaps(), *self._parts(), *self._unlinked_photos())
+        """What the user should know: images that nothing connects, videos that are the same."""
+        same = (
+            f"'{first}' and '{second}' show the same pictures, as encodings of one video do: give "
+            "one of them, the other adds nothing but time"
+            for first, second in self.same_videos
+        )
+        return (*self._open_gaps(), *self._parts(), *self._unlinked_photos(), *same)
 
     def _open_gaps(self) -> tuple[str, ...]:
         if not self.open_gaps:
@@ -318,12 +326,14 @@ def _link(
         links = links.joined(matched_pairs(beside))
     broken = broken_gaps(gaps, links, matched, cameras)
     merged = merge_links(matched, links, features, broken)
+    same = same_videos(links, features, cameras, takes)
     report = LinkReport(
         num_images=len(plan.wanted),
         num_tried=len(tried | beside),
         num_links=len(links.pairs),
         num_revisits=len(revisits & found),
         num_between=len(between & found),
+        same_videos=tuple((takes.videos[a], takes.videos[b]) for a, b in same),
         **_gap_report(gaps, broken, merged, takes),
         **_take_report(merged, takes),
     )
