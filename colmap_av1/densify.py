@@ -262,7 +262,7 @@ def _pictures(
     takes: Takes, inputs: Inputs, photos: Sequence[Photo], scratch: Path, options: DensifyOptions
 ) -> Pictures:
     """What gives the pictures of images; a folder keeps those of videos."""
-    kept = [KeptPictures(scratch / f"{number}.nut") for number in range(len(inputs.videos))]
+    kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
     shown = [ShownVideo(own, kept=file) for own, file in zip(inputs.videos, kept, strict=True)]
     return pictures_of(takes, shown, [photo.path for photo in photos], options.match)
 

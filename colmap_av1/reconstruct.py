@@ -189,7 +189,7 @@ def reconstruct(
         )
         scratch = opened.enter_context(scratch_folder(stages / "pictures"))
         sources = tuple(
-            replace(own, kept=KeptPictures(scratch / f"{number}.nut"))
+            replace(own, kept=KeptPictures(scratch / f"{number}.raw"))
             for number, own in enumerate(sources)
         )
         run = Run(inputs, sources, output, stages, options, clock, progress)

@@ -259,8 +259,8 @@ def write_images(
                 num_threads=num_threads,
                 display=display,
                 wanted=wanted,
+                kept=kept,
             )
-            decoded = kept.of(wanted, decoded) if kept is not None else decoded
             with contextlib.closing(decoded):
                 _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)
     except VideoError:  # images of two videos would be kept as those of one

@@ -380,9 +380,8 @@ def decodable_frames(
         num_threads=options.run.num_threads,
         display=display,
         wanted=wanted,
+        kept=kept,
     )
-    if kept is not None and wanted is not None:
-        decoded = kept.of(wanted, decoded)
     count = 0
     try:
         for index, image in decoded:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.video.container import reason_of
 from colmap_av1.video.display import Display, shown_picture
-from colmap_av1.video.facts import read_video
+from colmap_av1.video.facts import Video, read_video
+from colmap_av1.video.kept_pictures import KeptPictures, Stored
 from colmap_av1.video.stored_frames import decode
 
 
@@ -23,7 +25,8 @@ def decode_frames(
     operating_point: int = 0,
     num_threads: int | None = None,
     display: Display | None = None,
-    wanted: Container[int] | None = None,
+    wanted: Collection[int] | None = None,
+    kept: KeptPictures | None = None,
 ) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
     """Decode the frames that players show, as they show them but for film grain.
 
@@ -34,6 +37,7 @@ def decode_frames(
         display: how pictures are cut and turned; None: as players do. Pixels stay as wide as
             they are stored.
         wanted: indices of the frames that are given, all others are decoded only; None: all.
+        kept: keeps those that are wanted, and what it holds is not decoded; None: each is decoded.
 
     Yields:
         (index, image) in output order: the index counts the frames that players show, see
@@ -45,19 +49,31 @@ def decode_frames(
     """
     video = read_video(video, operating_point)
     how = display if display is not None else video.display
+    decoded = _decoded(video, operating_point, num_threads, wanted)
+    if kept is not None and wanted is not None:
+        decoded = kept.of(wanted, decoded)
+    with closing(decoded):
+        for index, stored in decoded:
+            yield index, shown_picture(_in_colours(stored, video.path), how)
+
+
+def _decoded(
+    video: Video, operating_point: int, num_threads: int | None, wanted: Collection[int] | None
+) -> Generator[Stored, None, None]:
+    """The frames that players show, or the wanted ones of them, by their index, as stored."""
     index_of = None
     if video.presented is not None:
         index_of = {int(f): i for i, f in enumerate(video.presented)}
 
-    def shown(number: int, frame: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    def given(number: int, frame: Any) -> Iterator[Stored]:
         index = number if index_of is None else index_of.get(number)
         if index is not None and (wanted is None or index in wanted):
-            yield index, shown_picture(_in_colours(frame, video.path), how)
+            yield index, frame
 
     count = 0
     try:
         for frame in decode(video, operating_point, num_threads):
-            yield from shown(count, frame)
+            yield from given(count, frame)
             count += 1
     except BitstreamError:
         if num_threads == 1:
@@ -65,15 +81,17 @@ def decode_frames(
         # Threads lose the frames in flight at the damage; one thread has none in flight.
         for number, frame in enumerate(decode(video, operating_point, 1)):
             if number >= count:
-                yield from shown(number, frame)
+                yield from given(number, frame)
 
 
 def _in_colours(frame: Any, path: Path) -> NDArray[np.uint8]:
     try:
-        return np.asarray(frame.to_ndarray(format="bgr24"))
+        picture = np.asarray(frame.to_ndarray(format="bgr24"))
     except OSError as error:
         raise VideoError(
             f"{path}: pictures of format {frame.format.name} with colour matrix "
             f"{int(frame.colorspace)} cannot be converted: {reason_of(error)}: name the right "
             "colours with 'ffmpeg -i VIDEO -c copy -bsf:v av1_metadata=matrix_coefficients=1 NEW'"
         ) from error
+    # Where nothing is converted the samples are the frame's own, which others may overwrite.
+    return picture.copy() if frame.format.name == "bgr24" else picture

@@ -1,30 +1,22 @@
 """Pictures of some frames of a video, decoded once and kept in a file as long as they are needed.
 
-Of a long video few frames become images, and all others are decoded with them. A file of these
-few without loss is read again in a fraction of that time.
+They are kept as they are stored, without compression: writing one and reading it again takes less
+time than decoding it, and not much more of the disk than the image that is made of it.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Generator
 from contextlib import closing
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
-_Picture = NDArray[np.uint8]
-
-# FFmpeg's lossless intra codec that is the fastest to read, and a container that takes it.
-_CODEC, _FORMAT, _CONTAINER = "utvideo", "gbrp", "nut"
-# Frames decoded for each that is wanted from which on it pays: writing and reading a picture takes
-# as long as decoding three or four.
-_FEWEST_DECODED = 4
-# Of the container's clock; the pictures' times are not kept.
-_TICK = Fraction(1, 25)
+# Index of a frame, and the av.VideoFrame as it is stored.
+Stored = tuple[int, Any]
 
 
 class KeptPictures:
@@ -37,19 +29,23 @@ class KeptPictures:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._frames: list[int] = []
+        # The last of them, which has what a file of samples lacks, such as their colour space.
+        self._last: Any = None
+        # Of each of its planes, the bytes of all lines and of one.
+        self._sizes: list[tuple[int, int]] = []
 
     def of(
-        self, wanted: Collection[int], decoded: Generator[tuple[int, _Picture], None, None]
-    ) -> Generator[tuple[int, _Picture], None, None]:
+        self, wanted: Collection[int], decoded: Generator[Stored, None, None]
+    ) -> Generator[Stored, None, None]:
         """The pictures of some frames, from the file where it holds them.
 
         Args:
             wanted: the frames.
-            decoded: (frame, uint8 BGR picture [height, width, 3]) of these, ascending, from the
-                video: begun only where the file lacks one, and then kept in it if that pays.
+            decoded: the pictures of these, ascending, from the video: begun only where the file
+                lacks one, and then kept in it.
 
         Yields:
-            The same as `decoded`.
+            The same as `decoded`. A picture is overwritten by the next one.
 
         Raises:
             OSError: they cannot be kept.
@@ -57,53 +53,68 @@ class KeptPictures:
         """
         if set(wanted) <= set(self._frames):
             return self._read(wanted)
-        pays = bool(wanted) and max(wanted) + 1 >= _FEWEST_DECODED * len(wanted)
-        return self._kept(wanted, decoded) if pays else decoded
+        return self._kept(wanted, decoded)
 
-    def _read(self, wanted: Collection[int]) -> Generator[tuple[int, _Picture], None, None]:
-        last = max(wanted, default=-1)
-        with av.open(str(self._file)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame, shown in zip(self._frames, container.decode(stream), strict=False):
-                if frame > last:
-                    return
-                if frame in wanted:
-                    yield frame, np.asarray(shown.to_ndarray(format="bgr24"))
+    def _read(self, wanted: Collection[int]) -> Generator[Stored, None, None]:
+        stored = self._last
+        stored.make_writable()  # the decoder may hold it, too
+        planes = [_lines(plane, plane.line_size) for plane in stored.planes]
+        with self._file.open("rb") as file:
+            for frame in self._frames[: 1 + self._frames.index(max(wanted))]:
+                if frame not in wanted:
+                    file.seek(sum(size for size, _ in self._sizes), os.SEEK_CUR)
+                    continue
+                for own, (size, line_size) in zip(planes, self._sizes, strict=True):
+                    kept = _lines(file.read(size), line_size)
+                    # Lines may end in bytes that mean nothing, more or fewer of them.
+                    length = min(line_size, own.shape[1])
+                    own[:, :length] = kept[:, :length]
+                yield frame, stored
 
     def _kept(
-        self, wanted: Collection[int], decoded: Generator[tuple[int, _Picture], None, None]
-    ) -> Generator[tuple[int, _Picture], None, None]:
+        self, wanted: Collection[int], decoded: Generator[Stored, None, None]
+    ) -> Generator[Stored, None, None]:
         """The decoded pictures; the file is whole before the last is given, where many stop."""
         last = max(wanted)
         frames: list[int] = []
+        kind: tuple[Any, ...] = ()
         self._frames = []
         with closing(decoded):
-            with av.open(str(self._file), "w", format=_CONTAINER) as container:
-                stream: Any = None
-                for frame, picture in decoded:
-                    stream = stream or _stream_of(container, picture)
-                    if picture.shape[1::-1] != (stream.width, stream.height):
-                        # Nobody takes pictures of several sizes: what to say of it is theirs.
-                        yield frame, picture
+            with self._file.open("wb") as file:
+                for frame, stored in decoded:
+                    kind = kind or _kind_of(stored)
+                    if _kind_of(stored) != kind or not _is_in_lines(stored):
+                        # Nobody takes pictures of several kinds: what to say of it is theirs.
+                        yield frame, stored
                         break
-                    shown = av.VideoFrame.from_ndarray(picture, format="bgr24")
-                    shown = shown.reformat(format=_FORMAT)
-                    shown.pts, shown.time_base = len(frames), _TICK
-                    container.mux(stream.encode(shown))
+                    for plane in stored.planes:
+                        file.write(plane)
                     frames.append(frame)
                     if frame == last:
-                        container.mux(stream.encode(None))
                         break
-                    yield frame, picture
+                    yield frame, stored
             if frames[-1:] == [last]:
-                self._frames = frames
-                yield frame, picture
+                self._frames, self._last, self._sizes = frames, stored, _sizes_of(stored)
+                yield frame, stored
             yield from decoded
 
 
-def _stream_of(container: Any, picture: _Picture) -> Any:
-    stream = container.add_stream(_CODEC, rate=1 / _TICK)
-    stream.height, stream.width = picture.shape[:2]
-    stream.pix_fmt = _FORMAT
-    return stream
+def _lines(samples: Any, line_size: int) -> NDArray[np.uint8]:
+    """A plane's samples by its lines."""
+    return np.frombuffer(samples, np.uint8).reshape(-1, line_size)
+
+
+def _sizes_of(stored: Any) -> list[tuple[int, int]]:
+    """Of each plane, the bytes of all lines and of one."""
+    return [(plane.buffer_size, plane.line_size) for plane in stored.planes]
+
+
+def _kind_of(stored: Any) -> tuple[Any, ...]:
+    """What all pictures in a file have in common."""
+    format_ = stored.width, stored.height, stored.format.name
+    return *format_, stored.colorspace, stored.color_range, _sizes_of(stored)
+
+
+def _is_in_lines(stored: Any) -> bool:
+    """Whether its samples come line by line from the top, and are no places in a palette."""
+    return all(plane.line_size > 0 for plane in stored.planes)
