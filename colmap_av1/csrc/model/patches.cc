@@ -13,16 +13,39 @@ constexpr int kSamples = kPatch * kPatch;
 using Row = std::array<float, kPatch>;
 using Patch = std::array<Row, kPatch>;
 
-float sum_of(const Row& row) {
-  float sum = 0;
-  for (const float value : row) {
-    sum += value;
+// By halves: a processor adds what does not wait for each other at once.
+float sum_of(Row row) {
+  for (int half = kPatch / 2; half > 0; half /= 2) {
+    for (int i = 0; i < half; ++i) {
+      row[i] += row[i + half];
+    }
   }
-  return sum;
+  return row[0];
+}
+
+// A picture whose pixels are numbers to compute with, each of which many patches have in common.
+struct FloatPicture {
+  explicit FloatPicture(const GreyPicture& picture)
+      : pixels(picture.pixels.begin(), picture.pixels.end()),
+        width(picture.width),
+        height(picture.height) {}
+
+  std::vector<float> pixels;  // [height][width]
+  std::int64_t width;
+  std::int64_t height;
+};
+
+// What lies a share of the way from each of the pixels to the next one.
+Row between(const float* pixels, float share) {
+  Row found;
+  for (int i = 0; i < kPatch; ++i) {
+    found[i] = pixels[i] + share * (pixels[i + 1] - pixels[i]);
+  }
+  return found;
 }
 
 // The patch around (x, y), and whether it lies within the picture.
-bool sample(const GreyPicture& picture, float x, float y, Patch& patch) {
+bool sample(const FloatPicture& picture, float x, float y, Patch& patch) {
   const float left = x - 0.5F * kPatch;
   const float top = y - 0.5F * kPatch;
   // Of pixels that are read the last ones are one beyond the patch. False for what is no number.
@@ -34,47 +57,40 @@ bool sample(const GreyPicture& picture, float x, float y, Patch& patch) {
   const auto row = static_cast<std::int64_t>(top);
   const float right_share = left - static_cast<float>(column);
   const float lower_share = top - static_cast<float>(row);
-  const float weights[] = {(1 - right_share) * (1 - lower_share), right_share * (1 - lower_share),
-                           (1 - right_share) * lower_share, right_share * lower_share};
-  const std::uint8_t* upper = picture.pixels.data() + row * picture.width + column;
+  const float* pixels = picture.pixels.data() + row * picture.width + column;
+  Row upper = between(pixels, right_share);
   for (Row& own : patch) {
-    const std::uint8_t* lower = upper + picture.width;
+    pixels += picture.width;
+    const Row lower = between(pixels, right_share);
     for (int i = 0; i < kPatch; ++i) {
-      own[i] = weights[0] * upper[i] + weights[1] * upper[i + 1] + weights[2] * lower[i] +
-               weights[3] * lower[i + 1];
+      own[i] = upper[i] + lower_share * (lower[i] - upper[i]);
     }
     upper = lower;
   }
   return true;
 }
 
-// Sums of a patch's values and of their squares.
-struct Sums {
-  float values = 0;
-  float squares = 0;
-};
-
-Sums sums_of(const Patch& patch) {
-  Row values{};
-  Row squares{};
+float mean_of(const Patch& patch) {
+  Row sums{};
   for (const Row& row : patch) {
     for (int i = 0; i < kPatch; ++i) {
-      values[i] += row[i];
-      squares[i] += row[i] * row[i];
+      sums[i] += row[i];
     }
   }
-  return {sum_of(values), sum_of(squares)};
+  return sum_of(sums) / kSamples;
 }
 
 // Makes the mean of a patch 0 and its norm 1; false where it is too flat for that.
 bool normalise(Patch& patch, float min_norm) {
-  const float mean = sums_of(patch).values / kSamples;
+  const float mean = mean_of(patch);
+  Row squares{};
   for (Row& row : patch) {
-    for (float& value : row) {
-      value -= mean;
+    for (int i = 0; i < kPatch; ++i) {
+      row[i] -= mean;
+      squares[i] += row[i] * row[i];
     }
   }
-  const float norm = std::sqrt(sums_of(patch).squares);
+  const float norm = std::sqrt(sum_of(squares));
   if (!(norm >= min_norm && norm > 0)) {
     return false;
   }
@@ -86,18 +102,20 @@ bool normalise(Patch& patch, float min_norm) {
   return true;
 }
 
-// Correlation of a normalised patch with one that is not.
-float correlation(const Patch& normalised, Patch& other, float min_norm) {
-  if (!normalise(other, min_norm)) {
-    return -1;
-  }
+// Correlation of a normalised patch with one that is not; -1 where that is too flat.
+float correlation(const Patch& normalised, const Patch& other, float min_norm) {
+  const float mean = mean_of(other);
+  Row squares{};
   Row products{};
   for (int row = 0; row < kPatch; ++row) {
     for (int i = 0; i < kPatch; ++i) {
-      products[i] += normalised[row][i] * other[row][i];
+      const float value = other[row][i] - mean;
+      squares[i] += value * value;
+      products[i] += normalised[row][i] * value;
     }
   }
-  return sum_of(products);
+  const float norm = std::sqrt(sum_of(squares));
+  return norm >= min_norm && norm > 0 ? sum_of(products) / norm : -1;
 }
 
 void check(const GreyPicture& picture) {
@@ -121,15 +139,17 @@ std::vector<float> correlate_patches(const GreyPicture& one, std::span<const flo
   }
   const std::size_t tried = count == 0 ? 0 : at_two.size() / at_one.size();
   const float min_norm = min_deviation * kPatch;  // the root of the number of samples
+  const FloatPicture first(one);
+  const FloatPicture second(two);
   std::vector<float> found(count * tried, -1.0F);
   for (std::size_t i = 0; i < count; ++i) {
     Patch own;
-    if (!sample(one, at_one[2 * i], at_one[2 * i + 1], own) || !normalise(own, min_norm)) {
+    if (!sample(first, at_one[2 * i], at_one[2 * i + 1], own) || !normalise(own, min_norm)) {
       continue;
     }
     for (std::size_t k = i * tried; k < (i + 1) * tried; ++k) {
       Patch other;
-      if (sample(two, at_two[2 * k], at_two[2 * k + 1], other)) {
+      if (sample(second, at_two[2 * k], at_two[2 * k + 1], other)) {
         found[k] = correlation(own, other, min_norm);
       }
     }
