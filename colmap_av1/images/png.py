@@ -13,6 +13,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _BITS, _RGB = 8, 2  # a sample's; and the type of colours
 _AVERAGE = 3  # the filter: a sample less the average of those to its left and above it
 _LEVEL = 1
+_FILTERED_AT_ONCE = 1 << 17  # bytes
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:
@@ -36,13 +37,19 @@ def _chunk(name: bytes, data: bytes) -> bytes:
 def _filtered(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The filtered samples, uint8 [height, 1 + 3 * width], after the filter of each row."""
     height, width = picture.shape[:2]
-    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).reshape(height, 3 * width)
-    left, above = rgb[1:, :-3], rgb[:-1, 3:]
-    average = np.zeros(rgb.shape, np.uint8)
-    average[1:, 3:] = (left & above) + ((left ^ above) >> 1)  # in 8 bits, rounded down
-    average[0, 3:] = rgb[0, :-3] >> 1
-    average[1:, :3] = rgb[:-1, :3] >> 1
     filtered = np.empty((height, 1 + 3 * width), np.uint8)
     filtered[:, 0] = _AVERAGE
-    np.subtract(rgb, average, out=filtered[:, 1:])
+    # Some rows at a time, which stay in a processor's cache, after the one above them.
+    most = max(1, _FILTERED_AT_ONCE // (3 * width))
+    rgb = np.zeros((1 + most, 3 + 3 * width), np.uint8)
+    for first in range(0, height, most):
+        rows = picture[first : first + most]
+        own = rgb[1 : 1 + len(rows)]
+        own[:, 3:] = cv2.cvtColor(rows, cv2.COLOR_BGR2RGB).reshape(len(rows), -1)
+        left, above = own[:, :-3], rgb[: len(rows), 3:]
+        average = np.bitwise_xor(left, above)  # in 8 bits, rounded down
+        average >>= 1
+        average += left & above
+        np.subtract(own[:, 3:], average, out=filtered[first : first + len(rows), 1:])
+        rgb[0] = own[-1]
     return filtered
