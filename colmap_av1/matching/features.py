@@ -16,6 +16,8 @@ from colmap_av1.video.coded_size import smaller_grey
 # Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from
 # far apart share; with it there are several times as many.
 _FIRST_OCTAVE = {"light": 0, "full": -1}
+# Of the width and height of the picture that quick ones are looked for in.
+_QUICK_SCALE = 0.7
 # COLMAP's own limits for matches of SIFT: angle of the nearest descriptor, in radians, and its
 # ratio to that of the second nearest.
 _MAX_ANGLE = 0.7
@@ -71,6 +73,31 @@ class FeatureExtractor:
         descriptors = np.asarray(found.data, dtype=np.float32).reshape(-1, _NUM_DIMENSIONS)
         length = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(xy, descriptors / np.maximum(length, 1e-6))
+
+
+def quick_features(picture: NDArray[np.uint8], max_num_features: int) -> Features:
+    """SIFT features of a picture by OpenCV, for views that differ little.
+
+    In a picture of half its pixels, enlarged again for the smallest features, they take half the
+    time of those of `FeatureExtractor`, and are placed as exactly.
+
+    Args:
+        picture: uint8 [height, width, 3], BGR.
+        max_num_features: about so many at most, those that stand out most.
+    """
+    grey = smaller_grey(picture)
+    size = tuple(max(1, round(length * _QUICK_SCALE)) for length in grey.shape[::-1])
+    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    sift = cv2.SIFT.create(nfeatures=max_num_features, enable_precise_upscale=True)
+    keypoints, found = sift.detectAndCompute(grey, None)
+    # OpenCV counts from the centre of the first pixel.
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2) + np.float32(0.5)
+    xy *= np.array(picture.shape[1::-1], dtype=np.float32) / grey.shape[::-1]
+    if found is None:
+        found = np.empty((0, _NUM_DIMENSIONS), np.float32)
+    # Root of the share of each: "RootSIFT", which COLMAP's own are by default.
+    sums = np.maximum(found.sum(axis=1, keepdims=True), 1e-6)
+    return Features(xy, np.sqrt(found / sums).astype(np.float32))
 
 
 def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask | None) -> Features:

@@ -14,7 +14,7 @@ from colmap_av1.errors import ImageError
 from colmap_av1.images.files import read_image
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import image_file, natural_order
-from colmap_av1.matching.features import FeatureExtractor, Features, masked_features
+from colmap_av1.matching.features import Features, masked_features, quick_features
 from colmap_av1.matching.link_matches import match_pairs
 from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
@@ -36,7 +36,7 @@ _MAX_SCALE = 2.0
 _NUM_POINTS = 200
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500
-# Images that pairs are made of, evenly spread: features take a tenth of a second of each.
+# Images that pairs are made of, evenly spread: features take a twentieth of a second of each.
 _NUM_IMAGES = 16
 # Pixels that views from far apart in time may disagree by before it is said: the surfaces of
 # models that hold together agree to less than one, or two with long focal lengths.
@@ -116,7 +116,6 @@ class FarViewCheck:
         self._cameras = [cameras[image.camera_id] for image in images]
         self._pairs = _far_pairs(images, self._cameras, points_of)
         self._wanted = set(self._pairs.ravel().tolist())
-        self._extractor = FeatureExtractor(_NUM_FEATURES) if self._wanted else None
         self._features: dict[int, Features] = {}
 
     @property
@@ -129,8 +128,8 @@ class FarViewCheck:
 
         `mask` says what of it counts.
         """
-        if index in self._wanted and self._extractor is not None:
-            features = self._extractor.extract(picture)
+        if index in self._wanted:
+            features = quick_features(picture, _NUM_FEATURES)
             self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> FarViews:
