@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -335,20 +334,6 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
-
-
-def read_images(paths: Sequence[Path], num_threads: int | None) -> Iterator[NDArray[np.uint8]]:
-    """Read image files on threads (None: one per CPU), in their order; see `read_image`."""
-    count = threads_or_cpus(num_threads)
-    waiting: deque[Future[NDArray[np.uint8]]] = deque()
-    # OpenCV releases the interpreter lock while it reads.
-    with ThreadPoolExecutor(max_workers=count) as executor:
-        for path in paths:
-            waiting.append(executor.submit(read_image, path))
-            if len(waiting) > count:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 def blur_warning(files: Sequence[Path]) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.files import read_image, read_images, write_image, write_images
+from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.masks import Mask
-from colmap_av1.images.names import image_file
 from colmap_av1.images.takes import Takes
 from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
 from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
@@ -37,12 +36,14 @@ from colmap_av1.model.track_points import (
     to_model_points,
 )
 from colmap_av1.model.undistort import (
+    Undistortion,
     on_pinhole,
     pinhole_camera,
     undistorted_masks,
     undistortion,
 )
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -78,18 +79,34 @@ def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
     return {int(view.camera.camera_id): view.camera for view in views}
 
 
-def _undistortions(
-    placed: PosedImages, views: Sequence[PosedCamera]
-) -> Callable[[int, _Image], _Image]:
-    """What undistorts the picture of an image, by its index."""
+def _undistortions(placed: PosedImages, views: Sequence[PosedCamera]) -> list[Undistortion | None]:
+    """What undistorts the picture of each image; None: it has no distortion."""
     pinholes = _pinholes(views)
     of_camera = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+    return [of_camera[image.camera_id] for image in placed.images]
 
-    def undistort(image: int, picture: _Image) -> _Image:
-        how = of_camera[placed.images[image].camera_id]
-        return how(picture) if how is not None else picture
 
-    return undistort
+def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:
+    return how(picture) if how is not None else picture
+
+
+def _pictures(run: Run, placed: PosedImages) -> Iterator[tuple[int, _Image]]:
+    """The pictures of the images as they were taken, by index."""
+    for take in np.unique(placed.take).tolist():
+        own = np.flatnonzero(placed.take == take)
+        if take >= len(run.sources):
+            yield int(own[0]), read_image(run.inputs.photos[take - len(run.sources)].path)
+            continue
+        first = int(placed.first_frame[take])
+        image_of = {int(placed.frames[i]) - first: int(i) for i in own}
+        decoded = decodable_frames(
+            *(run.sources[take].pictures, max(image_of) + 1, run.options.match),
+            wanted=image_of,
+            use="colours are looked at",
+            kept=run.sources[take].kept,
+        )
+        for frame, picture in decoded:
+            yield image_of[frame], picture
 
 
 def _on_pinholes(
@@ -108,22 +125,17 @@ def _written_images(
     run: Run,
     folder: Path,
     placed: PosedImages,
-    views: Sequence[PosedCamera],
+    undistort: Sequence[Undistortion | None],
     look: Look,
-) -> list[Path]:
-    """Write the images, undistorted, and look at those of videos on the way.
-
-    Returns:
-        Their files.
-    """
+) -> None:
+    """Write the images, undistorted, and look at those of videos on the way."""
     options, progress = run.options, run.progress
-    undistort = _undistortions(placed, views)
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
     def change(first: int, frame: int, picture: _Image) -> _Image:
         index = index_of_frame[first + frame]
-        shown = undistort(index, picture)
+        shown = _undistorted(picture, undistort[index])
         look(index, shown)
         return shown
 
@@ -150,10 +162,10 @@ def _written_images(
         else:
             photo = run.inputs.photos[take - len(run.sources)]
             (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
-            write_image(folder / photo.name, undistort(int(own[0]), read_image(photo.path)))
+            shown = _undistorted(read_image(photo.path), undistort[int(own[0])])
+            write_image(folder / photo.name, shown)
             report(1)
         done += len(own)
-    return [image_file(folder, name) for name in names]
 
 
 def _written_cloud(
@@ -162,42 +174,47 @@ def _written_cloud(
     placed: PosedImages,
     views: Sequence[PosedCamera],
     tracked: ModelPoints,
-) -> tuple[list[Path], ModelPoints]:
+    *,
+    undistort: Sequence[Undistortion | None],
+) -> ModelPoints:
     """Write the images; those points, in black, that the options want of tracks and pictures."""
     options, clock = run.options.triangulate, run.clock
-    files: list[Path] = []
 
     def show(look: Look) -> None:
         with clock.measure("images"):
-            files.extend(_written_images(run, folder, placed, views, look))
+            _written_images(run, folder, placed, undistort, look)
 
     if options.points == "survey":
         show(lambda *_: None)
-        return files, tracked
-    cloud = swept_cloud(
+        return tracked
+    return swept_cloud(
         *(tracked, views, placed.take, show),
         max_points=options.max_points,
         num_threads=run.options.match.run.num_threads,
         clock=clock,
     )
-    return files, cloud
 
 
 def _looked_at(
     run: Run,
-    files: Sequence[Path],
     placed: PosedImages,
     views: Sequence[PosedCamera],
+    undistort: Sequence[Undistortion | None],
     cloud: ModelPoints,
 ) -> tuple[FarViews, ModelPoints]:
-    """How far views from far apart disagree in the images, and the points in their colours."""
+    """How far views from far apart disagree in the images, and the points in their colours.
+
+    The images themselves are not read: decompressing them takes several times as long.
+    """
     far = FarViewCheck(placed.images, _pinholes(views), lambda image: points_seen(cloud, image))
     colours = Colours(cloud, [view.size for view in views])
+    compared = set(far.wanted)
     with run.clock.measure("colours"):
-        for index, picture in enumerate(read_images(files, run.options.match.run.num_threads)):
-            colours.add(index, picture)
-            far.add(index, picture, views[index].mask)
-            run.progress("colours", index + 1, len(files))
+        for done, (index, picture) in enumerate(_pictures(run, placed), start=1):
+            colours.add(index, picture, undistort[index])
+            if index in compared:
+                far.add(index, _undistorted(picture, undistort[index]), views[index].mask)
+            run.progress("colours", done, len(views))
     with run.clock.measure("far views"):
         return far.result(), replace(cloud, rgb=colours.rgb())
 
@@ -249,11 +266,13 @@ def model_stage(
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_moving = np.array([image.name in moving for image in images])
             tracked = take_points(tracked, surely_still(tracked, shows_moving))
-        files, cloud = _written_cloud(run, partial / "images", placed, views, tracked)
+        with clock.measure("images"):
+            undistort = _undistortions(placed, views)
+        cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)
         with clock.measure("coverage"):
             covered = coverage(views, cloud.xyz)
-        far_views, cloud = _looked_at(run, files, placed, views, cloud)
+        far_views, cloud = _looked_at(run, placed, views, undistort, cloud)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)

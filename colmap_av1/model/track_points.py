@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.model.colmap_model import ModelPoints
 from colmap_av1.model.splats.points import splat_points
 from colmap_av1.model.triangulate import Observations, TriangulatedPoints, Views, triangulate
+from colmap_av1.model.undistort import Undistortion
 from colmap_av1.options import MatchOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.progress import Progress
@@ -127,13 +128,17 @@ class Colours:
         self._bounds = np.searchsorted(ordered, np.arange(len(sizes) + 1))
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
-    def add(self, image: int, picture: _Image) -> None:
-        """Look at the picture (BGR, of any scale) of an image, of its model's camera."""
+    def add(self, image: int, picture: _Image, undistortion: Undistortion | None = None) -> None:
+        """Look at the picture (BGR, of any scale) of an image.
+
+        It is of its model's camera, or what `undistortion` makes of it is.
+        """
         own = self._order[self._bounds[image] : self._bounds[image + 1]]
-        size = np.array(picture.shape[1::-1])
+        size = np.array(undistortion.size if undistortion is not None else picture.shape[1::-1])
         at = self._points.xy[own] * size / self._sizes[image]
         x, y = np.clip(at.astype(np.int64), 0, size - 1).T
-        self._seen[own] = picture[y, x, ::-1]
+        shown = undistortion.pixels(picture, x, y) if undistortion is not None else picture[y, x]
+        self._seen[own] = shown[:, ::-1]
 
     def rgb(self) -> _Image:
         """Colours uint8 [num_points, 3], red first."""

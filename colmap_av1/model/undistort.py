@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -20,6 +21,8 @@ _Image = NDArray[np.uint8]
 # Zoom of the undistorted camera against the distorted one.
 _ZOOM_RANGE = (0.25, 4.0)
 _BISECTIONS = 40
+# Of the tables in which single pixels are looked up.
+_COLUMNS = 512
 
 
 def pinhole_camera(camera: Any) -> Any:
@@ -92,7 +95,7 @@ def undistorted_masks(
     """
 
     @functools.cache
-    def change_of(camera_id: int) -> Callable[[_Image], _Image] | None:
+    def change_of(camera_id: int) -> Undistortion | None:
         return undistortion(of_id[camera_id], pinholes[camera_id], cv2.INTER_NEAREST)
 
     @functools.cache
@@ -112,10 +115,47 @@ def undistorted_masks(
     ]
 
 
+@dataclass(frozen=True)
+class Undistortion:
+    """Undistorts pictures of a camera.
+
+    Attributes:
+        source: float32 [height, width, 2] where each pixel of the undistorted picture is in the
+            distorted one, the centre of whose first pixel is (0, 0).
+        interpolation: OpenCV's flag for what lies between pixels.
+    """
+
+    source: NDArray[np.float32]
+    interpolation: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of undistorted pictures."""
+        height, width = self.source.shape[:2]
+        return width, height
+
+    def __call__(self, picture: _Image) -> _Image:
+        """The undistorted picture of a picture, uint8 [height, width, ...]."""
+        return self._looked_up(picture, self.source)
+
+    def pixels(self, picture: _Image, x: NDArray[np.int64], y: NDArray[np.int64]) -> _Image:
+        """Some pixels [n, ...] of the undistorted picture, by their columns and rows [n]."""
+        # As a table: OpenCV takes no row or column as long as that.
+        rows = -(-len(x) // _COLUMNS)
+        source = np.resize(self.source[y, x], (rows, _COLUMNS, 2))
+        found = self._looked_up(picture, source) if rows else picture[:0]
+        return found.reshape(-1, *picture.shape[2:])[: len(x)]
+
+    def _looked_up(self, picture: _Image, source: NDArray[np.float32]) -> _Image:
+        edge = cv2.BORDER_REPLICATE
+        found = cv2.remap(picture, source, None, self.interpolation, borderMode=edge)
+        return np.asarray(found, np.uint8)
+
+
 def undistortion(
     camera: Any, pinhole: Any, interpolation: int = cv2.INTER_CUBIC
-) -> Callable[[_Image], _Image] | None:
-    """A function that undistorts pictures; None without distortion."""
+) -> Undistortion | None:
+    """What undistorts the pictures of a camera; None without distortion."""
     if is_undistorted(camera):
         return None
     fx, fy, cx, cy = pinhole.params
@@ -124,9 +164,4 @@ def undistortion(
     source = _project(camera, np.column_stack([(x - cx) / fx, (y - cy) / fy]))
     # OpenCV counts from the centre of the first pixel.
     at = (source - 0.5).reshape(height, width, 2).astype(np.float32)
-
-    def undistort(picture: _Image) -> _Image:
-        edge = cv2.BORDER_REPLICATE
-        return np.asarray(cv2.remap(picture, at, None, interpolation, borderMode=edge), np.uint8)
-
-    return undistort
+    return Undistortion(at, interpolation)
