@@ -168,6 +168,20 @@ def test_graphdeco(made: ReconstructReport) -> None:
     assert rgb.std() > 10
 
 
+def test_colours_are_pixels_of_the_images(made: ReconstructReport) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    pictures = {
+        i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1]
+        for i, image in model.images.items()
+    }
+    for point in list(model.points3D.values())[::50]:
+        shown = set()
+        for seen in point.track.elements:
+            x, y = model.images[seen.image_id].points2D[seen.point2D_idx].xy.astype(int)
+            shown.add(tuple(pictures[seen.image_id][y, x].tolist()))
+        assert tuple(point.color.tolist()) in shown
+
+
 def test_gsplat(made: ReconstructReport) -> None:
     """Files and images in their sorted order stand for each other."""
     _, images, _ = raw_model(made.output / "sparse" / "0")

@@ -3,6 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pycolmap
+from hypothesis import given
+from hypothesis import strategies as st
 
 from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
 
@@ -40,3 +42,16 @@ def test_undistorted_picture_shows_the_same() -> None:
     )
     assert undistortion(plain, pinhole_camera(plain)) is None
     assert list(pinhole_camera(plain).params) == [250, 250, 160, 120]
+
+
+@given(st.lists(st.tuples(st.integers(0, 96), st.integers(0, 60)), max_size=1100))
+def test_some_pixels_are_those_of_the_whole_undistorted_picture(at: list[tuple[int, int]]) -> None:
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_RADIAL", width=97, height=61, params=[90, 48, 30, -0.1]
+    )
+    undistort = undistortion(camera, pinhole_camera(camera))
+    assert undistort is not None
+    assert undistort.size == (97, 61)
+    picture = np.random.default_rng(0).integers(0, 256, (61, 97, 3), dtype=np.uint8)
+    x, y = np.array(at, np.int64).reshape(-1, 2).T
+    assert np.array_equal(undistort.pixels(picture, x, y), undistort(picture)[y, x])
