@@ -97,6 +97,70 @@ def correlate_patches(
     *,
     min_deviation: float,
 ) -> NDArray[np.float32]: ...
+def reprojection_errors(
+    *,
+    cam_from_world: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    view: NDArray[np.int64],
+    rays: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    offsets: NDArray[np.int64],
+    observation: NDArray[np.int64],
+) -> NDArray[np.float64]: ...
+def widest_angles(
+    *,
+    centres: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    offsets: NDArray[np.int64],
+    view: NDArray[np.int64],
+) -> NDArray[np.float64]: ...
+def hanging_observations(
+    *,
+    cam_from_world: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    view: NDArray[np.int64],
+    rays: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    offsets: NDArray[np.int64],
+    observation: NDArray[np.int64],
+    before: float,
+    as_near: float,
+    support: int,
+    around: float,
+    fewest_around: int,
+) -> NDArray[np.int64]: ...
+def points_in_view(
+    cam_from_world: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]: ...
+def points_in_picture(
+    cam_from_world: NDArray[np.float64],
+    pinhole: NDArray[np.float64],
+    width: float,
+    height: float,
+    xyz: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]: ...
+def nearest_in_cells(
+    xy: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    *,
+    cell: int,
+    columns: int,
+    rows: int,
+) -> NDArray[np.float64]: ...
+def best_at_spacings(
+    xy: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    rank: NDArray[np.int64],
+    *,
+    width: int,
+    height: int,
+    spacings: NDArray[np.int64],
+    steps_per_octave: float,
+    most_steps: int,
+) -> NDArray[np.int64]: ...
 def triangulate(
     *,
     cam_from_world: NDArray[np.float64],

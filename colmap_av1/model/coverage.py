@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1 import _core
 from colmap_av1.images.masks import Mask
 from colmap_av1.model.colmap_model import ModelImage, posed_images
 
@@ -23,8 +24,6 @@ _NEARER = 1.25
 _AROUND = 8
 # Images that are looked at, evenly spread; bounds the time of long videos.
 _MOST_IMAGES = 64
-# Points looked at at a time: as many as stay in a processor's cache.
-_CHUNK = 16_384
 # Points of the picture's edge that tell which rays a camera sees.
 _EDGE_POINTS = 33
 
@@ -88,28 +87,19 @@ class PosedCamera:
             int64 [m] their indices, ascending; float64 [m, 2] pixels, the first one's centre at
             (0.5, 0.5); and float64 [m] depths along the camera's axis.
         """
-        low, high = self._seen_rays
+        xyz = np.ascontiguousarray(xyz, np.float64)
+        pose = np.ascontiguousarray(self.cam_from_world, np.float64)
         width, height = self.size
-        found = []
-        for first in range(0, len(xyz), _CHUNK):
-            own = xyz[first : first + _CHUNK] @ self.cam_from_world[:, :3].T
-            own += self.cam_from_world[:, 3]
-            # By columns: NumPy's loops over rows of two take several times as long.
-            x, y, z = own.T
-            # Beyond what a camera sees its distortion may fold back into the picture.
-            within = z > 0
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                for along, least, most in zip((x, y), low, high, strict=True):
-                    ray = along / z
-                    within &= (ray >= least) & (ray <= most)
-            seen = np.flatnonzero(within)
-            xy = np.asarray(self.camera.img_from_cam(own[seen])).reshape(-1, 2)
-            inside = (xy[:, 0] >= 0) & (xy[:, 0] < width) & (xy[:, 1] >= 0) & (xy[:, 1] < height)
-            found.append((seen[inside] + first, xy[inside], own[seen[inside], 2]))
-        if not found:
-            return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
-        index, xy, depth = (np.concatenate(column) for column in zip(*found, strict=True))
-        return index, xy, depth
+        if self.camera.model_name == "PINHOLE":
+            return _core.points_in_picture(
+                pose, np.asarray(self.camera.params), float(width), float(height), xyz
+            )
+        # Beyond what a camera sees its distortion may fold back into the picture.
+        index, own = _core.points_in_view(pose, *self._seen_rays, xyz)
+        xy = np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
+        x, y = xy[:, 0], xy[:, 1]
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return index[inside], xy[inside], own[inside, 2]
 
 
 def views_of(
@@ -175,12 +165,8 @@ def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
 def nearest_in_cells(size: tuple[int, int], xy: _Floats, depth: _Floats) -> _Floats:
     """Least of the depths [n] at pixels [n, 2] in each cell of a (width, height), see above."""
     columns, rows = (-(-length // CELL) for length in size)
-    column, row = (xy // CELL).astype(np.int64).T
     # What is seen at the very edge is of the last cell.
-    cell = np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1)
-    grid = np.full(rows * columns, np.inf)
-    np.minimum.at(grid, cell, depth)
-    return grid.reshape(rows, columns)
+    return _core.nearest_in_cells(xy, depth, cell=CELL, columns=columns, rows=rows)
 
 
 def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_side: int) -> _Floats:

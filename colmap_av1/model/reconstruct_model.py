@@ -30,14 +30,14 @@ from colmap_av1.model.splats.cloud import take_points
 from colmap_av1.model.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.model.track_points import (
     Colours,
-    by_camera,
     mean_error,
+    rays_of,
     seen_in,
     to_model_points,
 )
 from colmap_av1.model.undistort import (
     Undistortion,
-    on_pinhole,
+    on_pinholes,
     pinhole_camera,
     undistorted_masks,
     undistortion,
@@ -62,14 +62,17 @@ def _tracked_points(
         The points, and the share of the tracks that agree with the poses.
     """
     seen, view = seen_in(tracks, placed.frames)
+    rays = rays_of(seen, view, placed.camera_of_image)
+    pinholes = [own.camera for own in views]
     points = triangulate_in(
         *(run, placed, seen, view),
         options=run.options.triangulate,
-        pinholes=[own.camera for own in views],
+        pinholes=pinholes,
+        rays=rays,
         progress=run.progress,
     )
     check_agreement(len(points.xyz), points.num_tracks)
-    xy = _on_pinholes(placed, views, seen.xy[points.observation], view[points.observation])
+    xy = on_pinholes(rays[points.observation], view[points.observation], pinholes)
     agreeing = points.num_agreeing / max(points.num_tracks, 1)
     return to_model_points(points, view, xy), agreeing
 
@@ -107,18 +110,6 @@ def _pictures(run: Run, placed: PosedImages) -> Iterator[tuple[int, _Image]]:
         )
         for frame, picture in decoded:
             yield image_of[frame], picture
-
-
-def _on_pinholes(
-    placed: PosedImages,
-    views: Sequence[PosedCamera],
-    xy: NDArray[np.float32],
-    image: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Pixels of observations [n, 2] by images [n] in the undistorted pictures of these."""
-    pinholes = _pinholes(views)
-    change = {i: partial(on_pinhole, camera, pinholes[i]) for i, camera in placed.cameras.items()}
-    return by_camera(xy, np.array([own.camera_id for own in placed.images]), image, change)
 
 
 def _written_images(

@@ -389,6 +389,7 @@ def triangulate_in(
     *,
     options: TriangulateOptions,
     pinholes: Sequence[Any] | None = None,
+    rays: NDArray[np.float64] | None = None,
     progress: Progress = no_progress,
 ) -> TriangulatedPoints:
     """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
@@ -398,6 +399,7 @@ def triangulate_in(
         options=options,
         num_threads=run.options.match.run.num_threads,
         progress=progress,
+        rays=rays,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -72,17 +72,14 @@ def triangulate_tracks(
     options: TriangulateOptions,
     num_threads: int | None,
     progress: Progress,
+    rays: NDArray[np.float64] | None = None,
 ) -> TriangulatedPoints:
     """Points of all tracks, of the kind that the options say.
 
-    Errors are in pixels of each image's pinhole camera, else of its own.
+    Errors are in pixels of each image's pinhole camera, else of its own. `rays` are those of
+    `rays_of`, where these are known already.
     """
-    rays = by_camera(
-        tracks.xy,
-        np.array([int(camera.camera_id) for camera in cameras]),
-        view,
-        {int(c.camera_id): c.cam_from_img for c in cameras},
-    )
+    rays = rays_of(tracks, view, cameras) if rays is None else rays
     shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = len(tracks.offsets) - 1
@@ -95,23 +92,28 @@ def triangulate_tracks(
     )
 
 
-def by_camera(
-    xy: NDArray[np.float32],
-    camera_of_view: NDArray[np.int64],
-    view: NDArray[np.int64],
-    change: Mapping[int, Callable[[NDArray[np.float64]], Any]],
-) -> NDArray[np.float64]:
-    """Positions [n, 2] in views [n], changed by what is given for the camera of each view."""
-    found = np.empty(xy.shape)
+def rays_of(tracks: Tracks, view: NDArray[np.int64], cameras: Sequence[Any]) -> NDArray[np.float64]:
+    """Undistorted positions (x / z, y / z) of observations, float64 [num_observations, 2].
+
+    Args:
+        tracks: the tracks.
+        view: int64 [num_observations] the image of each observation.
+        cameras: the pycolmap.Camera of each image.
+    """
+    by_id = {int(camera.camera_id): camera for camera in cameras}
+    camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
+    rays = np.empty(tracks.xy.shape)
     # Part by part: what is made on the way is several times as large.
-    for start in range(0, len(xy), _CHUNK):
+    for start in range(0, len(rays), _CHUNK):
         part = slice(start, start + _CHUNK)
-        camera = camera_of_view[view[part]]
-        for camera_id, changed in change.items():
-            own = camera == camera_id
-            if own.any():
-                found[part][own] = np.asarray(changed(xy[part][own].astype(np.float64)))
-    return found
+        xy, camera_id = tracks.xy[part].astype(np.float64), camera_of_view[view[part]]
+        if len(by_id) == 1:
+            rays[part] = cameras[0].cam_from_img(xy)
+            continue
+        for own_id in np.unique(camera_id).tolist():
+            own = camera_id == own_id
+            rays[part][own] = by_id[own_id].cam_from_img(xy[own])
+    return rays
 
 
 class Colours:

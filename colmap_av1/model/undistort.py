@@ -76,11 +76,15 @@ def _project(camera: Any, rays: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
 
-def on_pinhole(camera: Any, pinhole: Any, xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Pixels of the undistorted camera that show the same."""
-    fx, fy, cx, cy = pinhole.params
-    rays = np.asarray(camera.cam_from_img(xy.astype(np.float64)))
-    return np.asarray(rays * (fx, fy) + (cx, cy))
+def on_pinholes(
+    rays: NDArray[np.float64], view: NDArray[np.int64], pinholes: Sequence[Any]
+) -> NDArray[np.float64]:
+    """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
+    params = np.array([pinhole.params for pinhole in pinholes])
+    xy = np.empty(rays.shape)
+    for axis in range(2):
+        xy[:, axis] = rays[:, axis] * params[view, axis] + params[view, 2 + axis]
+    return xy
 
 
 def undistorted_masks(

@@ -28,6 +28,28 @@ def at_cells(depth: float, camera: pycolmap.Camera = PLAIN) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [PLAIN, BENT])
+def test_points_in_the_picture(camera: pycolmap.Camera) -> None:
+    """Those that COLMAP's camera puts there, beside and behind it too many for a chunk."""
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-3, 3, 3)
+    rotation = pycolmap.Rotation3d(angles).matrix()
+    view = PosedCamera(camera, np.column_stack([rotation, [0.3, -0.2, 0.1]]))
+    xyz = rng.normal(0, 2, (5000, 3))
+    local = xyz @ rotation.T + view.cam_from_world[:, 3]
+    there = np.flatnonzero(local[:, 2] > 0)
+    # Beyond what the picture shows a distortion folds rays back into it.
+    rays = local[there, :2] / local[there, 2:]
+    there = there[(np.abs(rays) < [1.0, 0.6]).all(axis=1)]
+    at = np.asarray(camera.img_from_cam(local[there])).reshape(-1, 2)
+    inside = ((at >= 0) & (at < SIZE)).all(axis=1)
+    index, xy, depth = view.project(xyz)
+    assert len(index) > 200
+    assert index.tolist() == there[inside].tolist()
+    assert np.allclose(xy, at[inside], atol=1e-9)
+    assert np.allclose(depth, local[index, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT])
 def test_share_of_cells(camera: pycolmap.Camera) -> None:
     view = PosedCamera(camera, HERE)
     points = at_cells(3.0, camera)

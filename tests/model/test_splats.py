@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_av1 import _core
 from colmap_av1.errors import OptionError
 from colmap_av1.model.colmap_model import ModelPoints, camera_centres
 from colmap_av1.model.coverage import PosedCamera, coverage
@@ -251,14 +252,35 @@ def test_centres_are_where_cameras_are() -> None:
         assert np.allclose(view.centre, centre)
 
 
-def test_many_points_are_looked_at_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the same result."""
-    poses = moving(0.05)
-    truth = np.concatenate([scattered(2000, 8.0), [[-0.2, 0.1, 2.0]], scattered(100, 900.0)])
-    seen = see(truth, poses, 0.2)
-    at_once = splat_points(seen, views_of(poses), SPLATS)
-    monkeypatch.setattr("colmap_av1.model.splats.points._CHUNK", 500)
-    in_parts = splat_points(seen, views_of(poses), SPLATS)
-    assert len(at_once.xyz) > 2000
-    for name in ("xyz", "error", "offsets", "observation"):
-        assert np.array_equal(getattr(at_once, name), getattr(in_parts, name))
+def test_what_the_core_is_given_must_fit() -> None:
+    poses = moving(0.2)
+    truth = scattered(5, 3.0)
+    seen = see(truth, poses, 0.0)
+    given = {
+        "cam_from_world": poses,
+        "focal": views_of(poses).focal,
+        "view": seen.view,
+        "rays": seen.rays,
+        "xyz": truth,
+        "offsets": seen.offsets,
+        "observation": np.arange(len(seen.view)),
+    }
+    assert np.abs(_core.reprojection_errors(**given)).max() < 1e-9
+    for name, wrong in (
+        ("view", seen.view + 1),
+        ("view", seen.view - 1),
+        ("offsets", seen.offsets[::-1].copy()),
+        ("observation", np.arange(len(seen.view)) + 1),
+        ("rays", seen.rays[1:]),
+        ("focal", given["focal"][1:]),
+    ):
+        with pytest.raises(ValueError, match=r"fit|no such"):
+            _core.reprojection_errors(**given | {name: wrong})
+    xy, depth = np.array([[3.0, 4.0], [5.0, 4.0]]), np.array([2.0, 2.1])
+    limits = {"width": 8, "height": 8, "steps_per_octave": 2.0, "most_steps": 64}
+    spacings, rank = np.array([8, 2]), np.array([1, 0])
+    best = _core.best_at_spacings(xy, depth, rank, spacings=spacings, **limits)
+    assert best.tolist() == [1, 0]
+    for wrong in ({"spacings": np.array([0])}, {"spacings": spacings, "width": 5}):
+        with pytest.raises(ValueError, match=r"spacings|outside"):
+            _core.best_at_spacings(xy, depth, rank, **limits | wrong)

@@ -6,7 +6,7 @@ import pycolmap
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_av1.model.undistort import on_pinhole, pinhole_camera, undistortion
+from colmap_av1.model.undistort import on_pinholes, pinhole_camera, undistortion
 
 
 def test_undistorted_picture_shows_the_same() -> None:
@@ -24,7 +24,8 @@ def test_undistorted_picture_shows_the_same() -> None:
         for x, y in at:
             cv2.circle(picture, (int(x), int(y)), 3, (255, 255, 255), -1)
         flat = undistort(picture)[..., 0].astype(float)
-        for x, y in on_pinhole(camera, pinhole, at):
+        rays = np.asarray(camera.cam_from_img(at.astype(np.float64)))
+        for x, y in on_pinholes(rays, np.zeros(2, np.int64), [pinhole]):
             near = np.mgrid[int(y) - 8 : int(y) + 9, int(x) - 8 : int(x) + 9]
             weight = flat[near[0], near[1]]
             centre = [(weight * (n + 0.5)).sum() / weight.sum() for n in near[::-1]]

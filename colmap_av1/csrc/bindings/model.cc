@@ -8,11 +8,15 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
 #include "bindings/arrays.h"
 #include "model/patches.h"
+#include "model/points.h"
+#include "model/projection.h"
+#include "model/surfaces.h"
 #include "model/triangulate.h"
 
 namespace nb = nanobind;
@@ -80,6 +84,135 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
 }
 
+using Points = InputArray<double, nb::shape<-1, 3>>;
+using Pose = InputArray<double, nb::shape<3, 4>>;
+
+std::span<const double, 12> span_of(const Pose& pose) {
+  return std::span<const double, 12>(pose.data(), 12);
+}
+
+using Poses = InputArray<double, nb::shape<-1, 3, 4>>;
+using Pairs = InputArray<double, nb::shape<-1, 2>>;
+using Indices = InputArray<std::int64_t, nb::ndim<1>>;
+
+model::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
+                              const Pairs& rays, const Points& xyz, const Indices& offsets,
+                              const Indices& observation) {
+  return {.cam_from_world = {cam_from_world.data(), cam_from_world.size()},
+          .focal = {focal.data(), focal.size()},
+          .view = {view.data(), view.size()},
+          .rays = {rays.data(), rays.size()},
+          .xyz = {xyz.data(), xyz.size()},
+          .offsets = {offsets.data(), offsets.size()},
+          .observation = {observation.data(), observation.size()}};
+}
+
+nb::object reprojection_errors(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
+                               const Pairs& rays, const Points& xyz, const Indices& offsets,
+                               const Indices& observation) {
+  std::vector<double> errors;
+  {
+    const nb::gil_scoped_release release;
+    errors = model::reprojection_errors(
+        seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation));
+  }
+  return adopt(std::move(errors));
+}
+
+nb::object widest_angles(const Points& centres, const Points& xyz, const Indices& offsets,
+                         const Indices& view) {
+  std::vector<double> angles;
+  {
+    const nb::gil_scoped_release release;
+    angles = model::widest_angles({centres.data(), centres.size()}, {xyz.data(), xyz.size()},
+                                  {offsets.data(), offsets.size()}, {view.data(), view.size()});
+  }
+  return adopt(std::move(angles));
+}
+
+nb::object hanging_observations(const Poses& cam_from_world, const Pairs& focal,
+                                const Indices& view, const Pairs& rays, const Points& xyz,
+                                const Indices& offsets, const Indices& observation, double before,
+                                double as_near, std::int64_t support, double around,
+                                std::int64_t fewest_around) {
+  std::vector<std::int64_t> counts;
+  {
+    const nb::gil_scoped_release release;
+    counts = model::hanging_observations(
+        seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation),
+        {.before = before,
+         .as_near = as_near,
+         .support = support,
+         .around = around,
+         .fewest_around = fewest_around});
+  }
+  return adopt(std::move(counts));
+}
+
+nb::tuple points_in_view(const Pose& cam_from_world, const InputArray<double, nb::shape<2>>& low,
+                         const InputArray<double, nb::shape<2>>& high, const Points& xyz) {
+  model::PointsInView found;
+  {
+    const nb::gil_scoped_release release;
+    found = model::points_in_view(span_of(cam_from_world),
+                                  {.low_x = low.data()[0],
+                                   .low_y = low.data()[1],
+                                   .high_x = high.data()[0],
+                                   .high_y = high.data()[1]},
+                                  {xyz.data(), xyz.size()});
+  }
+  const std::size_t count = found.index.size();
+  return nb::make_tuple(adopt(std::move(found.index)),
+                        adopt<double>(std::move(found.xyz), {count, 3}));
+}
+
+nb::tuple points_in_picture(const Pose& cam_from_world,
+                            const InputArray<double, nb::shape<4>>& pinhole, double width,
+                            double height, const Points& xyz) {
+  const double* params = pinhole.data();
+  model::PointsInPicture found;
+  {
+    const nb::gil_scoped_release release;
+    found = model::points_in_picture(span_of(cam_from_world),
+                                     {.focal_x = params[0],
+                                      .focal_y = params[1],
+                                      .centre_x = params[2],
+                                      .centre_y = params[3],
+                                      .width = width,
+                                      .height = height},
+                                     {xyz.data(), xyz.size()});
+  }
+  const std::size_t count = found.index.size();
+  return nb::make_tuple(adopt(std::move(found.index)),
+                        adopt<double>(std::move(found.xy), {count, 2}),
+                        adopt(std::move(found.depth)));
+}
+
+nb::object nearest_in_cells(const InputArray<double, nb::shape<-1, 2>>& xy,
+                            const InputArray<double, nb::ndim<1>>& depth, int cell,
+                            std::int64_t columns, std::int64_t rows) {
+  std::vector<double> nearest = model::nearest_in_cells(
+      {xy.data(), xy.size()}, {depth.data(), depth.size()}, cell, columns, rows);
+  return adopt<double>(std::move(nearest),
+                       {static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
+}
+
+nb::object best_at_spacings(const Pairs& xy, const InputArray<double, nb::ndim<1>>& depth,
+                            const Indices& rank, std::int64_t width, std::int64_t height,
+                            const Indices& spacings, double steps_per_octave,
+                            std::int64_t most_steps) {
+  std::vector<std::int64_t> found;
+  {
+    const nb::gil_scoped_release release;
+    found = model::best_at_spacings({xy.data(), xy.size()}, {depth.data(), depth.size()},
+                                    {rank.data(), rank.size()}, width, height,
+                                    {.spacings = {spacings.data(), spacings.size()},
+                                     .steps_per_octave = steps_per_octave,
+                                     .most_steps = most_steps});
+  }
+  return adopt(std::move(found));
+}
+
 }  // namespace
 
 void bind_model(nb::module_& m) {
@@ -93,6 +226,26 @@ void bind_model(nb::module_& m) {
         nb::kw_only(), "min_deviation"_a,
         "Correlations [n, d] of the patches around positions [n, 2] in one grey picture with those "
         "around positions [n, d, 2] in another.");
+  m.def("reprojection_errors", &reprojection_errors, nb::kw_only(), "cam_from_world"_a, "focal"_a,
+        "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a,
+        "Reprojection error in pixels of each observation of points, inf behind the camera.");
+  m.def("widest_angles", &widest_angles, nb::kw_only(), "centres"_a, "xyz"_a, "offsets"_a, "view"_a,
+        "Angle in radians at which the rays of each point meet, about the widest.");
+  m.def("hanging_observations", &hanging_observations, nb::kw_only(), "cam_from_world"_a, "focal"_a,
+        "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a, "before"_a, "as_near"_a,
+        "support"_a, "around"_a, "fewest_around"_a,
+        "Of each point, the number of its observations in which it hangs before what is around.");
+  m.def("points_in_view", &points_in_view, "cam_from_world"_a, "low"_a, "high"_a, "xyz"_a,
+        "The points before a camera whose rays lie within bounds: (index, xyz in the camera).");
+  m.def("points_in_picture", &points_in_picture, "cam_from_world"_a, "pinhole"_a, "width"_a,
+        "height"_a, "xyz"_a,
+        "The points that lie in a pinhole camera's picture: (index, xy, depth).");
+  m.def("nearest_in_cells", &nearest_in_cells, "xy"_a, "depth"_a, nb::kw_only(), "cell"_a,
+        "columns"_a, "rows"_a,
+        "Least of the depths [n] at pixels [n, 2] in each cell of a picture, [rows, columns].");
+  m.def("best_at_spacings", &best_at_spacings, "xy"_a, "depth"_a, "rank"_a, nb::kw_only(),
+        "width"_a, "height"_a, "spacings"_a, "steps_per_octave"_a, "most_steps"_a,
+        "Index of the first spacing at which each point is the best of its cell and surface.");
 }
 
 }  // namespace colmap_av1

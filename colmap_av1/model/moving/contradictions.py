@@ -46,7 +46,7 @@ _STEPS_BEFORE = 2
 # Points of a surface before a track, where none is seen, in more than this share of its images.
 _FEWEST_BEFORE = 4
 _THROUGH_SHARE = 0.5
-# Width in cells of what counts as around.
+# Width in cells of what counts as around, odd.
 _AROUND = 3
 
 
@@ -229,23 +229,29 @@ class Contradictions:
         placed = self._placed
         index, xy, depth = view.project(placed.xyz[there])
         track = there[index]
-        unseen = ~np.isin(track, placed.track[rows])
-        column, row = (xy[unseen] // placed.cell).astype(np.int16).T
-        return _Shown(track[unseen].astype(np.int32), row, column, depth[unseen].astype(np.float32))
+        is_seen = np.zeros(len(placed.xyz), np.bool_)
+        is_seen[placed.track[rows]] = True
+        unseen = np.flatnonzero(~is_seen[track])
+        # Whole pixels first: NumPy divides these many times as fast.
+        cell = xy[unseen].astype(np.int16) // np.int16(placed.cell)
+        own = track[unseen].astype(np.int32)
+        return _Shown(own, cell[:, 1], cell[:, 0], depth[unseen].astype(np.float32))
 
     def _hiding(self, agreeing: _Bools) -> _Bools:
         from scipy.ndimage import minimum_filter, uniform_filter  # noqa: PLC0415 - slow to import
 
         placed = self._placed
+        _, rows, columns = placed.shape
         hides, looked = np.zeros(len(agreeing)), np.zeros(len(agreeing))
-        for rows, shown in zip(self._seen, self._shown, strict=True):
-            own = rows[agreeing[placed.track[rows]]]
-            nearest, count = np.full(placed.shape[1:], np.inf), np.zeros(placed.shape[1:])
-            at = placed.row[own], placed.column[own]
-            np.minimum.at(nearest, at, placed.depth[own])
-            np.add.at(count, at, 1.0)
-            nearest = minimum_filter(nearest, _AROUND, mode="nearest")
-            count = uniform_filter(count, _AROUND, mode="constant") * _AROUND**2
+        for seen, shown in zip(self._seen, self._shown, strict=True):
+            own = seen[agreeing[placed.track[seen]]]
+            at = placed.row[own] * columns + placed.column[own]
+            in_cells = np.full(rows * columns, np.inf)
+            np.minimum.at(in_cells, at, placed.depth[own])
+            nearest = minimum_filter(in_cells.reshape(rows, columns), _AROUND, mode="nearest")
+            counts = np.bincount(at, minlength=rows * columns).astype(np.float64)
+            count = uniform_filter(counts.reshape(rows, columns), _AROUND, mode="constant")
+            count *= _AROUND**2
             enough = count[shown.row, shown.column] > _FEWEST_SEEN - 0.5
             track = shown.track[enough]
             looked[track] += 1
@@ -267,26 +273,44 @@ class Contradictions:
         for rows, shown in zip(self._seen, self._shown, strict=True):
             own = rows[np.isfinite(placed.depth[rows])]
             kept = agreeing[shown.track]
-            there = self._at_most(shown.row[kept], shown.column[kept], steps(shown.depth[kept]))
             proof = own[agreeing[placed.track[own]]]
-            seen = self._at_most(
-                placed.row[proof], placed.column[proof], steps(placed.depth[proof])
-            )
             step = steps(placed.depth[own]) - _STEPS_BEFORE
             at = placed.row[own], placed.column[own], np.maximum(step, 0)
-            is_through = (there[at] > _FEWEST_BEFORE - 0.5) & (seen[at] < 0.5) & (step >= 0)
-            np.add.at(through, placed.track[own], is_through)
+            there = self._at_most(
+                *(shown.row[kept], shown.column[kept], steps(shown.depth[kept])), at
+            )
+            seen = self._at_most(
+                *(placed.row[proof], placed.column[proof], steps(placed.depth[proof])), at
+            )
+            is_through = (there >= _FEWEST_BEFORE) & (seen == 0) & (step >= 0)
+            # An image sees a track once.
+            through[placed.track[own]] += is_through
         return np.asarray(through > _THROUGH_SHARE * placed.lengths)
 
     def _at_most(
-        self, row: NDArray[np.integer], column: NDArray[np.integer], step: _Ints
-    ) -> _Floats:
-        """Numbers of points around each cell that are as near as each step, or nearer."""
-        from scipy.ndimage import uniform_filter  # noqa: PLC0415 - slow to import
+        self,
+        row: NDArray[np.integer],
+        column: NDArray[np.integer],
+        step: _Ints,
+        at: tuple[_Ints, _Ints, _Ints],
+    ) -> _Ints:
+        """Numbers of points around cells that are as near as a step, or nearer.
 
+        Args:
+            row: integers [n] the cell's row of each point.
+            column: integers [n] its column.
+            step: int64 [n] the step of its depth.
+            at: int64 [m] rows and columns of the cells asked for, and the step for each.
+        """
+        # With an edge of empty cells, so that each has all of those around it.
+        edge = _AROUND // 2
         _, rows, columns = self._placed.shape
-        cell = (row.astype(np.int64) * columns + column) * _NUM_STEPS + step
-        count = np.bincount(cell, minlength=rows * columns * _NUM_STEPS).astype(np.float64)
-        size = (_AROUND, _AROUND, 1)
-        around = uniform_filter(count.reshape(rows, columns, _NUM_STEPS), size, mode="constant")
-        return np.asarray(np.cumsum(around * _AROUND**2, axis=2))
+        stride, size = columns + 2 * edge, (rows + 2 * edge) * (columns + 2 * edge)
+        cell = (row.astype(np.int64) + edge) * stride + column + edge
+        count = np.bincount(step * size + cell, minlength=size * _NUM_STEPS)
+        steps = count.reshape(_NUM_STEPS, size)
+        for step_number in range(1, _NUM_STEPS):
+            steps[step_number] += steps[step_number - 1]
+        first = at[2] * size + at[0] * stride + at[1]
+        around = [down * stride + across for down in range(_AROUND) for across in range(_AROUND)]
+        return np.asarray(sum(count[first + beside] for beside in around), np.int64)

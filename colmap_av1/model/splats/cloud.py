@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1 import _core
 from colmap_av1.model.colmap_model import ModelPoints, joined_points, take_rows
 from colmap_av1.model.coverage import (
     CELL,
@@ -107,18 +108,15 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
     stage = np.full(len(rank), len(_SPACINGS))
     for key in keys:
         index, xy, depth = key.project(points.xyz)
-        step = np.floor(_STEPS_PER_OCTAVE * np.log2(depth)).astype(np.int64)
-        step -= step.min(initial=0)
-        step = np.minimum(step, _MOST_STEPS - 1)
-        own = rank[index]
-        for number, spacing in enumerate(_SPACINGS):
-            num_columns, num_rows = (-(-length // spacing) for length in key.size)
-            column, row = (xy // spacing).astype(np.int64).T
-            cell = (row * num_columns + column) * _MOST_STEPS + step
-            best = np.full(num_rows * num_columns * _MOST_STEPS, len(rank))
-            np.minimum.at(best, cell, own)
-            wanted = index[own == best[cell]]
-            stage[wanted] = np.minimum(stage[wanted], number)
+        best = _core.best_at_spacings(
+            *(xy, depth, rank[index]),
+            width=key.size[0],
+            height=key.size[1],
+            spacings=np.array(_SPACINGS),
+            steps_per_octave=_STEPS_PER_OCTAVE,
+            most_steps=_MOST_STEPS,
+        )
+        stage[index] = np.minimum(stage[index], best)
     return stage
 
 

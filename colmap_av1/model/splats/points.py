@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1 import _core
 from colmap_av1.model.colmap_model import camera_centres, take_rows
 from colmap_av1.model.triangulate import (
     ERROR_TO_SIGMA,
@@ -40,8 +41,6 @@ _SUPPORT = 4
 # Width in pixels of the squares of an image that surroundings are, and points that they take.
 _AROUND = 48.0
 _FEWEST_AROUND = 8
-# Observations worked on at a time; bounds memory.
-_CHUNK = 65_536
 # Least angle in radians that is divided by.
 _TINY = 1e-12
 
@@ -65,23 +64,10 @@ class _Points:
         """The observation in the middle of each point's."""
         return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
 
-    def parts(self) -> Iterator[_Points]:
-        """The points in order, some at a time; none where there are none."""
-        for low, high in _chunks(self.offsets):
-            seen = slice(self.offsets[low], self.offsets[high])
-            offsets = self.offsets[low : high + 1] - self.offsets[low]
-            yield _Points(self.xyz[low:high], self.error[low:high], offsets, self.observation[seen])
-
     def take(self, rows: _Ints) -> _Points:
         """Some of the points, in the order of `rows`."""
         offsets, seen = take_rows(self.offsets, rows)
         return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
-
-
-def _chunks(offsets: _Ints) -> Iterator[tuple[int, int]]:
-    """First and last but one row of parts of what `offsets` divide, in order."""
-    chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK))
-    yield from itertools.pairwise(np.unique(np.minimum(chunk, len(offsets) - 1)).tolist())
 
 
 @dataclass(frozen=True)
@@ -103,15 +89,21 @@ class _Seen:
         """Float64 [n, 3] centres of the views of some observations."""
         return self.centres[self.observations.view[rows]]
 
-    def errors(self, xyz: _Floats, rows: _Ints) -> _Floats:
-        """Reprojection errors in pixels of points at observations, inf behind the camera."""
-        view = self.observations.view[rows]
-        pose = self.views.cam_from_world[view]
-        own = np.einsum("nij,nj->ni", pose[:, :, :3], xyz) + pose[:, :, 3]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            off = own[:, :2] / own[:, 2:] - self.observations.rays[rows]
-            error = np.linalg.norm(off * self.views.focal[view], axis=1)
-        return np.where((own[:, 2] > 0) & np.isfinite(error), error, np.inf)
+    def of_points(self, points: _Points) -> dict[str, Any]:
+        """What the core is given of points and the views that see them."""
+        return {
+            "cam_from_world": np.ascontiguousarray(self.views.cam_from_world),
+            "focal": np.ascontiguousarray(self.views.focal),
+            "view": self.observations.view,
+            "rays": self.observations.rays,
+            "xyz": points.xyz,
+            "offsets": points.offsets,
+            "observation": points.observation,
+        }
+
+    def errors(self, points: _Points) -> _Floats:
+        """Reprojection errors in pixels of the observations of points, inf behind the camera."""
+        return _core.reprojection_errors(**self.of_points(points))
 
 
 def splat_points(
@@ -182,22 +174,12 @@ def distance_uncertainty(
         view: int64 [num_observations] view of each observation.
         focal: float64 [num_views] focal lengths in pixels.
     """
-    parts = [np.empty(0)]
-    for low, high in _chunks(offsets):
-        own = view[offsets[low] : offsets[high]]
-        starts = offsets[low : high + 1] - offsets[low]
-        owner = np.repeat(np.arange(high - low), np.diff(starts))
-        ray = xyz[low:high][owner] - centres[own]
-        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), _TINY)
-        narrowest = np.ones(high - low)
-        for end in (starts[:-1], starts[1:] - 1):
-            cosine = np.einsum("ni,ni->n", ray, ray[end][owner])
-            narrowest = np.minimum(narrowest, np.minimum.reduceat(cosine, starts[:-1]))
-        angle = np.maximum(np.arccos(np.clip(narrowest, -1.0, 1.0)), _TINY)
-        middle = own[(starts[:-1] + starts[1:]) // 2]
-        sigma = np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * error[low:high])
-        parts.append(sigma / (focal[middle] * angle))
-    return np.concatenate(parts)
+    angle = _core.widest_angles(
+        centres=np.ascontiguousarray(centres), xyz=xyz, offsets=offsets, view=view
+    )
+    middle = view[(offsets[:-1] + offsets[1:]) // 2]
+    sigma = np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * error)
+    return np.asarray(sigma / (focal[middle] * np.maximum(angle, _TINY)))
 
 
 def _distance(points: _Points, seen: _Seen) -> _Floats:
@@ -237,11 +219,9 @@ def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _See
 
 def _with_errors(points: _Points, seen: _Seen) -> _Points:
     """The points with the mean errors that they have where they are; without blind ones."""
-    means = [np.empty(0)]
-    for part in points.parts():
-        error = seen.errors(part.xyz[part.owner], part.observation)
-        means.append(np.add.reduceat(error, part.offsets[:-1]) / np.diff(part.offsets))
-    mean = np.concatenate(means)
+    if len(points.xyz) == 0:
+        return points
+    mean = np.add.reduceat(seen.errors(points), points.offsets[:-1]) / np.diff(points.offsets)
     return replace(points, error=mean).take(np.flatnonzero(np.isfinite(mean)))
 
 
@@ -264,11 +244,7 @@ def _points_far_away(
         return tracks
     middle = tracks.middle
     xyz = seen.origins(middle) + seen.rays(middle) * far
-    errors = [
-        seen.errors(part.xyz[part.owner], part.observation)
-        for part in replace(tracks, xyz=xyz).parts()
-    ]
-    kept = np.concatenate(errors) <= options.max_reprojection_error
+    kept = seen.errors(replace(tracks, xyz=xyz)) <= options.max_reprojection_error
     owner = tracks.owner[kept]
     counts = np.bincount(owner, minlength=len(left))
     far_away = _Points(
@@ -290,43 +266,12 @@ def _in_order(one: _Points, two: _Points) -> _Points:
 
 def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
     """Points that hang, nearly alone, before all that is around them in most of their images."""
-    owner = points.owner.astype(np.int32)
-    by_view = np.argsort(seen.observations.view[points.observation], kind="stable")
-    ordered = seen.observations.view[points.observation[by_view]]
-    votes = np.zeros(len(points.xyz))
-    # Whole views, and as many at a time as make about a chunk.
-    ends = np.searchsorted(ordered, np.arange(len(seen.centres) + 1))
-    chunk = np.searchsorted(ends, np.arange(0, ends[-1] + _CHUNK, _CHUNK))
-    for low, high in itertools.pairwise(np.unique(np.minimum(chunk, len(ends) - 1))):
-        rows = by_view[ends[low] : ends[high]]
-        if len(rows):
-            alone = _alone_before(points.xyz[owner[rows]], points.observation[rows], seen)
-            votes += np.bincount(owner[rows], weights=alone, minlength=len(votes))
-    return np.asarray(votes > 0.5 * np.diff(points.offsets))
-
-
-def _alone_before(xyz: _Floats, rows: _Ints, seen: _Seen) -> NDArray[np.bool_]:
-    """Whether points at observations hang before what others show around, in the same square."""
-    distance = np.linalg.norm(xyz - seen.origins(rows), axis=1)
-    view = seen.observations.view[rows]
-    square = np.floor(seen.observations.rays[rows] * seen.views.focal[view] / _AROUND)
-    square = square.astype(np.int64)
-    square -= square.min(axis=0)
-    size = square.max(axis=0) + 1
-    key = (view * size[0] + square[:, 0]) * size[1] + square[:, 1]
-    order = np.lexsort((distance, key))
-    sorted_key, sorted_distance = key[order], distance[order]
-    first = np.flatnonzero(np.diff(sorted_key, prepend=-1))
-    counts = np.diff(np.append(first, len(order)))
-    group = np.repeat(np.arange(len(first)), counts)
-    median = sorted_distance[first + counts // 2][group]
-    # Distances ascend within a square; shifted apart, those of other squares are out of reach.
-    scale = np.log(sorted_distance / sorted_distance.min())
-    factor = np.log(_AS_NEAR)
-    scale += group * (scale.max() + 2 * factor)
-    near = np.searchsorted(scale, scale + factor, "right") - np.searchsorted(scale, scale - factor)
-    alone = np.zeros(len(rows), np.bool_)
-    alone[order] = (
-        (sorted_distance < _BEFORE * median) & (near < _SUPPORT) & (counts[group] >= _FEWEST_AROUND)
+    votes = _core.hanging_observations(
+        **seen.of_points(points),
+        before=_BEFORE,
+        as_near=_AS_NEAR,
+        support=_SUPPORT,
+        around=_AROUND,
+        fewest_around=_FEWEST_AROUND,
     )
-    return alone
+    return np.asarray(votes > 0.5 * np.diff(points.offsets))
