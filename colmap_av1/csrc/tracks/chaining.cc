@@ -20,10 +20,7 @@ void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& st
       for (int list = 0; list < link.other->motion.num_lists; ++list) chain_forward(link, list);
       continue;
     }
-    const int num_lists = current.motion.num_lists;
-    for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kOwn);
-    if (bridge_ <= 0.F) continue;
-    for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
+    chain_backward(link);
   }
 }
 
@@ -55,26 +52,30 @@ bool Chainer::is_open(OpenUnit unit) const {
   return false;
 }
 
+void Chainer::chain_backward(const Link& link) {
+  note_unplaced(*link.other);
+  const int num_lists = current_->motion.num_lists;
+  for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kOwn);
+  if (bridge_ <= 0.F) return;
+  for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
+}
+
 // By the current frame's displacements: every free cell asks for the longest track that it
 // finds, every track goes to the cell that puts it nearest to its centre (a stable
 // matching, so the order of cells does not matter).
 void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion.lists[list];
   claims_.resize(link.other->cells.size());
+  beside_unit_ = -1;
   // A cell as large as its unit is searched in no more time than the unit is judged.
   const bool judges_units = grid_.cells > 1;
-  bool noted = false;
   std::size_t num_open = 0;
   for (const OpenUnit open : open_units_) {
     if (!is_open(open)) continue;
     open_units_[num_open++] = open;
     const int unit = open.row * current_->motion.cols + open.col;
     if (!link.refs[motion[unit].ref]) continue;
-    if (judges_units) {
-      if (!noted) note_unplaced_units(*link.other);
-      noted = true;
-      if (!may_find_track(link, unit, motion[unit], reach)) continue;
-    }
+    if (judges_units && !may_find_track(link, unit, motion[unit], reach)) continue;
     for (int part = 0; part < grid_.cells * grid_.cells; ++part) {
       const int row = grid_.cells * open.row + (part >> grid_.log_cells);
       const int col = grid_.cells * open.col + (part & (grid_.cells - 1));
@@ -87,23 +88,40 @@ void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   for (const std::int32_t cell : claimed_) {
     const Claim claim = std::exchange(claims_[cell], Claim{});
     carry_on(*link.other, cell, claim.cell, claim);
+    note_placed(*link.other, cell);
   }
   claimed_.clear();
 }
 
-// The units of a frame with tracks that have no place in the current frame yet.
-void Chainer::note_unplaced_units(const ChainedFrame& other) {
+// The cells of a frame whose tracks have no place in the current frame yet.
+void Chainer::note_unplaced(const ChainedFrame& other) {
+  unplaced_.resize(other.cells.size());
   unplaced_units_.assign(other.motion.mi_size.size(), 0);
-  const Cell* cell = other.cells.data();
+  std::size_t cell = 0;
   for (int row = 0; row < other.cell_rows; ++row) {
     std::uint8_t* unit = unplaced_units_.data() +
                          static_cast<std::ptrdiff_t>(row >> grid_.log_cells) * other.motion.cols;
-    for (int col = 0; col < other.motion.cols; ++col, ++unit) {
-      for (const Cell* end = cell + grid_.cells; cell < end; ++cell) {
-        if (store_->is_unplaced(*cell, *current_)) *unit = 1;
-      }
+    for (int col = 0; col < other.cell_cols; ++col, ++cell) {
+      unplaced_[cell] = store_->is_unplaced(other.cells[cell], *current_) ? 1 : 0;
+      unit[col >> grid_.log_cells] |= unplaced_[cell];
     }
   }
+}
+
+// The track of a cell has got its place.
+void Chainer::note_placed(const ChainedFrame& other, int cell) {
+  unplaced_[cell] = 0;
+  const int size = grid_.cells;
+  const int row = cell / other.cell_cols >> grid_.log_cells;
+  const int col = cell % other.cell_cols >> grid_.log_cells;
+  const std::uint8_t* first = unplaced_.data() +
+                              static_cast<std::ptrdiff_t>(size) * row * other.cell_cols +
+                              static_cast<std::ptrdiff_t>(size) * col;
+  std::uint8_t any = 0;
+  for (int r = 0; r < size; ++r, first += other.cell_cols) {
+    for (int c = 0; c < size; ++c) any |= first[c];
+  }
+  unplaced_units_[row * other.motion.cols + col] = any;
 }
 
 // Whether the cells of a unit can find any track, to search them only then.
@@ -134,7 +152,8 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) 
     if (reach == Reach::kOwn) {
       find_track(link, asker, current_->motion.lists[list][asker.unit], &best);
     } else {
-      find_track_beside(link, list, asker, &best);
+      note_motion_beside(link, list, asker.unit);
+      for (const UnitMotion* motion : beside_) find_track(link, asker, *motion, &best);
     }
     if (best.cell < 0) return;
     if (claims_[best.cell].cell < 0) claimed_.push_back(best.cell);
@@ -157,8 +176,8 @@ void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion&
   for (int row = window.top; row <= window.bottom; ++row) {
     for (int col = window.left; col <= window.right; ++col) {
       const int index = row * other.cell_cols + col;
+      if (unplaced_[index] == 0) continue;
       const Cell& found = other.cells[index];
-      if (found.track == kNoTrack) continue;
       const Point target{found.position.x * link.from_picture_x,
                          found.position.y * link.from_picture_y};
       Point position;
@@ -173,7 +192,6 @@ void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion&
       claim.variance = found.variance + motion.variance;
       if ((best->cell >= 0 && !is_preferred(other, index, claim, best->cell, best->claim)) ||
           !current_->motion.contains(position) || !is_better(claim, claims_[index]) ||
-          !store_->is_unplaced(found, *current_) ||
           !cosine_.passes(link, index, position, target, &claim.velocity)) {
         continue;
       }
@@ -182,21 +200,31 @@ void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion&
   }
 }
 
-// The same by the displacements of the units beside the cell's: where these point apart, tracks lie
-// in the gap that their blocks leave.
-void Chainer::find_track_beside(const Link& link, int list, const Asker& asker, Found* best) const {
+// The displacements of the units beside a unit that its cells look for tracks by, too: where these
+// point apart, tracks lie in the gap that their blocks leave.
+void Chainer::note_motion_beside(const Link& link, int list, int unit) {
+  if (unit == beside_unit_) return;
+  beside_unit_ = unit;
+  beside_.clear();
   const TrustedMotion& frame = current_->motion;
-  const int row = asker.unit / frame.cols;
-  const int col = asker.unit % frame.cols;
+  const int row = unit / frame.cols;
+  const int col = unit % frame.cols;
   const auto& motion = frame.lists[list];
-  const UnitMotion& own = motion[asker.unit];
+  const UnitMotion& own = motion[unit];
+  const auto is_same = [](const UnitMotion& a, const UnitMotion& b) {
+    return a.dx == b.dx && a.dy == b.dy && a.warp == b.warp;
+  };
   for (int r = std::max(0, row - 1); r <= std::min(frame.visible_rows - 1, row + 1); ++r) {
     for (int c = std::max(0, col - 1); c <= std::min(frame.visible_cols - 1, col + 1); ++c) {
       const UnitMotion& other = motion[r * frame.cols + c];
       if (!link.refs[other.ref] || !moves_alike(other, own, bridge_)) continue;
-      // The cell has looked there already.
-      if (other.dx == own.dx && other.dy == own.dy && other.warp == own.warp) continue;
-      find_track(link, asker, other, best);
+      // The cells have looked there already.
+      if (is_same(other, own)) continue;
+      if (std::any_of(beside_.begin(), beside_.end(),
+                      [&](const UnitMotion* noted) { return is_same(other, *noted); })) {
+        continue;
+      }
+      beside_.push_back(&other);
     }
   }
 }

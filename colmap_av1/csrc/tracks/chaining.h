@@ -61,13 +61,15 @@ class Chainer {
   void note_open_units(std::span<const Link> links);
   bool is_open(OpenUnit unit) const;
 
+  void chain_backward(const Link& link);
   void chain_backward(const Link& link, int list, Reach reach);
-  void note_unplaced_units(const ChainedFrame& other);
+  void note_unplaced(const ChainedFrame& other);
+  void note_placed(const ChainedFrame& other, int cell);
+  void note_motion_beside(const Link& link, int list, int unit);
   bool may_find_track(const Link& link, int unit, const UnitMotion& motion, Reach reach) const;
   void claim_track(const Link& link, int list, Reach reach, Asker asker);
   void find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
                   Found* best) const;
-  void find_track_beside(const Link& link, int list, const Asker& asker, Found* best) const;
   bool is_better(const Claim& claim, const Claim& holder) const;
   static Window around(const Link& link, Point position, float reach);
 
@@ -86,10 +88,16 @@ class Chainer {
   ChainedFrame* current_ = nullptr;
   TrackStore* store_ = nullptr;
   // Buffers that are kept from frame to frame.
-  std::vector<Claim> claims_;                 // by cell, free between links
-  std::vector<std::int32_t> claimed_;         // those that are not
-  std::vector<OpenUnit> open_units_;          // of the current frame, in raster order
-  std::vector<std::uint8_t> unplaced_units_;  // of a frame with tracks
+  std::vector<Claim> claims_;          // by cell, free between links
+  std::vector<std::int32_t> claimed_;  // those that are not
+  std::vector<OpenUnit> open_units_;   // of the current frame, in raster order
+  // Of a frame with tracks: cells whose tracks have no place in the current frame yet, and units
+  // that have such cells.
+  std::vector<std::uint8_t> unplaced_;
+  std::vector<std::uint8_t> unplaced_units_;
+  // Of a unit of the current frame: the motion of those beside it that it looks for tracks by.
+  int beside_unit_ = -1;
+  std::vector<const UnitMotion*> beside_;
 };
 
 }  // namespace colmap_av1::tracks

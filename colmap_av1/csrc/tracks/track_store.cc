@@ -27,12 +27,14 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
   auto index = static_cast<std::int32_t>(tracks_.size());
   if (free_tracks_.empty()) {
     tracks_.emplace_back();
+    last_seen_.emplace_back();
     serials_.emplace_back();
   } else {
     index = free_tracks_.back();
     free_tracks_.pop_back();
     tracks_[index] = Track{};
   }
+  last_seen_[index] = -1;
   serials_[index] = frame.first_serial + static_cast<std::int64_t>(cell);
   Track& track = tracks_[index];
   track.frames = 1;

@@ -43,14 +43,14 @@ class TrackStore {
   // Whether a cell holds a track that has no place in a frame yet.
   bool is_unplaced(const Cell& cell, const ChainedFrame& frame) const {
     return cell.track == kSeed ||
-           (cell.track != kNoTrack && tracks_[cell.track].last_seen != frame.order);
+           (cell.track != kNoTrack && last_seen_[cell.track] != frame.order);
   }
 
   // Makes a track of the seed in a cell, seen there where the frame is shown.
   std::int32_t start(ChainedFrame& frame, std::size_t cell);
   // Another frame holds the track.
   void hold(std::int32_t track, const ChainedFrame& frame) {
-    tracks_[track].last_seen = frame.order;
+    last_seen_[track] = frame.order;
     ++tracks_[track].frames;
   }
   // A shown frame sees the tracks that it holds.
@@ -65,7 +65,6 @@ class TrackStore {
  private:
   // Small: tracks are looked up all the time, in no order.
   struct Track {
-    std::int32_t last_seen = -1;  // order of the frame
     std::int32_t last_stretch = -1;
     std::int32_t length = 0;    // shown frames that have seen it
     std::int32_t observed = 0;  // observations that are kept of it
@@ -103,7 +102,8 @@ class TrackStore {
   int width_ = 0;
   int height_ = 0;
   std::vector<Track> tracks_;
-  std::vector<std::int64_t> serials_;  // of the tracks' seeds
+  std::vector<std::int32_t> last_seen_;  // order of the last frame that took each track up
+  std::vector<std::int64_t> serials_;    // of the tracks' seeds
   std::vector<std::int32_t> free_tracks_;
   std::deque<Stretch> stretches_;
   std::vector<std::int32_t> previous_stretch_;  // of the same track, by stretch
