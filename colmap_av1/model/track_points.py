@@ -144,10 +144,16 @@ class Colours:
 
     def rgb(self) -> _Image:
         """Colours uint8 [num_points, 3], red first."""
-        offsets = self._points.offsets
-        owner = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-        order = np.lexsort((self._seen.astype(np.int64) @ _LUMA, owner))
-        return np.asarray(self._seen[order[(offsets[:-1] + offsets[1:]) // 2]])
+        first, lengths = self._points.offsets[:-1], np.diff(self._points.offsets)
+        most = int(lengths.max(initial=1))
+        # Point, brightness and place among the point's in one number: sorting such takes a third
+        # of the time of sorting by several.
+        key = np.repeat(np.arange(len(lengths)), lengths) * (_LUMA.sum() * 255 + 1)
+        key += self._seen.astype(np.int64) @ _LUMA
+        key *= most
+        key += np.arange(len(key)) - np.repeat(first, lengths)
+        key.sort()
+        return np.asarray(self._seen[first + key[first + lengths // 2] % most])
 
 
 def mean_error(cloud: ModelPoints) -> float:
