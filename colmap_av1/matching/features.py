@@ -116,9 +116,7 @@ def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     """
     if min(len(a.xy), len(b.xy)) < 2:
         return np.empty((0, 2), dtype=np.uint32)
-    # Not NumPy's product: its threads, which wait for work in a loop, cost several times as much
-    # as products of this size.
-    likeness = cv2.gemm(a.descriptors, b.descriptors, 1.0, None, 0.0, flags=cv2.GEMM_2_T)
+    likeness = a.descriptors @ b.descriptors.T
     rows = np.arange(len(likeness))
     nearest = likeness.argmax(axis=1)
     is_mutual = likeness.argmax(axis=0)[nearest] == rows

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Pictures, Takes
@@ -104,9 +105,12 @@ def match_pairs(
     there = [i in features and j in features for i, j in pairs.tolist()]
     pairs = pairs[np.array(there, dtype=np.bool_)]
     matches = []
-    for i, j in pairs.tolist():
-        matches.append(match_features(features[i], features[j]))
-        progress("link matches", len(matches), len(pairs))
+    # Threads of the matrix product, which wait for work in a loop, cost several times as much as
+    # products of this size.
+    with threadpool_limits(1, user_api="blas"):
+        for i, j in pairs.tolist():
+            matches.append(match_features(features[i], features[j]))
+            progress("link matches", len(matches), len(pairs))
     options = replace(verify, min_num_inliers=max(verify.min_num_inliers, _MIN_GAP_INLIERS))
     geometries = verify_pairs(views, pairs, matches, cameras, options, run=run)
     kept = [k for k, g in enumerate(geometries) if len(g.inlier_matches) > 0]
