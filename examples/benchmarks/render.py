@@ -388,6 +388,7 @@ def jerks(rows: list[Row]) -> str:
         words("sequence, way", "sequence", "way"),
         count("clips", lambda _: True),
         count("whole and straight", lambda row: whole(row) and straight(row)),
+        count("of these doubted", lambda row: whole(row) and straight(row) and bool(row["said"])),
         count("parts straight, said", lambda row: not whole(row) and straight(row)),
         count("bent, or none, said", lambda row: not straight(row) and bool(row["said"])),
         count("bent, not said", lambda row: not straight(row) and not row["said"]),
