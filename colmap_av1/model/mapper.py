@@ -51,6 +51,7 @@ def map_poses(
     log: Path,
     num_images: int,
     progress: Progress,
+    start_tracks: int | None = None,
 ) -> tuple[int, ...]:
     """Map a database in a process of its own, see `run_mapper`.
 
@@ -62,6 +63,8 @@ def map_poses(
         log: file that gets what the mapper prints.
         num_images: number of images, for the progress.
         progress: called in the stage "poses" with the number of images placed so far.
+        start_tracks: tracks of each image that the global mapper starts from, the longest ones; the
+            others are triangulated and adjusted on what it finds. None: all.
 
     Returns:
         Images with a pose in each model, the most first; empty where none came out.
@@ -71,6 +74,7 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
+    settings["start_tracks"] = start_tracks
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
@@ -129,6 +133,7 @@ def _mapping_settings(
         "init_max_forward_motion": ANY_FORWARD_MOTION if options.forward_motion else None,
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
+        "start_tracks": None,
     }
 
 

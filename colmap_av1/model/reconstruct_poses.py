@@ -38,6 +38,9 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
+# Tracks of an image that the global mapper starts from, the longest ones: from all of them it takes
+# up to twice the time, to the same poses. What links images is short, and all of it is needed.
+_START_TRACKS = 400
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted.
 _ADJUSTED = DensityOptions(
@@ -66,6 +69,8 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     mapper = mapping.mapper
     if mapper == "auto":
         mapper = "incremental" if matched.facts["guessed"] else "global"
+    links = matched.facts["links"]
+    start_tracks = None if links["num_links"] or links["weak_gaps"] else _START_TRACKS
     how = MapOptions(
         mapper=mapper,
         forward_motion=forward and mapper == "incremental",
@@ -87,6 +92,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
                 log=run.stages / "mapper.log",
                 num_images=len(keyed.images.names),
                 progress=progress,
+                start_tracks=start_tracks,
             )
         if max(sizes, default=0) < LEAST_IMAGES:
             raise ModelError(_why_no_start(matched.facts, mapper))
@@ -103,7 +109,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, how, pycolmap.__version__],
+        [matched.digest, how, start_tracks, pycolmap.__version__],
         into=run.stages,
         products=["poses"],
         make=make,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -47,6 +48,43 @@ def test_mapper_that_fails(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log says where"):
         run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
     assert (tmp_path / "log").stat().st_size > 0
+
+
+def test_mapper_starts_from_the_longest_tracks(
+    made: ReconstructReport, truth: Truth, tmp_path: Path
+) -> None:
+    """And finds the points of the others, too."""
+    found = {}
+    for start_tracks in (None, 40):
+        folder = tmp_path / str(start_tracks)
+        folder.mkdir()
+        copy = folder / "mapped.db"
+        copy.write_bytes(made.database.read_bytes())
+        sizes = mapper_module.map_poses(
+            copy,
+            folder / "poses",
+            MapOptions(mapper="global", num_threads=1),
+            image_path=None,
+            log=folder / "log",
+            num_images=NUM_IMAGES,
+            progress=no_progress,
+            start_tracks=start_tracks,
+        )
+        model = read_model(folder / "poses" / "0")
+        counts = re.search(r"Before filtering: (\d+), after filtering: (\d+)", log_of(folder))
+        assert counts is not None
+        error = pose_errors(model_poses(model, 60), truth.cam_from_world)
+        found[start_tracks] = (sizes, [int(n) for n in counts.groups()], model, error)
+    (sizes, (before, after), whole, error), (few_sizes, few, model, few_error) = found.values()
+    assert few_sizes == sizes == (made.num_key_images,)
+    assert (few[0], after) == (before, before)
+    assert few[1] < before / 2
+    assert model.num_points3D() > 0.9 * whole.num_points3D()
+    assert few_error.rotation < 2 * error.rotation
+
+
+def log_of(folder: Path) -> str:
+    return (folder / "log").read_text()
 
 
 def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:

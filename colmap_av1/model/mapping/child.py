@@ -68,6 +68,8 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         how = pycolmap.GlobalPipelineOptions(**common)
         how.mapper.bundle_adjustment.refine_focal_length = refine
         how.mapper.bundle_adjustment.refine_extra_params = refine
+        if settings["start_tracks"] is not None:
+            how.mapper.track_required_tracks_per_view = settings["start_tracks"]
         models = pycolmap.global_mapping(database, each, each, options=how)
     shutil.rmtree(each)
     found = sorted(models.values(), key=lambda m: -m.num_reg_images())
