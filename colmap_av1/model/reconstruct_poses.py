@@ -32,7 +32,13 @@ from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_frames, keep_tracks_of
+from colmap_av1.tracks.tracks import (
+    Tracks,
+    every_nth_track,
+    join_tracks,
+    keep_frames,
+    keep_tracks_of,
+)
 from colmap_av1.util.progress import Progress, no_progress, progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -47,6 +53,8 @@ _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.25
+# Beside corners, one in so many of them: each is less exact, and all of them may be off one way.
+_BESIDE = 4
 # Tracks that images between key images are placed by, and views of these that make their points.
 _RESECTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
@@ -276,7 +284,7 @@ def adjustment_stage(
         posed: the stage that left the poses.
         moved: the stage that found what moves, where tracks and links are without it.
         follow: corrects the chosen tracks in the images that have a pose.
-        corners: follows corners of these images' pictures, which take part whole, and corrects
+        corners: looks for corners of these images' pictures, which take part whole, and corrects
             poses that these contradict.
     """
     options = run.options
@@ -294,8 +302,8 @@ def adjustment_stage(
         if corners is not None:
             with run.clock.measure("refinement"):
                 followed, placed = corners(join_tracks(spread, linked), placed)
-            seen = join_tracks(linked, followed)
-            sets = [(spread, _BESIDE_CORNERS), (seen, FROM_PICTURES)]
+            few = every_nth_track(spread, _BESIDE)
+            sets = [(few, _BESIDE_CORNERS), (join_tracks(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"):
             folder = partial / "adjusted"
             folder.mkdir()
@@ -321,7 +329,7 @@ def adjustment_stage(
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
-    given = (_ADJUSTED, kinds, _LOSS_SCALE, refine, *how)
+    given = (_ADJUSTED, _BESIDE, kinds, _LOSS_SCALE, refine, *how)
     return run_stage(
         run.stages,
         "adjustment",

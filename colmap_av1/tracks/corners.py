@@ -59,6 +59,7 @@ def follow_corners(
     progress: Callable[[int], None] | None = None,
     *,
     density: CornerDensity = CornerDensity(),
+    keep: Callable[[int, NDArray[np.uint8]], None] | None = None,
 ) -> Tracks:
     """Follow corners from each picture to the next one.
 
@@ -70,6 +71,7 @@ def follow_corners(
         counts: which positions count, see `Counts`: masks leave out others.
         progress: called after each picture with the number of pictures so far.
         density: how many.
+        keep: called with each frame and the grey picture of it that is looked at.
 
     Returns:
         Tracks of three and more of the pictures, in the frames of `guide` and pixels of the
@@ -88,6 +90,8 @@ def follow_corners(
     count, scale = 0, np.ones(2, np.float32)
     for frame, picture in pictures:
         grey = smaller_grey(picture)
+        if keep is not None:
+            keep(frame, grey)
         scale = (np.array(picture.shape[1::-1]) / grey.shape[::-1]).astype(np.float32)
         inside = partial(_counts, counts, frame, grey.shape[::-1])
         if before is not None and len(at):

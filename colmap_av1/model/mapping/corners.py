@@ -1,4 +1,4 @@
-"""Corners followed through the images that have a pose, for the adjustment of these."""
+"""Corners in the images that have a pose, for the adjustment of these."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.masks import Mask
+from colmap_av1.model.coverage import views_of
+from colmap_av1.model.mapping.grey_pictures import GreyPictures
+from colmap_av1.model.mapping.seen_again import found_again
 from colmap_av1.model.reconstruct_poses import FROM_PICTURES, PosedImages, triangulate_in
 from colmap_av1.model.reconstruct_tracks import Run
 from colmap_av1.model.resection import resect, sightings_of
@@ -32,7 +35,7 @@ _LOST = 8.0
 def corners_in_images(
     run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
 ) -> tuple[Tracks, PosedImages]:
-    """Follow the corners of all videos' pictures, and place images anew that contradict them.
+    """Look for corners of all videos' pictures, and place images anew that contradict them.
 
     Args:
         run: what every stage is given.
@@ -44,6 +47,21 @@ def corners_in_images(
         The corners as tracks, and the images.
     """
     masks = placed.masks_with(moving)
+    with GreyPictures(run.stages) as pictures:
+        followed = _followed(run, masks, tracks, placed, pictures)
+        placed = place_anew(run, followed, placed)
+        return _seen_again(run, masks, followed, placed, pictures), placed
+
+
+def _followed(
+    run: Run,
+    masks: list[Mask | None],
+    tracks: Tracks,
+    placed: PosedImages,
+    pictures: GreyPictures,
+) -> Tracks:
+    """Corners followed through each video's images, whose pictures are kept."""
+    image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
     found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.sources)):
         own = np.flatnonzero(placed.take == video)
@@ -62,9 +80,36 @@ def corners_in_images(
         )
         report = progress_in(run.progress, "refinement", len(own))
         density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()
-        corners = follow_corners(guide, decoded, partial(_keeps, mask_of), report, density=density)
+
+        def keep(frame: int, grey: NDArray[np.uint8], first: int = first) -> None:
+            pictures.keep(image_of[first + frame], grey)
+
+        corners = follow_corners(
+            *(guide, decoded, partial(_keeps, mask_of), report), density=density, keep=keep
+        )
         found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
-    return found, place_anew(run, found, placed)
+    return found
+
+
+def _seen_again(
+    run: Run,
+    masks: list[Mask | None],
+    corners: Tracks,
+    placed: PosedImages,
+    pictures: GreyPictures,
+) -> Tracks:
+    """Corners where all images show them, see `found_again`."""
+    seen, view = seen_in(corners, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    views = views_of(placed.images, placed.cameras, masks)
+    report = progress_in(run.progress, "refinement", len(views))
+    return found_again(
+        *(seen, view, points),
+        views=views,
+        frames=placed.frames,
+        pictures=pictures,
+        progress=report,
+    )
 
 
 def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:

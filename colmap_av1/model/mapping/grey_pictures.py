@@ -1,0 +1,53 @@
+"""Grey pictures of images, kept while corners are looked for in them more than once."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class GreyPictures:
+    """Grey pictures of images in a file without a name, which goes when it is closed.
+
+    They would be decoded again, or take the memory of all.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
+        self._at: dict[int, tuple[int, tuple[int, int]]] = {}
+
+    def __enter__(self) -> GreyPictures:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def __contains__(self, image: int) -> bool:
+        """Whether there is a picture of an image, by its index."""
+        return image in self._at
+
+    def keep(self, image: int, grey: NDArray[np.uint8]) -> None:
+        """Keep the picture, uint8 [height, width], of an image that has none yet."""
+        height, width = grey.shape
+        self._at[image] = self._file.seek(0, 2), (height, width)
+        self._file.write(grey.tobytes())
+
+    def read(self, image: int) -> NDArray[np.uint8]:
+        """The picture of an image."""
+        start, shape = self._at[image]
+        self._file.seek(start)
+        return np.frombuffer(self._file.read(shape[0] * shape[1]), np.uint8).reshape(shape)
+
+    def size(self, image: int) -> tuple[int, int]:
+        """The (width, height) of the picture of an image."""
+        height, width = self._at[image][1]
+        return width, height
