@@ -48,8 +48,8 @@ class CornerDensity:
         spacing: pixels between them, of the picture that is looked at.
     """
 
-    most: int = 500
-    spacing: int = 16
+    most: int = 650
+    spacing: int = 13
 
 
 def follow_corners(

@@ -29,9 +29,9 @@ _Grey = NDArray[np.uint8]
 
 # Width in pixels of the window that is compared, of the picture around a point as another image is
 # to show it, and of what is kept of the image that shows it.
-_WINDOW = 15
-_SHOWN = 21
-_KEPT = 45
+_WINDOW = 11
+_SHOWN = 17
+_KEPT = 37
 # Lucas-Kanade's steps, and the pixels below which one is the last.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
 # Cosine of the angle between two views of a point, and factor by which what is around it grows,
@@ -47,7 +47,7 @@ _LEAST_LIKENESS = 0.8
 # Pixels over which it is measured how a picture changes by the view.
 _REACH = 4.0
 # Points that are looked for in an image, evenly spread over all; bounds the time of long videos.
-_MOST_POINTS = 1000
+_MOST_POINTS = 1500
 # Points of an image, below which it keeps those that were followed: what held it is not let go.
 _FEW = 50
 # Images that see a corner at least.
