@@ -53,8 +53,8 @@ _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
 _LOSS_SCALE = 0.25
-# Beside corners, one in so many of them: each is less exact, and all of them may be off one way.
-_BESIDE = 4
+# Beside corners, one in so many of them: each is less exact, and all may be off one way.
+_BESIDE = 2
 # Tracks that images between key images are placed by, and views of these that make their points.
 _RESECTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
@@ -65,7 +65,7 @@ FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 # Beside corners, which say where an image is, motion that is off by more tells nothing. A corner is
 # where the picture shows it, and where a shutter bends this, all of it is to count; a link, too:
 # where poses do not hold together it is as far off as they are.
-_BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.7)
+_BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
 FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
