@@ -56,6 +56,30 @@ def test_a_joint_that_few_points_hold(
     assert f"only {_LEFT} points join '{first}'" in capsys.readouterr().err
 
 
+def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
+    """Thirty images in a row; 100 points join neighbours, 500 are seen by the first and last."""
+    camera = make_camera(CameraOptions(), 640, 480)
+    poses = [np.column_stack([np.eye(3), [-0.1 * k, 0.0, 0.0]]) for k in range(30)]
+    images = [
+        ModelImage(k + 1, f"{k:03}.png", int(camera.camera_id), pose)
+        for k, pose in enumerate(poses)
+    ]
+    views = [[k, k + 1, k + 2] for k in range(28) for _ in range(100)]
+    views += [[0, 1, 28, 29]] * 500
+    count = len(views)
+    points = ModelPoints(
+        xyz=np.tile([1.5, 0.0, 5.0], (count, 1)),
+        rgb=np.zeros((count, 3), np.uint8),
+        error=np.zeros(count),
+        offsets=np.concatenate([[0], np.cumsum([len(own) for own in views])]),
+        image=np.concatenate(views),
+        xy=np.zeros((sum(map(len, views)), 2)),
+    )
+    write_model(tmp_path, {int(camera.camera_id): camera}, images, points)
+    found = model_joints(read_model(tmp_path)).num_points
+    assert found.tolist() == [600, *[200] * 27, 600]
+
+
 def test_parts_that_are_joined_wrongly(
     made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

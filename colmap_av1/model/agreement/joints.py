@@ -22,6 +22,9 @@ _FEWEST_VIEWS = 3
 # more afterwards, models that were bent there 1 to 5 %.
 _DOUBTFUL = 0.15
 _WEAK = 0.07
+# Images between two that see a point, beyond which these say nothing of the joints between: a place
+# seen again would count for all of the way there and back.
+_REACH = 10
 # So many points hold any joint, however many others have: bent ones had 50 at most.
 _ENOUGH = 100
 # A point has depth where it is seen under this angle in degrees: many times what its error and that
@@ -40,8 +43,8 @@ class Joints:
 
     Attributes:
         pairs: names of the images before and after each joint, in the order of their names.
-        num_points: int64 [n] points that join them: which images on both sides see, three of them
-            at least.
+        num_points: int64 [n] points that join them: which images on both sides see, up to ten
+            images apart, and three images at least.
         num_scaled: int64 [n] those of the points that carry the scale across: which have depth by
             the views up to the image before, and by those from it on.
         num_deep: int64 [n] points that have depth by the views up to the image before, or by those
@@ -124,6 +127,9 @@ def model_joints(reconstruction: Any) -> Joints:
     images = [posed[names[k]] for k in natural_order(names)]
     views, point, xyz = _seen_points(reconstruction, images)
     num_images, num_joints = len(images), max(len(images) - 1, 0)
+    order = np.lexsort((views, point))
+    views, point = views[order], point[order]
+    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
     np.minimum.at(first, point, views)
     np.maximum.at(last, point, views)
@@ -149,7 +155,7 @@ def model_joints(reconstruction: Any) -> Joints:
     joints = [k for k, (own, other) in enumerate(pairwise(row)) if own == other]
     return Joints(
         tuple((images[k].name, images[k + 1].name) for k in joints),
-        num_points=between(first, last)[joints],
+        num_points=between(views[near], views[near + 1])[joints],
         num_scaled=between(deep_from, deep_to + 1)[joints],
         num_deep=np.minimum(before, after)[joints],
     )

@@ -47,7 +47,7 @@ _LEAST_LIKENESS = 0.8
 # Pixels over which it is measured how a picture changes by the view.
 _REACH = 4.0
 # Points that are looked for in an image, evenly spread over all; bounds the time of long videos.
-_MOST_POINTS = 1500
+_MOST_POINTS = 1000
 # Points of an image, below which it keeps those that were followed: what held it is not let go.
 _FEW = 50
 # Images that see a corner at least.
