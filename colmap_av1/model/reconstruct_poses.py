@@ -292,8 +292,8 @@ def adjustment_stage(
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
-        longer = keep_frames(pose_tracks(run, tracks), placed.frames)
-        spread = select_tracks(longer, _ADJUSTED)
+        # The long tracks of all images are several times as large as those chosen: they go at once.
+        spread = select_tracks(keep_frames(pose_tracks(run, tracks), placed.frames), _ADJUSTED)
         if follow is not None:
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
@@ -307,9 +307,8 @@ def adjustment_stage(
         with run.clock.measure("adjustment"):
             folder = partial / "adjusted"
             folder.mkdir()
-            points = joined_points([_black_points(run, placed, *own) for own in sets])
-            check_agreement(len(points.xyz), len(spread.offsets) - 1)
-            write_model(folder, placed.cameras, placed.images, points)
+            num_points = _write_black_points(run, folder, placed, sets)
+            check_agreement(num_points, len(spread.offsets) - 1)
             run.progress("adjustment", 0, 1)
             adjust_model(
                 folder,
@@ -338,6 +337,18 @@ def adjustment_stage(
         products=["adjusted"],
         make=make,
     )
+
+
+def _write_black_points(
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    sets: Sequence[tuple[Tracks, TriangulateOptions]],
+) -> int:
+    """Write a model of the images and of points of sets of tracks; returns how many points."""
+    points = joined_points([_black_points(run, placed, *own) for own in sets])
+    write_model(folder, placed.cameras, placed.images, points)
+    return len(points.xyz)
 
 
 def _black_points(
