@@ -17,6 +17,7 @@ from colmap_av1.model.mapping import child
 from colmap_av1.model.mapping.child import run_mapping
 from colmap_av1.options import MapOptions
 from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
@@ -205,6 +206,7 @@ def _run_apart(
     path = os.pathsep.join(sys.path)
     done, reason = False, ""
     log.write_bytes(_LOG_START)
+    give_back_free_memory()  # the process needs its own beside this one's
     with (
         log.open("ab") as file,
         subprocess.Popen(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +36,17 @@ def _machine_memory() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not on Windows
         return _UNKNOWN
+
+
+def give_back_free_memory() -> None:
+    """Give memory that is free again back to the system, where that does not happen by itself.
+
+    GNU's C library keeps what it has had from the system for arrays of up to 32 MiB: after much
+    work that is more than what is in use.
+    """
+    # Other C libraries have no such function.
+    with suppress(OSError, TypeError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def resident_memory(process: int) -> int:

@@ -27,6 +27,7 @@ from colmap_av1.util.digests import (
     package_version,
 )
 from colmap_av1.util.files import only_run, remove_leftovers, whole_file
+from colmap_av1.util.memory import give_back_free_memory
 
 _FOLDER = ".stages"
 WHOLE_PACKAGE = (".",)
@@ -122,6 +123,7 @@ def run_stage(
     try:
         _remove(partial)
         partial.mkdir()
+        give_back_free_memory()  # what earlier stages had
         facts = make(partial)
         _remove(record)
         for product in products:

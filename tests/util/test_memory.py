@@ -1,0 +1,41 @@
+"""Memory of processes."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from colmap_av1.util.memory import give_back_free_memory, resident_memory
+
+_MEGABYTE = 1 << 20
+# Arrays of a megabyte, every second of which is freed once larger ones have been: C keeps them.
+_FREED = """
+import os
+from colmap_av1.util.memory import give_back_free_memory, resident_memory
+large = bytearray(30 << 20)
+del large
+held = [bytearray(os.urandom(1 << 20)) for _ in range(200)]
+last = bytearray(1000)
+small = held[1::2]
+del held
+before = resident_memory(os.getpid())
+give_back_free_memory()
+print(before - resident_memory(os.getpid()))
+"""
+
+
+def test_own_memory_is_known() -> None:
+    assert resident_memory(os.getpid()) > _MEGABYTE
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do it themselves")
+def test_free_memory_goes_back() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _FREED], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) > 50 * _MEGABYTE
+    give_back_free_memory()  # nothing to give back is no error
