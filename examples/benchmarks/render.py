@@ -24,8 +24,8 @@ SPANS = (1, 2, 4, 8, 16)
 LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
 REFERENCE = "sift-exhaustive"
 
-# Ways whose renderings are compared, the one first that the other is held against.
-SPLAT_WAYS = ("SIFT sequential", "reconstruct")
+# Ways whose renderings are compared, the one first that the others are held against.
+SPLAT_WAYS = ("SIFT sequential", "reconstruct", "reconstruct --gaussians")
 _QUALITIES = ("psnr_y", "ssim_db", "vmaf")
 
 Row = dict[str, str]
@@ -565,7 +565,7 @@ def loops(rows: list[Row]) -> str:
 
 
 def splats(rows: list[Row]) -> str:
-    """Renderings of Gaussians trained from both ways' folders, means of the seeds.
+    """Renderings of Gaussians trained from all ways' folders, means of the seeds.
 
     Shares are of the CPU time that SIFT's training takes to its end, until its last figure is
     reached: between two measurements along the line that joins them.

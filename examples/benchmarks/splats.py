@@ -3,9 +3,10 @@
 python examples/benchmarks/splats.py --cache benchmark_phone
 
 For each clip the two folders of `phone_to_folder.py` are made, in its cache, and Gaussians are
-trained on half of the images of each, from its own poses and points, and rendered for the others.
-The trainer is a small one for CPUs, `../shared/tools/gs_cpu`: what it gives is to be compared with
-what it gives for another cloud, not with other trainers' figures. Its time is of training alone.
+trained on half of the images of each, from its own poses and points, and rendered for the others;
+of `reconstruct`, from the Gaussians of `--gaussians`, too. The trainer is a small one for CPUs,
+`../shared/tools/gs_cpu`: what it gives is to be compared with what it gives for another cloud, not
+with other trainers' figures. Its time is of training alone.
 """
 
 from __future__ import annotations
@@ -28,8 +29,12 @@ from results import Value, add_results, read_rows, save
 from rich.console import Console
 
 from colmap_av1 import ImageOptions
+from colmap_av1.model.splats.gaussians import write_model_gaussians
 
 TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
+FROM_GAUSSIANS = Path(__file__).with_name("train_from_gaussians.py")
+OURS = render.SPLAT_WAYS[1:]
+GAUSSIANS = OURS[-1]
 # Which frames become images, where that differs from the other benchmark.
 IMAGES = {"kitchen": ImageOptions(every=4)}
 WIDTH, ITERATIONS = 225, 3000
@@ -40,7 +45,7 @@ FIGURES = {"iter": "iterations", "cpu_s": "cpu_s", "gaussians": "gaussians"} | {
 
 
 def main() -> int:
-    """Train on every clip, both ways, and keep and print the table."""
+    """Train on every clip, all ways, and keep and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -66,7 +71,7 @@ def main() -> int:
             console.print(f"{name}: {way}", markup=False)
             images, model = folder_of(clip, folder, way)
             for seed in arguments.seeds:
-                rows = train(images, model, folder / "splats" / way.replace(" ", "_"), seed)
+                rows = train(images, model, folder / "splats" / way.replace(" ", "_"), seed, way)
                 about: dict[str, Value] = {"clip": name, "way": way, "seed": seed}
                 key = ("clip", "way", "seed", "iterations")
                 save(arguments.results, [about | row for row in rows], key)
@@ -77,7 +82,7 @@ def main() -> int:
 def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     """The images and the model that one way makes of a clip; the trainer undistorts SIFT's."""
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
-    if way == "reconstruct":
+    if way in OURS:
         return output / "images", output / "sparse" / "0"
     names = sorted(path.name for path in (output / "images").iterdir())
     _, model, images = phone_to_folder.sift_of(clip, folder / "sift", names)
@@ -86,14 +91,21 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     return images, model
 
 
-def train(images: Path, model: Path, folder: Path, seed: int) -> Iterator[dict[str, Value]]:
-    """Train from a model's points, and give what is measured on the way."""
+def train(
+    images: Path, model: Path, folder: Path, seed: int, way: str
+) -> Iterator[dict[str, Value]]:
+    """Train from a model's points, or Gaussians of these, and give what is measured on the way."""
     cloud, output = folder / "cloud.npz", folder / f"seed_{seed}"
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     run = [sys.executable, str(TRAINER / "colmap_to_npz.py"), str(model), str(cloud)]
     subprocess.run([*run, "--images", str(images)], check=True, capture_output=True)
-    run = [sys.executable, str(TRAINER / "gs_train.py"), str(cloud), str(images), str(output)]
+    if way == GAUSSIANS:
+        write_model_gaussians(folder / "init.ply", model)
+        run = [sys.executable, str(FROM_GAUSSIANS), str(folder / "init.ply"), str(TRAINER)]
+    else:
+        run = [sys.executable, str(TRAINER / "gs_train.py")]
+    run += [str(cloud), str(images), str(output)]
     run += ["--width", str(WIDTH), "--iters", str(ITERATIONS), "--reset-every", "0"]
     run += ["--threads", "1", "--seed", str(seed), "--milestones", ",".join(map(str, MILESTONES))]
     with (output / "log.txt").open("w") as log:
