@@ -268,9 +268,11 @@ def test_jerk_that_only_the_model_shows(
     assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
     assert again.links == made.links
 
-    only_said = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
-    bent = reconstruct(jerk, tmp_path / "bent", options=only_said)
-    assert any(f"join 'frame_{before:06d}.png'" in warning for warning in bent.warnings)
+    # Without links corners that are found again across it hold the model together.
+    without = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
+    held = reconstruct(jerk, tmp_path / "held", options=without)
+    assert held.warnings == ()
+    _check_poses(held, FAR_OUT, 0.0005)
 
 
 def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None:
