@@ -191,9 +191,9 @@ std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
     for (std::int64_t i = by_views.ends[view]; i < by_views.ends[view + 1]; ++i) {
       const auto [point, observation] = by_views.seen[static_cast<std::size_t>(i)];
       const Vector ray = between(points.xyz.data() + 3 * point, centres[view].data());
+      const double* seen_at = points.rays.data() + 2 * static_cast<std::size_t>(observation);
       const auto square = [&](std::size_t axis) {
-        const double ray_at = points.rays[2 * static_cast<std::size_t>(observation) + axis];
-        return std::floor(ray_at * points.focal[2 * view + axis] / options.around);
+        return std::floor(seen_at[axis] * points.focal[2 * view + axis] / options.around);
       };
       seen.push_back({square(1), square(0), std::sqrt(dot(ray, ray)), point});
     }
