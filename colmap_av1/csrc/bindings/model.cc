@@ -25,22 +25,35 @@ using namespace nb::literals;
 namespace colmap_av1 {
 namespace {
 
-nb::tuple triangulate(const InputArray<double, nb::shape<-1, 3, 4>>& cam_from_world,
-                      const InputArray<double, nb::shape<-1, 2>>& focal,
-                      const InputArray<std::int64_t, nb::ndim<1>>& offsets,
-                      const InputArray<std::int64_t, nb::ndim<1>>& view,
-                      const InputArray<double, nb::shape<-1, 2>>& rays,
+using Points = InputArray<double, nb::shape<-1, 3>>;
+using Pose = InputArray<double, nb::shape<3, 4>>;
+using Poses = InputArray<double, nb::shape<-1, 3, 4>>;
+using Pairs = InputArray<double, nb::shape<-1, 2>>;
+using Numbers = InputArray<double, nb::ndim<1>>;
+using Indices = InputArray<std::int64_t, nb::ndim<1>>;
+using Picture = InputArray<std::uint8_t, nb::ndim<2>>;
+
+template <typename Array>
+auto span_of(const Array& array) {
+  return std::span(array.data(), array.size());
+}
+
+std::span<const double, 12> span_of(const Pose& pose) {
+  return std::span<const double, 12>(pose.data(), 12);
+}
+
+nb::tuple triangulate(const Poses& cam_from_world, const Pairs& focal, const Indices& offsets,
+                      const Indices& view, const Pairs& rays,
                       const InputArray<float, nb::ndim<1>>& sigma, std::int64_t first,
                       std::int64_t last, int min_observations, double max_reprojection_error,
                       double min_angle, std::optional<double> max_depth_error, double sigma_floor,
                       double error_to_sigma) {
-  const model::PosedTracks tracks{
-      .cam_from_world = {cam_from_world.data(), 12 * cam_from_world.shape(0)},
-      .focal = {focal.data(), 2 * focal.shape(0)},
-      .offsets = {offsets.data(), offsets.shape(0)},
-      .view = {view.data(), view.shape(0)},
-      .rays = {rays.data(), 2 * rays.shape(0)},
-      .sigma = {sigma.data(), sigma.shape(0)}};
+  const model::PosedTracks tracks{.cam_from_world = span_of(cam_from_world),
+                                  .focal = span_of(focal),
+                                  .offsets = span_of(offsets),
+                                  .view = span_of(view),
+                                  .rays = span_of(rays),
+                                  .sigma = span_of(sigma)};
   model::PointArrays points;
   {
     const nb::gil_scoped_release release;
@@ -59,10 +72,8 @@ nb::tuple triangulate(const InputArray<double, nb::shape<-1, 3, 4>>& cam_from_wo
                         points.num_tracks);
 }
 
-using Picture = InputArray<std::uint8_t, nb::ndim<2>>;
-
 model::GreyPicture grey_picture(const Picture& pixels) {
-  return {.pixels = {pixels.data(), pixels.size()},
+  return {.pixels = span_of(pixels),
           .width = static_cast<std::int64_t>(pixels.shape(1)),
           .height = static_cast<std::int64_t>(pixels.shape(0))};
 }
@@ -77,34 +88,22 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
   std::vector<float> found;
   {
     const nb::gil_scoped_release release;
-    found =
-        model::correlate_patches(grey_picture(one), {at_one.data(), at_one.size()},
-                                 grey_picture(two), {at_two.data(), at_two.size()}, min_deviation);
+    found = model::correlate_patches(grey_picture(one), span_of(at_one), grey_picture(two),
+                                     span_of(at_two), min_deviation);
   }
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
 }
 
-using Points = InputArray<double, nb::shape<-1, 3>>;
-using Pose = InputArray<double, nb::shape<3, 4>>;
-
-std::span<const double, 12> span_of(const Pose& pose) {
-  return std::span<const double, 12>(pose.data(), 12);
-}
-
-using Poses = InputArray<double, nb::shape<-1, 3, 4>>;
-using Pairs = InputArray<double, nb::shape<-1, 2>>;
-using Indices = InputArray<std::int64_t, nb::ndim<1>>;
-
 model::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
                               const Pairs& rays, const Points& xyz, const Indices& offsets,
                               const Indices& observation) {
-  return {.cam_from_world = {cam_from_world.data(), cam_from_world.size()},
-          .focal = {focal.data(), focal.size()},
-          .view = {view.data(), view.size()},
-          .rays = {rays.data(), rays.size()},
-          .xyz = {xyz.data(), xyz.size()},
-          .offsets = {offsets.data(), offsets.size()},
-          .observation = {observation.data(), observation.size()}};
+  return {.cam_from_world = span_of(cam_from_world),
+          .focal = span_of(focal),
+          .view = span_of(view),
+          .rays = span_of(rays),
+          .xyz = span_of(xyz),
+          .offsets = span_of(offsets),
+          .observation = span_of(observation)};
 }
 
 nb::object reprojection_errors(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
@@ -124,8 +123,7 @@ nb::object widest_angles(const Points& centres, const Points& xyz, const Indices
   std::vector<double> angles;
   {
     const nb::gil_scoped_release release;
-    angles = model::widest_angles({centres.data(), centres.size()}, {xyz.data(), xyz.size()},
-                                  {offsets.data(), offsets.size()}, {view.data(), view.size()});
+    angles = model::widest_angles(span_of(centres), span_of(xyz), span_of(offsets), span_of(view));
   }
   return adopt(std::move(angles));
 }
@@ -159,7 +157,7 @@ nb::tuple points_in_view(const Pose& cam_from_world, const InputArray<double, nb
                                    .low_y = low.data()[1],
                                    .high_x = high.data()[0],
                                    .high_y = high.data()[1]},
-                                  {xyz.data(), xyz.size()});
+                                  span_of(xyz));
   }
   const std::size_t count = found.index.size();
   return nb::make_tuple(adopt(std::move(found.index)),
@@ -180,7 +178,7 @@ nb::tuple points_in_picture(const Pose& cam_from_world,
                                       .centre_y = params[3],
                                       .width = width,
                                       .height = height},
-                                     {xyz.data(), xyz.size()});
+                                     span_of(xyz));
   }
   const std::size_t count = found.index.size();
   return nb::make_tuple(adopt(std::move(found.index)),
@@ -188,25 +186,25 @@ nb::tuple points_in_picture(const Pose& cam_from_world,
                         adopt(std::move(found.depth)));
 }
 
-nb::object nearest_in_cells(const InputArray<double, nb::shape<-1, 2>>& xy,
-                            const InputArray<double, nb::ndim<1>>& depth, int cell,
-                            std::int64_t columns, std::int64_t rows) {
-  std::vector<double> nearest = model::nearest_in_cells(
-      {xy.data(), xy.size()}, {depth.data(), depth.size()}, cell, columns, rows);
+nb::object nearest_in_cells(const Pairs& xy, const Numbers& depth, int cell, std::int64_t columns,
+                            std::int64_t rows) {
+  std::vector<double> nearest;
+  {
+    const nb::gil_scoped_release release;
+    nearest = model::nearest_in_cells(span_of(xy), span_of(depth), cell, columns, rows);
+  }
   return adopt<double>(std::move(nearest),
                        {static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
 }
 
-nb::object best_at_spacings(const Pairs& xy, const InputArray<double, nb::ndim<1>>& depth,
-                            const Indices& rank, std::int64_t width, std::int64_t height,
-                            const Indices& spacings, double steps_per_octave,
-                            std::int64_t most_steps) {
+nb::object best_at_spacings(const Pairs& xy, const Numbers& depth, const Indices& rank,
+                            std::int64_t width, std::int64_t height, const Indices& spacings,
+                            double steps_per_octave, std::int64_t most_steps) {
   std::vector<std::int64_t> found;
   {
     const nb::gil_scoped_release release;
-    found = model::best_at_spacings({xy.data(), xy.size()}, {depth.data(), depth.size()},
-                                    {rank.data(), rank.size()}, width, height,
-                                    {.spacings = {spacings.data(), spacings.size()},
+    found = model::best_at_spacings(span_of(xy), span_of(depth), span_of(rank), width, height,
+                                    {.spacings = span_of(spacings),
                                      .steps_per_octave = steps_per_octave,
                                      .most_steps = most_steps});
   }

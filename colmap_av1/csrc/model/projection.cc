@@ -6,79 +6,77 @@
 #include <limits>
 #include <stdexcept>
 
+#include "model/geometry.h"
+
 namespace colmap_av1::model {
 namespace {
 
 // Points worked on at a time.
 constexpr std::size_t kChunk = 1024;
 
-using Vector = std::array<double, 3>;
-
-Vector to_camera(std::span<const double, 12> pose, const double* point) {
-  Vector found{};
-  for (std::size_t i = 0; i < 3; ++i) {
-    const double* row = pose.data() + 4 * i;
-    found[i] = row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3];
-  }
-  return found;
-}
-
 template <typename T, std::size_t size>
 void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& to) {
   to.insert(to.end(), from.begin(), from.begin() + static_cast<std::ptrdiff_t>(count));
 }
 
-}  // namespace
-
-// Here and below every point is written, and stays where the next one does not overwrite it: which
-// ones are seen is too random for a processor to foretell.
-PointsInView points_in_view(std::span<const double, 12> cam_from_world, const RayBounds& bounds,
-                            std::span<const double> xyz) {
+// Goes through points a chunk at a time. `write` is given a place in the chunk and a point in the
+// camera, writes what is wanted of it there, and says whether it is seen; `take` then takes over
+// what the first places hold. Every point is written, and stays where the next one does not
+// overwrite it: which ones are seen is too random for a processor to foretell.
+template <typename Write, typename Take>
+void for_seen(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
+              std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
   const std::size_t total = xyz.size() / 3;
-  PointsInView found;
   std::array<std::int64_t, kChunk> index;
-  std::array<double, 3 * kChunk> local;
   for (std::size_t first = 0; first < total; first += kChunk) {
     std::size_t count = 0;
     for (std::size_t i = first; i < std::min(first + kChunk, total); ++i) {
-      const Vector at = to_camera(cam_from_world, xyz.data() + 3 * i);
-      const auto [x, y, z] = at;
       index[count] = static_cast<std::int64_t>(i);
-      std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * count));
-      const bool within = (z > 0) & (x >= bounds.low_x * z) & (x <= bounds.high_x * z) &
-                          (y >= bounds.low_y * z) & (y <= bounds.high_y * z);
-      count += within ? 1 : 0;
+      count += write(count, to_camera(cam_from_world.data(), xyz.data() + 3 * i)) ? 1 : 0;
     }
-    append(index, count, found.index);
-    append(local, 3 * count, found.xyz);
+    append(index, count, seen);
+    take(count);
   }
+}
+
+}  // namespace
+
+PointsInView points_in_view(std::span<const double, 12> cam_from_world, const RayBounds& bounds,
+                            std::span<const double> xyz) {
+  PointsInView found;
+  std::array<double, 3 * kChunk> local;
+  for_seen(
+      cam_from_world, xyz, found.index,
+      [&](std::size_t place, const Vector& at) {
+        std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
+        const auto [x, y, z] = at;
+        return (z > 0) & (x >= bounds.low_x * z) & (x <= bounds.high_x * z) &
+               (y >= bounds.low_y * z) & (y <= bounds.high_y * z);
+      },
+      [&](std::size_t count) { append(local, 3 * count, found.xyz); });
   return found;
 }
 
 PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, const Pinhole& camera,
                                   std::span<const double> xyz) {
-  const std::size_t total = xyz.size() / 3;
   PointsInPicture found;
-  std::array<std::int64_t, kChunk> index;
   std::array<double, 2 * kChunk> pixels;
   std::array<double, kChunk> depth;
-  for (std::size_t first = 0; first < total; first += kChunk) {
-    std::size_t count = 0;
-    for (std::size_t i = first; i < std::min(first + kChunk, total); ++i) {
-      const auto [u, v, z] = to_camera(cam_from_world, xyz.data() + 3 * i);
-      const double x = camera.focal_x * (u / z) + camera.centre_x;
-      const double y = camera.focal_y * (v / z) + camera.centre_y;
-      index[count] = static_cast<std::int64_t>(i);
-      pixels[2 * count] = x;
-      pixels[2 * count + 1] = y;
-      depth[count] = z;
-      const bool inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height);
-      count += inside ? 1 : 0;
-    }
-    append(index, count, found.index);
-    append(pixels, 2 * count, found.xy);
-    append(depth, count, found.depth);
-  }
+  for_seen(
+      cam_from_world, xyz, found.index,
+      [&](std::size_t place, const Vector& at) {
+        const auto [u, v, z] = at;
+        const double x = camera.focal_x * (u / z) + camera.centre_x;
+        const double y = camera.focal_y * (v / z) + camera.centre_y;
+        pixels[2 * place] = x;
+        pixels[2 * place + 1] = y;
+        depth[place] = z;
+        return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height);
+      },
+      [&](std::size_t count) {
+        append(pixels, 2 * count, found.xy);
+        append(depth, count, found.depth);
+      });
   return found;
 }
 

@@ -7,10 +7,10 @@
 #include <limits>
 #include <stdexcept>
 
+#include "model/geometry.h"
+
 namespace colmap_av1::model {
 namespace {
-
-using Vector = std::array<double, 3>;
 
 // Two rays that a first guess is made of, by their place in the track from 0 to 1.
 constexpr std::array<std::array<double, 2>, 4> kGuesses{
@@ -25,16 +25,6 @@ constexpr double kSoftError2 = 1.0;
 constexpr double kSingular = 1e-12;
 constexpr double kInfinite = std::numeric_limits<double>::infinity();
 
-double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-Vector camera_centre(const double* pose) {
-  Vector centre{};
-  for (std::size_t i = 0; i < 3; ++i) {
-    centre[i] = -(pose[i] * pose[3] + pose[4 + i] * pose[7] + pose[8 + i] * pose[11]);
-  }
-  return centre;
-}
-
 struct Observation {
   std::int64_t index = 0;
   const double* pose = nullptr;
@@ -44,33 +34,14 @@ struct Observation {
   double weight = 0;  // inverse expected variance
 };
 
-struct Projection {
-  double x = 0;
-  double y = 0;
-  double depth = 0;
-  double error2 = kInfinite;  // px^2; infinite behind the camera
-};
-
-Projection project(const Observation& seen, const Vector& point) {
-  const double* r = seen.pose;
-  const double u = r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3];
-  const double v = r[4] * point[0] + r[5] * point[1] + r[6] * point[2] + r[7];
-  Projection found;
-  found.depth = r[8] * point[0] + r[9] * point[1] + r[10] * point[2] + r[11];
-  if (!(found.depth > 0)) return found;
-  found.x = u / found.depth;
-  found.y = v / found.depth;
-  const double off_x = (found.x - seen.x) * seen.focal[0];
-  const double off_y = (found.y - seen.y) * seen.focal[1];
-  const double error2 = off_x * off_x + off_y * off_y;
-  if (std::isfinite(error2)) found.error2 = error2;
-  return found;
+Projection projection_of(const Observation& seen, const Vector& point) {
+  return project(seen.pose, seen.focal, seen.x, seen.y, point.data());
 }
 
 // What is beyond the limit costs no more than that.
 double cost_of(std::span<const Observation> track, const Vector& point, double limit) {
   double cost = 0;
-  for (const Observation& seen : track) cost += std::min(project(seen, point).error2, limit);
+  for (const Observation& seen : track) cost += std::min(projection_of(seen, point).error2, limit);
   return cost;
 }
 
@@ -91,10 +62,10 @@ Vector midpoint(const Observation& a, const Observation& b) {
   const Vector db = direction(b);
   const Vector ca = camera_centre(a.pose);
   const Vector cb = camera_centre(b.pose);
-  const Vector between{cb[0] - ca[0], cb[1] - ca[1], cb[2] - ca[2]};
+  const Vector apart = between(ca.data(), cb.data());
   const double cosine = dot(da, db);
-  const double along_a = dot(da, between);
-  const double along_b = dot(db, between);
+  const double along_a = dot(da, apart);
+  const double along_b = dot(db, apart);
   const double sine2 = std::max(1.0 - cosine * cosine, kSingular);
   const double on_a = (along_a - cosine * along_b) / sine2;
   const double on_b = (cosine * along_a - along_b) / sine2;
@@ -149,7 +120,7 @@ Vector gauss_newton_step(std::span<const Observation> track, const Vector& point
   std::array<double, 6> normal{};
   Vector gradient{};
   for (const Observation& seen : track) {
-    const Projection at = project(seen, point);
+    const Projection at = projection_of(seen, point);
     if (at.error2 > limit) continue;
     const double weight = seen.weight / (1.0 + at.error2 / kSoftError2);
     const std::array<double, 2> where{at.x, at.y};
@@ -192,27 +163,10 @@ Vector locate(std::span<const Observation> track, double limit) {
   return point;
 }
 
-Vector towards(const Vector& point, const Observation& seen) {
-  const Vector centre = camera_centre(seen.pose);
-  Vector ray{point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]};
-  const double norm = std::sqrt(dot(ray, ray));
-  if (norm > 0) {
-    for (double& value : ray) value /= norm;
-  }
-  return ray;
-}
-
-// Angle in radians at which the rays of observations meet in a point: against the first and the
-// last of them, so at most a little less than the widest.
-double widest_angle(std::span<const Observation> kept, const Vector& point) {
-  const Vector first = towards(point, kept.front());
-  const Vector last = towards(point, kept.back());
-  double narrowest = 1.0;
-  for (const Observation& seen : kept) {
-    const Vector ray = towards(point, seen);
-    narrowest = std::min({narrowest, dot(ray, first), dot(ray, last)});
-  }
-  return std::acos(std::clamp(narrowest, -1.0, 1.0));
+double angle_of(std::span<const Observation> kept, const Vector& point) {
+  return widest_angle(kept.size(), [&](std::size_t i) {
+    return unit_vector(camera_centre(kept[i].pose).data(), point.data());
+  });
 }
 
 // Whether a point of this angle and mean error has an accurate depth.
@@ -288,14 +242,14 @@ PointArrays triangulate(const PosedTracks& tracks, std::int64_t first, std::int6
       dropped.clear();
       double error = 0;
       for (const Observation& seen : left) {
-        const double error2 = project(seen, point).error2;
+        const double error2 = projection_of(seen, point).error2;
         (error2 <= limit ? kept : dropped).push_back(seen);
         if (error2 <= limit) error += std::sqrt(error2);
       }
       if (kept.size() < least) break;
       points.num_agreeing += attempt == 0;
       error /= static_cast<double>(kept.size());
-      if (is_sure(widest_angle(kept, point), error, focal, options)) {
+      if (is_sure(angle_of(kept, point), error, focal, options)) {
         points.xyz.insert(points.xyz.end(), point.begin(), point.end());
         points.error.push_back(error);
         points.count.push_back(static_cast<std::int64_t>(kept.size()));
