@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -252,11 +253,12 @@ def test_centres_are_where_cameras_are() -> None:
         assert np.allclose(view.centre, centre)
 
 
-def test_what_the_core_is_given_must_fit() -> None:
+def given_to_core(num_points: int) -> dict[str, np.ndarray]:
+    """Points, each of which every view sees, as the core takes them."""
     poses = moving(0.2)
-    truth = scattered(5, 3.0)
+    truth = scattered(num_points, 3.0)
     seen = see(truth, poses, 0.0)
-    given = {
+    return {
         "cam_from_world": poses,
         "focal": views_of(poses).focal,
         "view": seen.view,
@@ -265,17 +267,65 @@ def test_what_the_core_is_given_must_fit() -> None:
         "offsets": seen.offsets,
         "observation": np.arange(len(seen.view)),
     }
+
+
+HANGING = {"before": 0.7, "as_near": 1.1, "support": 2, "around": 1000.0, "fewest_around": 3}
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("view", lambda view: view + 1),
+        ("view", lambda view: view - 1),
+        ("offsets", lambda offsets: offsets[::-1].copy()),
+        ("offsets", lambda offsets: offsets[:-1]),
+        ("offsets", lambda offsets: offsets[:0]),
+        ("observation", lambda observation: observation + 1),
+        ("rays", lambda rays: rays[1:]),
+        ("focal", lambda focal: focal[1:]),
+        ("xyz", lambda xyz: xyz[1:]),
+        ("cam_from_world", lambda poses: poses[:1]),
+    ],
+)
+def test_points_that_the_core_is_given_must_fit(name: str, wrong: Callable[..., object]) -> None:
+    given = given_to_core(5)
     assert np.abs(_core.reprojection_errors(**given)).max() < 1e-9
-    for name, wrong in (
-        ("view", seen.view + 1),
-        ("view", seen.view - 1),
-        ("offsets", seen.offsets[::-1].copy()),
-        ("observation", np.arange(len(seen.view)) + 1),
-        ("rays", seen.rays[1:]),
-        ("focal", given["focal"][1:]),
-    ):
+    assert _core.hanging_observations(**given, **HANGING).tolist() == [0] * 5
+    given[name] = wrong(given[name])
+    with pytest.raises(ValueError, match=r"fit|no such"):
+        _core.reprojection_errors(**given)
+    with pytest.raises(ValueError, match=r"fit|no such"):
+        _core.hanging_observations(**given, **HANGING)
+    if name in ("view", "offsets", "xyz", "cam_from_world"):
+        centres = camera_centres(given["cam_from_world"])
+        rest = {key: given[key] for key in ("xyz", "offsets", "view")}
         with pytest.raises(ValueError, match=r"fit|no such"):
-            _core.reprojection_errors(**given | {name: wrong})
+            _core.widest_angles(centres=centres, **rest)
+
+
+def test_what_is_no_number_tells_the_core_nothing() -> None:
+    given = given_to_core(5)
+    given["xyz"][0] *= 0.3  # hangs before the others
+    given["rays"] += 1.0  # all in one square
+    counts = _core.hanging_observations(**given, **HANGING)
+    assert counts.tolist() == [NUM_VIEWS, 0, 0, 0, 0]
+    given["rays"][0] = np.nan
+    given["xyz"][4] = np.nan
+    counts = _core.hanging_observations(**given, **HANGING)
+    assert counts.tolist() == [NUM_VIEWS - 1, 0, 0, 0, 0]
+    errors = _core.reprojection_errors(**given)
+    assert np.isinf(errors[0])
+    assert np.isinf(errors[-NUM_VIEWS:]).all()
+    assert np.isfinite(errors[1:-NUM_VIEWS]).all()
+    rest = {key: given[key] for key in ("xyz", "offsets", "view")}
+    angles = _core.widest_angles(centres=camera_centres(given["cam_from_world"]), **rest)
+    assert (angles[:4] > 0).all()
+    assert angles[4] == 0
+    with pytest.raises(ValueError, match="wider than 0"):
+        _core.hanging_observations(**given, **HANGING | {"around": 0.0})
+
+
+def test_surfaces_that_the_core_is_given_must_fit() -> None:
     xy, depth = np.array([[3.0, 4.0], [5.0, 4.0]]), np.array([2.0, 2.1])
     limits = {"width": 8, "height": 8, "steps_per_octave": 2.0, "most_steps": 64}
     spacings, rank = np.array([8, 2]), np.array([1, 0])
@@ -284,3 +334,10 @@ def test_what_the_core_is_given_must_fit() -> None:
     for wrong in ({"spacings": np.array([0])}, {"spacings": spacings, "width": 5}):
         with pytest.raises(ValueError, match=r"spacings|outside"):
             _core.best_at_spacings(xy, depth, rank, **limits | wrong)
+    for beyond in (np.inf, np.nan, 0.0):
+        with pytest.raises(ValueError, match="outside"):
+            _core.best_at_spacings(xy, np.full(2, beyond), rank, spacings=spacings, **limits)
+    # Steps beyond all bounds are one surface.
+    limits["steps_per_octave"] = 1e308
+    steep = _core.best_at_spacings(xy, depth * 8, rank, spacings=spacings, **limits)
+    assert steep.tolist() == [1, 0]

@@ -25,7 +25,8 @@ std::vector<double> reprojection_errors(const SeenPoints& points);
 
 // Widest angle in radians at which the rays of points [n][3] from the centres of cameras meet:
 // against those of a point's first and its last observation, so at most a little less. 0 without
-// observations; these are in compressed sparse row form, the camera of each in `view`.
+// observations, and where places are not finite. Observations are in compressed sparse row form,
+// the camera of each in `view`.
 std::vector<double> widest_angles(std::span<const double> centres, std::span<const double> xyz,
                                   std::span<const std::int64_t> offsets,
                                   std::span<const std::int64_t> view);
@@ -39,7 +40,8 @@ struct HangingOptions {
 };
 
 // Of each point, the number of its observations in which it hangs, nearly alone, before what others
-// show in the same square of the image.
+// show in the same square of the image. Rays and points that are not finite tell nothing. Throws
+// for squares without a width, too.
 std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
                                                const HangingOptions& options);
 

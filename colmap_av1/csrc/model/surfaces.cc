@@ -19,8 +19,8 @@ void check(std::span<const double> xy, std::span<const double> depth,
     const double x = xy[2 * i];
     const double y = xy[2 * i + 1];
     if (!(x >= 0 && x < static_cast<double>(width) && y >= 0 && y < static_cast<double>(height) &&
-          depth[i] > 0)) {
-      throw std::invalid_argument("a point lies outside the picture");
+          depth[i] > 0 && std::isfinite(depth[i]))) {
+      throw std::invalid_argument("a point lies outside the picture, behind it or without end");
     }
   }
   if (options.most_steps < 1 || !std::all_of(options.spacings.begin(), options.spacings.end(),
@@ -37,10 +37,12 @@ std::vector<std::int64_t> steps_of(std::span<const double> depth, const SurfaceO
     steps[i] = std::floor(options.steps_per_octave * std::log2(depth[i]));
     least = std::min(least, steps[i]);
   }
-  const auto most = static_cast<double>(options.most_steps - 1);
+  // What is no number, by steps beyond all bounds, is of the last one.
+  const auto last = static_cast<double>(options.most_steps - 1);
   std::vector<std::int64_t> found(depth.size());
   std::transform(steps.begin(), steps.end(), found.begin(), [&](double step) {
-    return static_cast<std::int64_t>(std::min(step - least, most));
+    const double beyond = step - least;
+    return static_cast<std::int64_t>(beyond < last ? beyond : last);
   });
   return found;
 }

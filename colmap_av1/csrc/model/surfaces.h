@@ -15,8 +15,8 @@ struct SurfaceOptions {
 
 // Of points in a picture, the index of the first spacing at which each is the best one of its cell
 // and surface; the number of spacings where it is at none. Pixels are [n][2] and lie within the
-// picture, depths above 0; the best point is that of the least rank. Throws std::invalid_argument
-// for what does not fit.
+// picture, depths are finite and above 0; the best point is that of the least rank. Throws
+// std::invalid_argument for what does not fit.
 std::vector<std::int64_t> best_at_spacings(std::span<const double> xy,
                                            std::span<const double> depth,
                                            std::span<const std::int64_t> rank, std::int64_t width,
