@@ -3,9 +3,10 @@
     python make_corpus.py corpus FILE.ivf...
 
 Each file gives corpus/parser/NAME and corpus/track_builder/NAME with as many of its first
-temporal units as the size limit lets in; corpus/track_builder/random_N makes block data up.
-The committed seeds were made from the conformance
-kit's streams and damaged files and thinned out by libFuzzer's -merge=1.
+temporal units as the size limit lets in; corpus/track_builder/random_N makes block data up, and
+corpus/model/random_N points and pictures. The committed seeds were made from the conformance
+kit's streams and damaged files and, but for those of the model, thinned out by libFuzzer's
+-merge=1.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ _IVF_FRAME_HEADER_SIZE = 12
 _PARSER_OPTIONS = bytes([0x02])
 _TRACK_BUILDER_OPTIONS = bytes([0x00, 0xFD])
 _NUM_RANDOM = 4
+# Of the model: kinds of input that its first byte says, and bytes of a seed. In every second one
+# nearly all numbers are small, as those of real scenes are.
+_NUM_KINDS = 3
+_MODEL_SIZE = 900
+_SMALL = range(100, 156)
 
 
 def temporal_units(ivf: bytes) -> list[bytes]:
@@ -68,6 +74,11 @@ def main() -> None:
         options = bytes([0x01, numbers.randrange(256), index % 2])
         data = options + numbers.randbytes(args.max_size - len(options))
         (args.corpus / "track_builder" / f"random_{index}").write_bytes(data)
+    (args.corpus / "model").mkdir(exist_ok=True)
+    for index in range(2 * _NUM_KINDS):
+        values = numbers.choices(_SMALL if index % 2 else range(256), k=_MODEL_SIZE)
+        data = bytes([index % _NUM_KINDS, *values])
+        (args.corpus / "model" / f"random_{index}").write_bytes(data)
 
 
 if __name__ == "__main__":
