@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from colmap_av1.database.findings import (
 from colmap_av1.database.findings_values import value_findings
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
+from colmap_av1.images.names import video_of
 from colmap_av1.matching.two_view_geometry import config_name
 from colmap_av1.matching.weak_gaps import ThinGap, thin_gaps
 from colmap_av1.util.arguments import checks_arguments
@@ -134,11 +135,8 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
-    rows = [
-        (camera, PurePosixPath(name).parent)
-        for camera, name in zip(images.camera_ids, images.names, strict=True)
-    ]
-    thin = thin_gaps(pairs.index[used], pairs.num_inliers[used], images.names, rows)
+    videos = list(map(video_of, images.camera_ids, images.names))
+    thin = thin_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
     findings = [
         *image_findings(images, cameras),
         *value_findings(images, pairs, cameras),

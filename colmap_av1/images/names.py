@@ -115,6 +115,14 @@ def natural_order(names: Sequence[str]) -> list[int]:
     return sorted(range(len(names)), key=lambda i: natural_key(names[i]))
 
 
+def video_of(camera_id: int, name: str) -> tuple[int, PurePosixPath]:
+    """What tells the video that an image is of: one camera took all of its images into one folder.
+
+    Of these, neighbours in their natural order are neighbours in time.
+    """
+    return camera_id, PurePosixPath(name).parent
+
+
 def last_number(name: str) -> int | None:
     """The last number in an image's name, its extension left out; None where there is none."""
     digits = re.findall(r"\d+", PurePosixPath(name).stem)

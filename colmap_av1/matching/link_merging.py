@@ -122,22 +122,23 @@ def _both(
 
 def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
     """Number of the group of images that pairs connect, for each image: int32 [num_images]."""
-    used = [len(geometry.inlier_matches) >= MIN_INLIERS for geometry in matched.geometries]
-    return connected_components(
-        len(matched.keypoints), matched.pairs[np.array(used, dtype=np.bool_)]
-    )
+    used, _ = _used_pairs(matched)
+    return connected_components(len(matched.keypoints), matched.pairs[used])
 
 
 def about_thin_gaps(matched: MatchedImages, takes: Takes) -> list[str]:
     """What the user should know of gaps between images of a video that few matches cross."""
-    counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
-    kinds = [geometry.config for geometry in matched.geometries]
-    used = (counts >= MIN_INLIERS) & ~np.isin(kinds, UNUSED_CONFIGS)
-    take = takes.take.tolist()
-    warning = thin_gap_warning(
-        thin_gaps(matched.pairs[used], counts[used], takes.images.names, take)
-    )
+    used, counts = _used_pairs(matched)
+    gaps = thin_gaps(matched.pairs[used], counts[used], takes.images.names, takes.take.tolist())
+    warning = thin_gap_warning(gaps)
     return [warning] if warning is not None else []
+
+
+def _used_pairs(matched: MatchedImages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Bool [m] which pairs mappers use, and int64 [m] the inliers of all."""
+    counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
+    configs = [geometry.config for geometry in matched.geometries]
+    return (counts >= MIN_INLIERS) & ~np.isin(configs, UNUSED_CONFIGS), counts
 
 
 def links_as_tracks(

@@ -143,9 +143,7 @@ def plan_links(
     ]
     between: list[int] = []
     if takes.num_takes > 1:
-        between = [
-            i for take in _videos(takes) for i in _spread_images(takes, matched, take, images_apart)
-        ]
+        between = _spread_over_videos(takes, matched, images_apart)
         between += range(takes.images_of(len(takes.videos)).start, len(takes.take))
     return Plan(gaps, around, key, between)
 
@@ -165,11 +163,7 @@ def thorough_plan(
     """
     key = plan.key
     if anywhere and not key:
-        key = [
-            i
-            for video in _videos(takes)
-            for i in _spread_images(takes, matched, video, images_apart)
-        ]
+        key = _spread_over_videos(takes, matched, images_apart)
     between: list[int] = []
     for first, last in _bounds_of_videos(takes):
         own = [image for image in plan.between if first <= image < last]
@@ -222,6 +216,7 @@ def _key_images(
 
 
 def _spread_over_videos(takes: Takes, matched: MatchedImages, images_apart: float) -> list[int]:
+    """Such images of every video, see `_spread_images`."""
     return [
         image
         for video in _videos(takes)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from colmap_av1.images.names import natural_order
@@ -45,12 +46,15 @@ def weak_frames(inter_share: NDArray[np.float32], *, surely: bool = False) -> ND
         bool [num_frames]; the first frame is never weak, there is nothing before it.
     """
     weak = np.zeros(len(inter_share), dtype=np.bool_)
+    if len(weak) < 2:
+        return weak
     share = _SURELY_LESS if surely else _LEAST_OF_NEIGHBOURS
-    for frame in range(1, len(inter_share)):
-        around = inter_share[max(1, frame - _NEIGHBOURS) : frame + _NEIGHBOURS + 1]
-        usual = float(np.median(around))
-        least = max(_LEAST_INTER_SHARE, share * usual)
-        weak[frame] = inter_share[frame] < least
+    own = inter_share[1:]
+    around = sliding_window_view(
+        np.pad(own, _NEIGHBOURS, constant_values=np.nan), 2 * _NEIGHBOURS + 1
+    )
+    usual = np.nanmedian(around, axis=1).astype(np.float64)
+    weak[1:] = own < np.maximum(_LEAST_INTER_SHARE, share * usual).astype(own.dtype)
     return weak
 
 
@@ -107,7 +111,7 @@ def thin_gaps(
     pairs: NDArray[np.integer],
     num_inliers: NDArray[np.integer],
     names: Sequence[str],
-    rows: Sequence[Hashable],
+    videos: Sequence[Hashable],
 ) -> tuple[ThinGap, ...]:
     """Find gaps that far fewer matches cross than those before and after them.
 
@@ -117,20 +121,25 @@ def thin_gaps(
         pairs: integers [m, 2] indices of images, of pairs that mappers use.
         num_inliers: integers [m] their verified matches.
         names: of the images; their natural order is that of time.
-        rows: of each image what it shares with those of the same video: camera and folder.
+        videos: of each image what tells its video, see `video_of`.
     """
+    rows: dict[Hashable, list[int]] = {}
+    for i in natural_order(names):
+        rows.setdefault(videos[i], []).append(i)
+    # One video after the other, so that no pair of one of them crosses a gap of another.
+    order = [i for own in rows.values() for i in own]
+    place, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
+    place[order] = np.arange(len(order))
+    row[order] = np.repeat(np.arange(len(rows)), [len(own) for own in rows.values()])
+    inside = row[pairs[:, 0]] == row[pairs[:, 1]]
+    ends = np.sort(place[pairs[inside]], axis=1)
+    change = np.zeros(len(names), dtype=np.int64)
+    np.add.at(change, ends[:, 0], num_inliers[inside])
+    np.subtract.at(change, ends[:, 1], num_inliers[inside])
+    across = np.cumsum(change)
     found: list[ThinGap] = []
-    order = natural_order(names)
-    for row in dict.fromkeys(rows[i] for i in order):
-        own = [i for i in order if rows[i] == row]
-        place = np.full(len(names), -1, dtype=np.int64)
-        place[own] = np.arange(len(own))
-        ends = np.sort(place[pairs], axis=1)
-        inside = ends[:, 0] >= 0
-        change = np.zeros(len(own), dtype=np.int64)
-        np.add.at(change, ends[inside, 0], num_inliers[inside])
-        np.subtract.at(change, ends[inside, 1], num_inliers[inside])
-        share = _share_of_usual(np.cumsum(change)[:-1])
+    for own in rows.values():
+        share = _share_of_usual(across[place[own[0]] : place[own[-1]]])
         for thin, gaps in groupby(range(len(share)), key=lambda g: share[g] < _THIN):
             if thin:
                 together = list(gaps)

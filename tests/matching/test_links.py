@@ -80,6 +80,16 @@ def test_weak_frames_are_those_without_motion_among_others() -> None:
     assert weak_frames(np.full(9, 0.04, np.float32))[1:].all()
 
 
+@pytest.mark.parametrize("num_frames", [0, 1, 2, 9, 50])
+def test_frames_are_weak_beside_the_median_of_those_around(num_frames: int) -> None:
+    share = np.random.default_rng(num_frames).random(num_frames, np.float32)
+    usual = [np.median(share[max(1, i - 8) : i + 9]) for i in range(1, num_frames)]
+    for surely, least in ((False, 0.55), (True, 0.4)):
+        weak = [own < max(0.25, least * x) for own, x in zip(share[1:], usual, strict=True)]
+        found = weak_frames(share, surely=surely)
+        assert found.tolist() == [False, *weak][:num_frames]
+
+
 def test_weak_gaps_lie_between_images() -> None:
     share = np.full(20, 0.9, np.float32)
     share[[7, 13]] = 0.05

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,10 @@ from colmap_av1.database.reading import (
     matches_from_row,
 )
 from colmap_av1.errors import DatabaseError
-from colmap_av1.images.names import natural_order
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
-from colmap_av1.model.colmap_model import ModelImage, posed_images
+from colmap_av1.model.agreement.joints import images_in_time
+from colmap_av1.model.colmap_model import ModelImage
 
 _Floats = NDArray[np.float64]
 
@@ -90,16 +89,12 @@ def model_crossings(reconstruction: Any, database: Path) -> Crossings:
     Raises:
         DatabaseError: the database cannot be read, or is damaged.
     """
-    posed = posed_images(reconstruction)
-    names = list(posed)
-    images = [posed[names[k]] for k in natural_order(names)]
+    images, gaps = images_in_time(reconstruction)
     matches, fitting = (np.zeros(len(images) + 1, np.int64) for _ in range(2))
     for i, j, fits in _fitting(images, reconstruction.cameras, database):
         for change, count in ((matches, len(fits)), (fitting, int(np.count_nonzero(fits)))):
             change[i] += count
             change[j] -= count
-    row = [(image.camera_id, PurePosixPath(image.name).parent) for image in images]
-    gaps = [k for k, (own, other) in enumerate(pairwise(row)) if own == other]
     return Crossings(
         tuple((images[k].name, images[k + 1].name) for k in gaps),
         np.cumsum(matches)[gaps],

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.names import natural_order
+from colmap_av1.images.names import natural_order, video_of
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
 
 # Two views of a point say nothing of how far one of them is from a third.
@@ -122,9 +121,7 @@ def model_joints(reconstruction: Any) -> Joints:
     Args:
         reconstruction: pycolmap.Reconstruction.
     """
-    posed = posed_images(reconstruction)
-    names = list(posed)
-    images = [posed[names[k]] for k in natural_order(names)]
+    images, joints = images_in_time(reconstruction)
     views, point, xyz = _seen_points(reconstruction, images)
     num_images, num_joints = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))
@@ -151,14 +148,25 @@ def model_joints(reconstruction: Any) -> Joints:
     deep = deep_from < num_images
     before = between(deep_from[deep], np.full(np.count_nonzero(deep), num_images))
     after = between(np.zeros(np.count_nonzero(deep), np.int64), deep_to[deep] + 1)
-    row = [(image.camera_id, PurePosixPath(image.name).parent) for image in images]
-    joints = [k for k, (own, other) in enumerate(pairwise(row)) if own == other]
     return Joints(
         tuple((images[k].name, images[k + 1].name) for k in joints),
         num_points=between(views[near], views[near + 1])[joints],
         num_scaled=between(deep_from, deep_to + 1)[joints],
         num_deep=np.minimum(before, after)[joints],
     )
+
+
+def images_in_time(reconstruction: Any) -> tuple[list[ModelImage], list[int]]:
+    """The images of a pycolmap.Reconstruction with a pose, in the natural order of their names.
+
+    Returns:
+        The images, and indices of those whose next one is a neighbour in time, see `video_of`.
+    """
+    posed = posed_images(reconstruction)
+    names = list(posed)
+    images = [posed[names[k]] for k in natural_order(names)]
+    videos = [video_of(image.camera_id, image.name) for image in images]
+    return images, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
 
 
 def _seen_points(
