@@ -50,7 +50,7 @@ def decode_frames(
     video = read_video(video, operating_point)
     how = display if display is not None else video.display
     decoded = _decoded(video, operating_point, num_threads, wanted)
-    if kept is not None and wanted is not None:
+    if kept is not None and wanted:
         decoded = kept.of(wanted, decoded)
     with closing(decoded):
         for index, stored in decoded:

@@ -131,3 +131,10 @@ def test_no_time_goes_into_decoding_again(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("colmap_av1.video.decoding.decode", lambda *_: pytest.fail("decoded"))
     again = decode_frames(SCENE, wanted=WANTED[1:3], kept=kept)
     assert [frame for frame, _ in again] == WANTED[1:3]
+
+
+def test_none_are_given_where_none_are_wanted(tmp_path: Path) -> None:
+    kept = KeptPictures(tmp_path / "pictures.raw")
+    for _ in range(2):
+        assert list(decode_frames(SCENE, wanted=[], kept=kept)) == []
+        assert len(list(decode_frames(SCENE, wanted=[1], kept=kept))) == 1
