@@ -237,36 +237,44 @@ def build_scene() -> Scene:
     return Scene(tuple(surfaces), _camera_path())
 
 
+def unsteady(seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Steps and hand tremor at some times: of amplitude 1, at most 1.6."""
+    total = np.zeros_like(seconds)
+    # Faster means smaller, as in real hand-held footage.
+    for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
+        phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
+        total += share * np.sin(2 * math.pi * hertz * detune * seconds + phase)
+    return total
+
+
+def hand_held(seconds: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """What a hand adds to a camera's way: shifts in metres and rotation vectors, each [n, 3]."""
+    shift = [size * unsteady(seconds, rng) for size in (0.020, 0.015, 0.018)]
+    turn = [size * unsteady(seconds, rng) for size in (0.45, 0.40, 0.55)]
+    return np.stack(shift, 1), np.radians(np.stack(turn, 1))
+
+
+def look(centre: FloatArray, target: FloatArray, turn: FloatArray) -> FloatArray:
+    """Pose [3, 4] of an upright camera that looks at a target, but for a rotation vector."""
+    forward = target - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = cv2.Rodrigues(turn)[0] @ np.stack([right, np.cross(forward, right), forward])
+    return np.c_[rotation, -rotation @ centre]
+
+
 def _camera_path() -> FloatArray:
     """[FRAMES, 3, 4] poses: an arc of 42 degrees walked with an unsteady hand."""
-    rng = np.random.default_rng(_SEED)
-    seconds = np.arange(FRAMES) / FPS
-
-    def wobble(amplitude: float) -> FloatArray:
-        # Steps and hand tremor: faster means smaller, as in real hand-held footage.
-        total = np.zeros(FRAMES)
-        for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
-            phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
-            total += share * np.sin(2 * math.pi * hertz * detune * seconds + phase)
-        return amplitude * total
-
     poses = np.empty((FRAMES, 3, 4))
     along = np.linspace(0, 1, FRAMES)
     angle = np.radians(-22 + 42 * (along + 0.02 * np.sin(2 * math.pi * along)))
     radius = 5.0 - 0.35 * along
-    shift = np.stack([wobble(0.020), wobble(0.015), wobble(0.018)], 1)
-    turn = np.radians(np.stack([wobble(0.45), wobble(0.40), wobble(0.55)], 1))
-    target = np.array([0.10, 0.35, 0.62])
+    shift, turn = hand_held(np.arange(FRAMES) / FPS, np.random.default_rng(_SEED))
     for k in range(FRAMES):
         orbit = np.array([math.sin(angle[k]), -math.cos(angle[k]), 0]) * radius[k]
         centre = np.array([0.1, 0.35, 1.55 + 0.22 * along[k]]) + orbit + shift[k]
-        forward = target - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        look = np.stack([right, np.cross(forward, right), forward])
-        rotation = cv2.Rodrigues(turn[k])[0] @ look
-        poses[k] = np.c_[rotation, -rotation @ centre]
+        poses[k] = look(centre, np.array([0.10, 0.35, 0.62]), turn[k])
     return poses
 
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.util.files import whole_file
 
+SCRIPT = ruler.load_render_scene()
 SIZE = (1920, 1080)
 FOCAL = 1560.0
 FPS = 30
@@ -72,20 +73,9 @@ def phone_clip(cache: Path, seconds: int) -> Path:
 
 def poses_at(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
     """[n, 3, 4] world-to-camera poses at some times: an arc walked to and fro, unsteadily."""
-    rng = np.random.default_rng(_SEED)
-
-    def wobble(amplitude: float) -> NDArray[np.float64]:
-        # Steps and hand tremor: faster means smaller, as in real hand-held footage.
-        total = np.zeros(len(seconds))
-        for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
-            phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
-            total += share * np.sin(2 * math.pi * hertz * detune * seconds + phase)
-        return amplitude * total
-
     along = (1 - np.cos(math.pi * seconds / _SWEEP)) / 2
     angle = np.radians(_ANGLES[0] + (_ANGLES[1] - _ANGLES[0]) * along)
-    shift = np.stack([wobble(0.020), wobble(0.015), wobble(0.018)], 1)
-    turn = np.radians(np.stack([wobble(0.45), wobble(0.40), wobble(0.55)], 1))
+    shift, turn = SCRIPT.hand_held(seconds, np.random.default_rng(_SEED))
     # Nearer and further with time, so that no way back is the way there.
     radius = 4.8 - 0.25 * np.sin(2 * math.pi * seconds / (2.7 * _SWEEP))
     height = 1.6 + 0.15 * np.sin(2 * math.pi * seconds / (3.3 * _SWEEP))
@@ -94,13 +84,7 @@ def poses_at(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
     for k in range(len(seconds)):
         orbit = np.array([math.sin(angle[k]), -math.cos(angle[k]), 0]) * radius[k]
         centre = np.array([0.1, 0.35, height[k]]) + orbit + shift[k]
-        forward = target - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        look = np.stack([right, np.cross(forward, right), forward])
-        rotation = cv2.Rodrigues(turn[k])[0] @ look
-        poses[k] = np.c_[rotation, -rotation @ centre]
+        poses[k] = SCRIPT.look(centre, target, turn[k])
     return poses
 
 
@@ -110,22 +94,21 @@ def true_poses(num_frames: int) -> NDArray[np.float64]:
 
 
 @functools.cache
-def _painted() -> tuple[Any, Any, list[Any]]:
-    """The module that renders, the scene at this size, and its textures."""
-    module = ruler.load_render_scene()
-    module.SUPERSAMPLE = 1
+def _painted() -> tuple[Any, list[Any]]:
+    """The scene at this size, and its textures."""
+    SCRIPT.SUPERSAMPLE = 1
     width, height = SIZE
     scene = dataclasses.replace(
-        module.build_scene(),
+        SCRIPT.build_scene(),
         **{"width": width, "height": height, "fx": FOCAL, "fy": FOCAL},
         **{"cx": width / 2, "cy": height / 2},
     )
-    return module, scene, [module._texture(scene, k) for k in range(len(scene.surfaces))]
+    return scene, [SCRIPT._texture(scene, k) for k in range(len(scene.surfaces))]
 
 
 def _picture(frame: int) -> NDArray[np.uint8]:
     """uint8 [height, width, 3] RGB of a frame: its exposure's samples, averaged, and noise."""
-    module, scene, textures = _painted()
+    scene, textures = _painted()
     times = frame / FPS + _EXPOSURE * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)
     rng = np.random.default_rng((_SEED, frame))
     total = np.zeros((scene.height, scene.width, 3), np.float32)
@@ -138,7 +121,7 @@ def _picture(frame: int) -> NDArray[np.uint8]:
             cx=scene.cx - inside[0],
             cy=scene.cy - inside[1],
         )
-        total += module.render_frame(shifted, textures, 0)
+        total += SCRIPT.render_frame(shifted, textures, 0)
     noise = rng.standard_normal(total.shape, np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), _SPREAD)
     noise *= _NOISE / noise.std()

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import resource
 import subprocess
 import sys
@@ -24,6 +23,7 @@ import numpy as np
 import pycolmap
 import render
 import room
+from clips import load_render_scene
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
 
@@ -31,25 +31,17 @@ from colmap_av1.model.colmap_model import camera_centres, posed_images, read_mod
 
 Floats = NDArray[np.float64]
 
+SCRIPT = load_render_scene()
 WIDTH, HEIGHT, FOCAL = 480, 360, 400.0
 NUM_FRAMES, RATE = 50, 25
 READ_OUTS = (0, 5, 15, 30)
 CLIPS = ("walk", "pan")
 
 
-def shake(t: Floats, seed: int) -> Floats:
-    """Steps and hand tremor: faster means smaller; of amplitude 1 at most 1.6."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros_like(t)
-    for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
-        phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
-        total += share * np.sin(2 * math.pi * hertz * detune * t + phase)
-    return total
-
-
 def poses(clip: str, t: Floats) -> Floats:
     """Poses [n, 3, 4] of a clip at times in seconds."""
-    x, y, z, yaw, pitch, roll = (shake(t, seed) for seed in range(6))
+    seeds = map(np.random.default_rng, range(6))
+    x, y, z, yaw, pitch, roll = (SCRIPT.unsteady(t, seed) for seed in seeds)
     if clip == "walk":
         centre = np.column_stack([0.9 * t - 2 + 0.02 * x, 0.02 * y - 2.2, 1.55 + 0.03 * z])
         angles = 2 + 1.4 * yaw, 1.2 * pitch - 4, 0.6 * roll
