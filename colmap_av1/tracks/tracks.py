@@ -217,6 +217,23 @@ def every_nth_track(tracks: Tracks, n: int) -> Tracks:
     return keep_observations(tracks, np.repeat(kept, np.diff(tracks.offsets)))
 
 
+def shorter_tracks(tracks: Tracks, most: int) -> Tracks:
+    """Tracks in pieces of much the same length that have so many observations at most.
+
+    Args:
+        tracks: any tracks.
+        most: observations of a piece.
+
+    Returns:
+        All observations in their former order.
+    """
+    length = np.diff(tracks.offsets)
+    piece = -(-length // -(-length // most))
+    place = np.arange(len(tracks.frame)) - np.repeat(tracks.offsets[:-1], length)
+    starts = np.flatnonzero(place % np.repeat(piece, length) == 0)
+    return replace(tracks, offsets=np.append(starts, len(tracks.frame)).astype(np.int64))
+
+
 def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
     """The tracks, cut in two wherever they pass from one of these frames to the next.
 

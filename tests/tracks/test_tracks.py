@@ -24,6 +24,8 @@ from colmap_av1.tracks.tracks import (
     in_frames_alone,
     keep_frames,
     keep_long_tracks,
+    no_tracks,
+    shorter_tracks,
 )
 
 BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32 = 0, 3, 6, 9
@@ -947,3 +949,27 @@ def test_progress_counts_coded_frames() -> None:
 def test_no_shown_frame_is_an_error() -> None:
     with pytest.raises(VideoError, match="no frame"):
         build_tracks([])
+
+
+@given(
+    lengths=st.lists(st.integers(1, 40), max_size=8),
+    most=st.integers(1, 12),
+)
+@settings(deadline=None)
+def test_shorter_tracks_hold_all_observations(lengths: list[int], most: int) -> None:
+    total = sum(lengths)
+    whole = replace(
+        no_tracks(40, (64, 64)),
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        frame=np.concatenate([np.empty(0), *(np.arange(n) for n in lengths)]).astype(np.int32),
+        xy=np.arange(2.0 * total, dtype=np.float32).reshape(-1, 2),
+        sigma=np.zeros(total, np.float32),
+        confirmed=np.ones(total, np.bool_),
+    )
+    short = shorter_tracks(whole, most)
+    assert np.isin(whole.offsets, short.offsets).all()
+    assert short.offsets[-1] == total
+    assert (np.diff(short.offsets) >= 1).all()
+    assert (np.diff(short.offsets) <= most).all()
+    assert len(short.offsets) - 1 <= sum(math.ceil(n / most) for n in lengths)
+    np.testing.assert_array_equal(short.xy, whole.xy)

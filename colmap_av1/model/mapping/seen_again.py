@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.model.coverage import PosedCamera, evenly_spread
 from colmap_av1.model.mapping.grey_pictures import GreyPictures
+from colmap_av1.model.mapping.slopes import surface_slopes
 from colmap_av1.model.triangulate import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
 
@@ -62,8 +63,8 @@ class _Patches:
         xyz: float64 [n, 3] the points.
         image: int64 [n] the image that shows what is looked for.
         ray: float64 [n, 3] unit vectors from there to them.
-        surface: float64 [n, 3, 3] three points of the surface around each, taken to face that
-            image: there they are seen at its place, `_REACH` pixels right of it, and below it.
+        surface: float64 [n, 3, 3] three points of the surface around each: in that image they are
+            seen at its place, `_REACH` pixels right of it, and below it.
         grey: uint8 [n, _KEPT, _KEPT] the picture around it there.
         fraction: float64 [n, 2] by how much its place lies off the middle of the middle pixel.
     """
@@ -105,9 +106,9 @@ def found_again(
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
     image, xy = view[points.observation], corners.xy[points.observation].astype(np.float64)
     middle = (points.offsets[:-1] + points.offsets[1:]) // 2
-    patches = _cut(points.xyz, image[middle], xy[middle], views, pictures)
     by_image = np.argsort(image, kind="stable")
     bounds = np.searchsorted(image[by_image], np.arange(len(views) + 1))
+    patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
     found = [(np.arange(len(points.xyz)), image[middle], xy[middle])]
     for number in range(len(views)):
         followed = by_image[bounds[number] : bounds[number + 1]]
@@ -144,21 +145,33 @@ def _as_tracks(
 
 
 def _cut(
-    xyz: _Floats,
+    points: TriangulatedPoints,
+    middle: _Indices,
     image: _Indices,
     xy: _Floats,
+    *,
     views: Sequence[PosedCamera],
     pictures: GreyPictures,
 ) -> _Patches:
-    """Cut out the pictures around points at some pixels of images."""
+    """Cut out the pictures around points.
+
+    Args:
+        points: the points.
+        middle: int64 [n] the observation of each at which it is cut out.
+        image: int64 [num_observations] image of each of their observations.
+        xy: float64 [num_observations, 2] pixels of these.
+        views: all images.
+        pictures: their pictures.
+    """
+    xyz, point = points.xyz, np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
     grey = np.empty((len(xyz), _KEPT, _KEPT), np.uint8)
     fraction, ray = np.empty((len(xyz), 2)), np.empty((len(xyz), 3))
     surface = np.empty((len(xyz), 3, 3))
     half, offset = _KEPT // 2, np.arange(_KEPT)
-    for number in np.unique(image).tolist():
-        own, view = np.flatnonzero(image == number), views[number]
+    for number in np.unique(image[middle]).tolist():
+        own, view = np.flatnonzero(image[middle] == number), views[number]
         scale = _scale(view, pictures.size(number))
-        at = xy[own] / scale
+        at = xy[middle[own]] / scale
         corner = np.floor(at).astype(np.int64)
         fraction[own] = at - corner - 0.5
         framed = cv2.copyMakeBorder(
@@ -168,11 +181,14 @@ def _cut(
         grey[own] = framed[y[:, :, None], x[:, None, :]]
         ray[own] = xyz[own] - view.centre
         rotation, shift = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
-        depth = (xyz[own] @ rotation.T + shift)[:, 2:]
-        for k, reach in enumerate(np.array([[0, 0], [_REACH, 0], [0, _REACH]]) * scale):
-            surface[own, k] = (view.rays(xy[own] + reach) * depth - shift) @ rotation
+        depth = xyz @ rotation[2] + shift[2]
+        shown = np.flatnonzero(image == number)
+        slope = surface_slopes(at, depth[own], xy[shown] / scale, depth[point[shown]])
+        for k, reach in enumerate(np.array([[0, 0], [_REACH, 0], [0, _REACH]])):
+            far = (depth[own] / (1 + slope @ reach))[:, None]
+            surface[own, k] = (view.rays(xy[middle[own]] + reach * scale) * far - shift) @ rotation
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    return _Patches(xyz, image, ray, surface, grey, fraction)
+    return _Patches(xyz, image[middle], ray, surface, grey, fraction)
 
 
 def _scale(view: PosedCamera, size: tuple[int, int]) -> _Floats:
