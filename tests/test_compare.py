@@ -291,6 +291,26 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     assert "frame_000030.png, photograph" in html
     assert "av1: 60.00 dB" in html
 
+    # Milestones that a command renders are in the report as those of gsplat are.
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import shutil, sys\n"
+        "for stop in sys.argv[3].split(','):\n"
+        "    shutil.copytree(sys.argv[1] + '/images', sys.argv[2] + '/' + stop)\n"
+        "open(sys.argv[2] + '/times.csv', 'w').write('iterations,seconds\\n3,1.5\\n7,4\\n')\n"
+    )
+    command = f"{sys.executable} {script} {{test}} {{renders}} {{milestones}} {{data}}"
+    on_the_way = replace(options, trainer=command, milestones=(3, 9))
+    (column,) = compare(video, output, reference=truth, options=on_the_way).columns
+    assert [(state.iteration, state.seconds) for state in column.training.states] == [
+        (3, 1.5),
+        (7, 4),
+    ]
+    assert "<th>3 iterations</th>" in (output / "report.html").read_text()
+    text = (output / "report.md").read_text()
+    assert "| av1 | 60.00 / inf / 9" in text
+    assert "](pictures/training.svg)" in text
+
     # What fails leaves its line, and figures of the clouds.
     refused = {
         "false {data}": f"the trainer ended with status 1: see {log}",

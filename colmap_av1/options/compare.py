@@ -15,7 +15,10 @@ from colmap_av1.options.model import TriangulateOptions
 
 # The trainer that is built in; others are commands with these placeholders.
 GSPLAT = "gsplat"
-PLACEHOLDERS = ("data", "test", "gaussians", "output", "renders", "iterations", "name")
+PLACEHOLDERS = (
+    *("data", "test", "gaussians", "output", "renders"),
+    *("iterations", "milestones", "name"),
+)
 # Programs that run the word after -c.
 _SHELL = re.compile(r"(.*/)?((ba|da|k|z)?sh|python[0-9.]*)")
 # Words that only a shell understands.
@@ -76,14 +79,16 @@ class CompareOptions(Options):
         "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a "
         "command with {data}, the folder of that half, and as needed {test}, that of the other "
         "half, {gaussians}, a .ply of initial Gaussians of the points, {output}, {renders}, which "
-        "receives the renderings of the test images, {iterations} and {name}; a shell reads it "
-        "only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
+        "receives the renderings of the test images, {iterations}, {milestones}, as in 1000,3000, "
+        "after each of which it then renders into {renders}/1000 and so on, and {name}; a shell "
+        "reads it only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
         common=True,
     )
     iterations: int = option(30_000, "iterations of the training", least=1)
     milestones: tuple[int, ...] = option(
         (1000, 3000, 7000, 15_000),
-        "iterations after which gsplat's renderings are measured as well",
+        "iterations after which renderings are measured as well, of gsplat or of a command with "
+        "{milestones}",
         least=1,
     )
     split: bool = option(False, "write the two halves even where nothing is trained")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from colmap_av1.evaluate.metrics.renderings import RenderingMetrics
 from colmap_av1.evaluate.training import splatting
 from colmap_av1.evaluate.training.splatting import (
     Milestone,
+    quality_after,
     share_of_time,
     split_images,
     train_gaussians,
@@ -92,6 +94,19 @@ def test_share_of_time() -> None:
     assert share_of_time(quick, baseline) == 15 / 40
     assert share_of_time([milestone(1, 8, 25)], baseline) == 0.2
     assert share_of_time([milestone(1, 8, 24.9)], baseline) is None
+    # VMAF has the same figures here, and is its own question.
+    assert share_of_time(quick, baseline, "vmaf") == 15 / 40
+    assert share_of_time([milestone(1, math.nan, 26)], baseline) is None
+    assert share_of_time(quick, [milestone(1, math.nan, 25)]) is None
+
+
+def test_quality_after_seconds() -> None:
+    milestones = [milestone(1, 10, 20), milestone(2, 40, 26)]
+    assert quality_after(milestones, 9.9) is None
+    found = [quality_after(milestones, seconds) for seconds in (10, 25, 40, 99)]
+    assert found == [20, 23, 26, 26]
+    assert quality_after([milestone(1, math.nan, 20)], 10) is None
+    assert quality_after([], 10) is None
 
 
 def test_scene_is_the_model(scene: tuple[Path, Path], tmp_path: Path) -> None:

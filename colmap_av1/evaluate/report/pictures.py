@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -168,22 +169,29 @@ def _add_legend(axis: Any, **how: Any) -> None:
 
 
 def training_chart(columns: Sequence[Column]) -> bytes | None:
-    """Curves of the renderings' PSNR-Y over the training's time, as SVG; None without any."""
+    """Curves of the renderings' PSNR-Y and VMAF over the training's time, as SVG; None without any.
+
+    Where a trainer does not tell the time, they are over its iterations.
+    """
     colours = colours_of([c.name for c in columns])
     trained = [(c.name, c.training.states) for c in columns if c.training and c.training.states]
     if not trained:
         return None
+    is_timed = all(math.isfinite(state.seconds) for _, states in trained for state in states)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10, 3.4), layout="constrained")
-        axis: Any = figure.subplots()
-        for name, states in trained:
-            quality = [float(state.metrics.psnr_y.mean()) for state in states]
-            seconds = [state.seconds for state in states]
-            axis.plot(seconds, quality, marker="o", color=colours[name], label=name)
-        axis.set_xlabel("seconds of training")
-        axis.set_title("PSNR-Y of the test images, dB", loc="left", fontsize=9)
-        axis.grid(alpha=0.25)
-        _add_legend(axis)
+        axes: Any = figure.subplots(1, 2)
+        for axis, quality, label in zip(
+            axes, ("psnr_y", "vmaf"), ("PSNR-Y of the test images, dB", "VMAF"), strict=True
+        ):
+            for name, states in trained:
+                values = [state.mean(quality) for state in states]
+                along = [state.seconds if is_timed else state.iteration for state in states]
+                axis.plot(along, values, marker="o", color=colours[name], label=name)
+            axis.set_xlabel("seconds of training" if is_timed else "iterations")
+            axis.set_title(label, loc="left", fontsize=9)
+            axis.grid(alpha=0.25)
+        _add_legend(axes[1], loc="lower right")
         return _svg(figure)
 
 

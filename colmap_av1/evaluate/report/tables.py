@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_av1.evaluate.report.results import Column, CompareReport
-from colmap_av1.evaluate.training.splatting import share_of_time
+from colmap_av1.evaluate.training.splatting import Milestone, quality_after, share_of_time
 
-# What the others' figures are shares of.
+# What the others' figures are shares of; of trainings, the first that was trained on.
 BASELINE = "sift-exhaustive"
+_TRAINING_BASELINES = (BASELINE, "sift-sequential")
+_QUALITIES = {"psnr_y": ".2f", "ssim_db": ".2f", "vmaf": ".1f"}
 _NONE = "-"
 _LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
 
@@ -153,8 +155,9 @@ def lengths_table(columns: Sequence[Column]) -> Table:
 def renderings_table(columns: Sequence[Column]) -> Table:
     """Renderings of trained Gaussians."""
     header = ["front-end", "PSNR-Y, dB", "SSIM, dB", "LPIPS", "VMAF", "Q", "difference of Q"]
-    header += ["Gaussians", "training, s", "share of the baseline's time"]
-    base = next((c.training for c in columns if c.name == BASELINE), None)
+    header += ["Gaussians", "training, s", "baseline's PSNR-Y after", "its VMAF after"]
+    baseline = _training_baseline(columns)
+    base = () if baseline is None or baseline.training is None else baseline.training.states
     rows = []
     words = ""
     for column in columns:
@@ -167,20 +170,68 @@ def renderings_table(columns: Sequence[Column]) -> Table:
         row.append(f"{metrics.lpips.mean():.3f}" if metrics.lpips is not None else _NONE)
         row += [f"{metrics.vmaf.mean():.2f}", f"{metrics.sharpness.mean():.2f}"]
         row.append(f"{metrics.sharpness_difference.mean():.2f}")
-        row.append(f"{training.states[-1].num_gaussians:,}" if training.states else _NONE)
+        count = training.states[-1].num_gaussians if training.states else None
+        row.append(f"{count:,}" if count is not None else _NONE)
         row.append(f"{training.seconds:.0f}")
-        share = None
-        if base is not None and base.states and training.states:
-            share = share_of_time(training.states, base.states)
-        row.append(f"{share:.0%}" if share is not None else _NONE)
+        for quality in ("psnr_y", "vmaf"):
+            share = share_of_time(training.states, base, quality) if base else None
+            row.append(f"{share:.0%}" if share is not None else _NONE)
         rows.append(row)
         words = metrics.no_lpips or words
     about = (
         "Means over the test images, which are the odd ones; trained on the even ones. Q: Zhu and "
-        "Milanfar's measure of sharpness, and its absolute difference to that of the photograph. "
-        f"The baseline is {BASELINE}: when its last PSNR-Y is reached."
+        "Milanfar's measure of sharpness, and its absolute difference to that of the photograph."
     )
+    if base and baseline is not None:
+        about += (
+            f" The baseline is {baseline.name}: the time until its last PSNR-Y and VMAF are "
+            "reached, as a share of that of its training."
+        )
     return Table("Renderings", f"{about} No LPIPS: {words}." if words else about, header, rows)
+
+
+def _training_baseline(columns: Sequence[Column]) -> Column | None:
+    """The column that other trainings are held against; None where none of them is there."""
+    trained = {column.name: column for column in columns if column.training is not None}
+    return next((trained[name] for name in _TRAINING_BASELINES if name in trained), None)
+
+
+def milestones_table(columns: Sequence[Column]) -> Table | None:
+    """Renderings after fixed numbers of iterations and of seconds; None without milestones."""
+    trained = [(c.name, c.training.states) for c in columns if c.training and c.training.states]
+    if not trained:
+        return None
+    stops = sorted({state.iteration for _, states in trained for state in states})
+    baseline = _training_baseline(columns)
+    base = () if baseline is None or baseline.training is None else baseline.training.states
+    times = [state.seconds for state in base if math.isfinite(state.seconds)]
+    header = ["front-end", *(f"{stop:,} iterations" for stop in stops)]
+    header += [f"{seconds:,.0f} s" for seconds in times]
+    rows = []
+    for name, states in trained:
+        at = {state.iteration: state for state in states}
+        row = [name, *(_qualities_cell(at.get(stop)) for stop in stops)]
+        rows.append(row + [_qualities_cell_after(states, seconds) for seconds in times])
+    about = "PSNR-Y in dB / SSIM in dB / VMAF, means over the test images."
+    if times and baseline is not None:
+        about += (
+            f" The seconds of training are those of {baseline.name}'s milestones; between its own "
+            "a training counts as rising evenly."
+        )
+    return Table("Renderings on the way", about, header, rows)
+
+
+def _qualities_cell(state: Milestone | None) -> str:
+    if state is None:
+        return _NONE
+    return " / ".join(f"{state.mean(name):{spelling}}" for name, spelling in _QUALITIES.items())
+
+
+def _qualities_cell_after(states: Sequence[Milestone], seconds: float) -> str:
+    found = {name: quality_after(states, seconds, name) for name in _QUALITIES}
+    if any(value is None for value in found.values()):
+        return _NONE
+    return " / ".join(f"{value:{_QUALITIES[name]}}" for name, value in found.items())
 
 
 def _number(value: float) -> str:

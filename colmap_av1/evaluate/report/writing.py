@@ -33,6 +33,7 @@ from colmap_av1.evaluate.report.tables import (
     Table,
     cost_table,
     lengths_table,
+    milestones_table,
     models_table,
     renderings_table,
 )
@@ -109,6 +110,9 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     tables["lengths"] = lengths_table(report.columns)
     if any(column.training is not None for column in report.columns):
         tables["renderings"] = renderings_table(report.columns)
+    on_the_way = milestones_table(report.columns)
+    if on_the_way is not None:
+        tables["milestones"] = on_the_way
     _write(report.output / "report.md", _markdown(report, tables, figures).encode())
     _write(report.output / "report.html", _html(report, tables, figures).encode())
     _write(report.output / "results.json", _json(report).encode())
@@ -260,7 +264,8 @@ def _markdown(
     for figure in (*views, *plans):
         parts += [figure.caption, "", picture(figure), ""]
     if "renderings" in tables:
-        parts += table(tables["renderings"])
+        for kind in ("renderings", "milestones"):
+            parts += table(tables[kind]) if kind in tables else []
         for figure in (*figures.get("training", []), *figures["crops"]):
             parts += [figure.caption, "", picture(figure), ""]
     parts += [*table(tables["lengths"]), picture(figures["lengths"][0]), ""]
@@ -299,8 +304,9 @@ def _html(
 
     renderings = ""
     if "renderings" in tables:
-        renderings = table("renderings") + "".join(map(chart, figures.get("training", [])))
-        renderings += grid("crop")
+        renderings = table("renderings")
+        renderings += table("milestones") if "milestones" in tables else ""
+        renderings += "".join(map(chart, figures.get("training", []))) + grid("crop")
     title = html.escape(f"Front-ends compared on {report.video.name}")
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in _notes(report))
     versions = ", ".join(f"{name} {number}" for name, number in _versions().items())

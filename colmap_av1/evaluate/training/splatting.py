@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -32,15 +33,20 @@ class Milestone:
 
     Attributes:
         iteration: iterations done.
-        seconds: time spent training until then, rendering of test images not counted.
-        num_gaussians: Gaussians.
+        seconds: time spent training until then, rendering of test images not counted; NaN where
+            the trainer does not tell.
+        num_gaussians: Gaussians; None likewise.
         metrics: of the renderings of the test images.
     """
 
     iteration: int
     seconds: float
-    num_gaussians: int
+    num_gaussians: int | None
     metrics: RenderingMetrics
+
+    def mean(self, quality: str) -> float:
+        """Mean over the images of one of the `RenderingMetrics`."""
+        return float(getattr(self.metrics, quality).mean())
 
 
 def split_images(names: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -108,15 +114,25 @@ def train_gaussians(
     return done
 
 
-def share_of_time(milestones: Sequence[Milestone], baseline: Sequence[Milestone]) -> float | None:
-    """Time until the baseline's final PSNR-Y is reached, as a share of the baseline's time.
+def share_of_time(
+    milestones: Sequence[Milestone], baseline: Sequence[Milestone], quality: str = "psnr_y"
+) -> float | None:
+    """Time until the baseline's final quality is reached, as a share of the baseline's time.
 
-    Between milestones it counts as rising evenly. None where it is never reached.
+    Between milestones it counts as rising evenly. None where it is never reached, or a time is not
+    known.
+
+    Args:
+        milestones: of a training, in order.
+        baseline: of the training whose end it is held against.
+        quality: which of `RenderingMetrics`, its mean over the images.
     """
-    goal = float(baseline[-1].metrics.psnr_y.mean())
+    if any(math.isnan(milestone.seconds) for milestone in (*milestones, baseline[-1])):
+        return None
+    goal = baseline[-1].mean(quality)
     before: tuple[float, float] | None = None
     for milestone in milestones:
-        now = milestone.seconds, float(milestone.metrics.psnr_y.mean())
+        now = milestone.seconds, milestone.mean(quality)
         if now[1] >= goal:
             seconds = now[0]
             if before is not None:
@@ -125,6 +141,20 @@ def share_of_time(milestones: Sequence[Milestone], baseline: Sequence[Milestone]
             return seconds / baseline[-1].seconds
         before = now
     return None
+
+
+def quality_after(
+    milestones: Sequence[Milestone], seconds: float, quality: str = "psnr_y"
+) -> float | None:
+    """Quality after so many seconds of training, as `share_of_time` has it between milestones.
+
+    What was complete by then counts as it ended. None before the first milestone, or where a time
+    is not known.
+    """
+    times = [milestone.seconds for milestone in milestones]
+    if not times or any(math.isnan(time) for time in times) or seconds < times[0]:
+        return None
+    return float(np.interp(seconds, times, [m.mean(quality) for m in milestones]))
 
 
 def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import math
 import os
 import re
 import shutil
@@ -28,6 +30,8 @@ from colmap_av1.util.stages import run_stage_in
 
 # What it says about a training; an upgrade of the rest repeats none.
 _CODE = ("evaluate/training", "evaluate/metrics")
+# What a command tells of its milestones, beside their renderings.
+_TIMES = "times.csv"
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
 
@@ -57,7 +61,8 @@ class Training:
 
     Attributes:
         seconds: wall time of the training.
-        states: milestones of the training, the last at its end; empty for other trainers.
+        states: milestones of the training, the last at its end; empty for commands without
+            `{milestones}`.
         names: the test images.
         references: the picture of each.
         renders: its rendering.
@@ -142,12 +147,15 @@ def train(
         trainer: "gsplat", or a command, see `words_of_trainer`: `{data}` and `{test}` are the
             halves, `{gaussians}` a file of initial Gaussians of the points as the first half sees
             them, `{output}` an empty folder, `{renders}` the one that gets the renderings of the
-            test images, `{iterations}` and `{name}` what they say.
+            test images, `{iterations}` and `{name}` what they say. With `{milestones}`, those and
+            the last iteration, it renders into a folder of `{renders}` for each, named by its
+            number; `times.csv` beside these may tell of each its `iterations`, `seconds` of
+            training until then and number of `gaussians`.
         split: the data.
         folder: gets `output/`, `renders/`, `log.txt` and the figures.
         name: the column.
         iterations: how many.
-        milestones: iterations after which gsplat's test images are rendered, too.
+        milestones: iterations after which the test images are rendered, too.
 
     Raises:
         ColmapAv1Error: the trainer failed, or rendered no test images.
@@ -155,13 +163,14 @@ def train(
     renders, references = folder / "renders", split.references
     inputs = [p for part in ("sparse/0", "images") for p in (split.data / part).rglob("*")]
     given = [file_digest(path) for path in sorted(inputs) if path.is_file()]
+    names = [reference.name for reference in references]
+    stops = tuple(sorted({stop for stop in milestones if stop < iterations}))
     if trainer == GSPLAT:
-        stops = tuple(stop for stop in milestones if stop < iterations)
         seconds, states = _kept_gsplat(split, folder, (given, iterations, stops))
         last = folder / "output" / str(iterations)
         files = [last / f"{reference.stem}.png" for reference in references]
-        metrics = states[-1].metrics
-        return Training(seconds, states, [r.name for r in references], references, files, metrics)
+        return Training(seconds, states, names, references, files, states[-1].metrics)
+    stops = (*stops, iterations) if "{milestones}" in trainer else ()
 
     def make() -> dict[str, Any]:
         for path in (folder / "output", renders):
@@ -176,19 +185,26 @@ def train(
             "output": (folder / "output").resolve(),
             "renders": renders.resolve(),
             "iterations": iterations,
+            "milestones": ",".join(map(str, stops)),
             "name": name,
         }
         command = [word.format(**values) for word in words_of_trainer(trainer)]
         measured = run_measured(_run, command, folder / "log.txt", log=folder / "log.txt")
-        match_renders(renders, references)  # refuses others before they are kept
-        return {"seconds": measured.seconds}
+        if not stops:
+            match_renders(renders, references)  # refuses others before they are kept
+        states = [_plain(state) for state in _states(renders, stops, references)]
+        return {"seconds": measured.seconds, "states": states}
 
-    depends_on = (trainer, given, iterations)
+    depends_on = (trainer, given, iterations, stops)
     finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
+    states = tuple(_milestone(state) for state in finished.facts["states"])
+    last = renders / str(iterations) if states else renders
+    files = match_renders(last, references)
+    metrics = states[-1].metrics if states else rendering_metrics(files, references)
     seconds = finished.facts["seconds"]
-    files = match_renders(renders, references)
-    metrics = rendering_metrics(files, references)
-    return Training(seconds, (), [r.name for r in references], references, files, metrics)
+    if states and not math.isnan(states[-1].seconds):
+        seconds = states[-1].seconds
+    return Training(seconds, states, names, references, files, metrics)
 
 
 def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
@@ -207,6 +223,49 @@ def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
         f"{folder}: holds {len(found)} renderings for {len(references)} test images: let the "
         "trainer's command write one for each into {renders}"
     )
+
+
+def _states(renders: Path, stops: Sequence[int], references: Sequence[Path]) -> list[Milestone]:
+    """The milestones that a command rendered, with what it tells of them.
+
+    Raises:
+        EvaluationError: renderings are missing, or `times.csv` is not what it should be.
+    """
+    told = _read_times(renders / _TIMES) if stops else {}
+    states = []
+    for stop in stops:
+        files = match_renders(renders / str(stop), references)
+        seconds, gaussians = told.get(stop, (math.nan, None))
+        states.append(Milestone(stop, seconds, gaussians, rendering_metrics(files, references)))
+    return states
+
+
+def _read_times(path: Path) -> dict[int, tuple[float, int | None]]:
+    """Seconds and number of Gaussians by iterations; nothing where there is no file."""
+    if not path.is_file():
+        return {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return {
+                int(row["iterations"]): (
+                    _positive(row["seconds"]),
+                    int(row["gaussians"]) if row.get("gaussians") else None,
+                )
+                for row in csv.DictReader(file)
+            }
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise EvaluationError(
+            f"{path}: cannot be read: let the trainer's command write a line "
+            "'iterations,seconds' or 'iterations,seconds,gaussians', then a line of numbers for "
+            "each milestone"
+        ) from error
+
+
+def _positive(word: str) -> float:
+    value = float(word)
+    if not 0 < value < math.inf:
+        raise ValueError(word)
+    return value
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
