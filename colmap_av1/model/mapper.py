@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +142,7 @@ def adjust_model(
     model: Path,
     *,
     refine_intrinsics: bool,
-    loss_scale: float,
+    loss_scales: Sequence[float],
     seed: int,
     num_threads: int,
     log: Path,
@@ -152,8 +152,9 @@ def adjust_model(
     Args:
         model: folder of a COLMAP model.
         refine_intrinsics: refine focal length and distortion.
-        loss_scale: reprojection error in pixels from which on an observation counts less
-            (Cauchy's loss).
+        loss_scales: reprojection errors in pixels from which on an observation counts less
+            (Cauchy's loss), of one adjustment after another: with a small one alone, images that
+            are off by much more hardly move.
         seed: the random seed.
         num_threads: threads; the result is the same from run to run with one only.
         log: file that gets what COLMAP prints.
@@ -165,7 +166,7 @@ def adjust_model(
         "task": "adjustment",
         "model": str(model),
         "refine_intrinsics": refine_intrinsics,
-        "loss_scale": loss_scale,
+        "loss_scales": list(loss_scales),
         "seed": seed,
         "num_threads": num_threads,
         "max_num_iterations": _ADJUSTMENT_STEPS,

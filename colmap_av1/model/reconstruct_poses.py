@@ -49,11 +49,12 @@ _FEW_TRACKS = 100
 # up to twice the time, to the same poses. What links images is short, and all of it is needed.
 _START_TRACKS = 400
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
-# of them come to 0.3 or 0.4 at most, those beyond have drifted.
+# of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
+# end of a video, say, the mapper may leave images that are off by more with all they see.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
-_LOSS_SCALE = 0.25
+_LOSS_SCALES = (1.0, 0.25)
 # Beside corners, one in so many of them: each is less exact, and all may be off one way. They
 # drift, by three times as much over twenty images as over three, and bend what corners hold
 # straight: so they are cut to pieces of so many images.
@@ -317,7 +318,7 @@ def adjustment_stage(
             adjust_model(
                 folder,
                 refine_intrinsics=refine,
-                loss_scale=_LOSS_SCALE,
+                loss_scales=_LOSS_SCALES,
                 seed=options.match.run.seed,
                 num_threads=options.mapping.mapper_threads,
                 log=run.stages / "adjustment.log",
@@ -332,7 +333,7 @@ def adjustment_stage(
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
-    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALE, refine, *how)
+    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALES, refine, *how)
     return run_stage(
         run.stages,
         "adjustment",

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from dense_scene import NUM_IMAGES, Truth
+from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
@@ -100,7 +101,7 @@ def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path:
     mapper_module.adjust_model(
         tmp_path,
         refine_intrinsics=False,
-        loss_scale=0.5,
+        loss_scales=(0.5,),
         seed=0,
         num_threads=1,
         log=tmp_path / "log",
@@ -113,6 +114,41 @@ def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path:
     assert errors.rotation < min(bent.rotation / 3, before.rotation + 0.05)
     assert errors.ate < min(bent.ate / 3, before.ate * 1.5)
     assert adjusted.cameras[1].mean_focal_length() == focal_length
+
+
+def test_the_end_of_a_video_bends_back(
+    made: ReconstructReport, truth: Truth, tmp_path: Path
+) -> None:
+    """The last images are off together with what they see: only points at the joint tell."""
+    model = read_model(made.output / ".stages" / "adjusted")
+    for number, point in list(model.points3D.items()):
+        if point.track.length() > 6:
+            model.delete_point3D(number)
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    last = {image.image_id for image in images[-6:]}
+    joint = images[-7].projection_center()
+    turn = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    bent = pycolmap.Sim3d(1.5, pycolmap.Rotation3d(turn), joint - 1.5 * turn @ joint)
+    for point in model.points3D.values():
+        if np.mean([element.image_id in last for element in point.track.elements]) > 0.5:
+            point.xyz = bent * point.xyz
+    for image in images[-6:]:
+        centre = bent * image.projection_center()
+        rotation = image.frame.rig_from_world.rotation.matrix() @ turn.T
+        image.frame.rig_from_world = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(rotation), -rotation @ centre
+        )
+    before = model_poses(model, 60)
+    errors = {}
+    for scales in ((0.25,), (1.0, 0.25)):
+        model.write_binary(tmp_path)
+        how = {"refine_intrinsics": False, "seed": 0, "num_threads": 1, "log": tmp_path / "log"}
+        mapper_module.adjust_model(tmp_path, loss_scales=scales, **how)
+        poses = model_poses(read_model(tmp_path), 60)
+        errors[scales] = pose_errors(poses, truth.cam_from_world).ate
+    assert pose_errors(before, truth.cam_from_world).ate > 0.08
+    assert errors[1.0, 0.25] < 0.003
+    assert errors[0.25,] > 10 * errors[1.0, 0.25]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
@@ -128,7 +164,7 @@ def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
             mapper_module.adjust_model(
                 tmp_path / "model",
                 refine_intrinsics=False,
-                loss_scale=0.5,
+                loss_scales=(0.5,),
                 seed=0,
                 num_threads=1,
                 log=tmp_path / "log",

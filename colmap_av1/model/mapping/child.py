@@ -90,11 +90,12 @@ def _adjust(settings: dict[str, Any]) -> None:
     options.refine_focal_length = settings["refine_intrinsics"]
     options.refine_extra_params = settings["refine_intrinsics"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = settings["loss_scale"]
     options.ceres.max_num_images_direct_dense_cpu_solver = settings["most_dense_images"]
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]
     solver.function_tolerance = settings["function_tolerance"]
-    pycolmap.bundle_adjustment(model, options)
+    for scale in settings["loss_scales"]:
+        options.ceres.loss_function_scale = scale
+        pycolmap.bundle_adjustment(model, options)
     model.write_binary(settings["model"])
