@@ -140,6 +140,26 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
     return Made(placed, views, np.array(moves))
 
 
+def test_points_lie_in_cells_of_very_wide_pictures() -> None:
+    width, cell, columns = 40_000, 16, [1, 1000, 2047, 2048, 2499]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=64, params=[100, 100, 0, 32])
+    views = [PosedCamera(camera, np.eye(4)[:3]) for _ in range(2)]
+    one, first = np.ones(5), np.zeros(5, np.int64)
+    x = (np.array(columns) + 0.5) * cell
+    xyz = np.column_stack([x / 100, 0 * one, one])
+    # The first image sees each of them all the time, the other one shows where they should be.
+    length = 6
+    track = np.repeat(np.arange(5), length)
+    column = (x // cell).astype(np.int64)[track]
+    placed = PlacedTracks(
+        *((2, 4, width // cell), cell, np.arange(0, 31, length), track, first[track]),
+        *(0 * column + 2, column, one[track], 0 * one, xyz),
+    )
+    unseen = Contradictions(placed, views).unseen(np.zeros(5, np.bool_))
+    assert not unseen[0].any()
+    assert np.argwhere(unseen[1]).tolist() == [[2, k] for k in columns]
+
+
 # Along the epipolar lines against the camera and faster than it, towards it, and upwards.
 WALKS = [(-0.05, 0, 0), (0.13, 0, 0), (-0.01, 0, -0.06), (0, -0.03, 0)]
 

@@ -232,8 +232,8 @@ class Contradictions:
         is_seen = np.zeros(len(placed.xyz), np.bool_)
         is_seen[placed.track[rows]] = True
         unseen = np.flatnonzero(~is_seen[track])
-        # Whole pixels first: NumPy divides these many times as fast.
-        cell = xy[unseen].astype(np.int16) // np.int16(placed.cell)
+        # Whole pixels first: NumPy divides these many times as fast. There are up to 65,536.
+        cell = (xy[unseen].astype(np.int32) // np.int32(placed.cell)).astype(np.int16)
         own = track[unseen].astype(np.int32)
         return _Shown(own, cell[:, 1], cell[:, 0], depth[unseen].astype(np.float32))
 
