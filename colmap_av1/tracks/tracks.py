@@ -15,6 +15,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.util.arguments import checks_arguments
+from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.video.display import Display, shown_points, shown_size
 
 # Width in pixels of the squares that motion is coded for.
@@ -111,6 +112,7 @@ def build_tracks(
         if progress is not None:
             progress(count)
     num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
+    give_back_free_memory()  # what was needed to build the tracks, as much as they are
     if num_frames == 0:
         raise VideoError("the video shows no frame: give a video with at least one picture")
     confirmed = np.zeros(len(frame_index), dtype=np.bool_)

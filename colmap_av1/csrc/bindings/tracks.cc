@@ -6,10 +6,6 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
-#ifdef __GLIBC__
-#include <malloc.h>
-#endif
-
 #include <cstddef>
 #include <cstdint>
 #include <utility>
@@ -41,10 +37,6 @@ nb::tuple finish(TrackBuilder& builder) {
   {
     const nb::gil_scoped_release release;
     arrays = builder.finish();
-#ifdef __GLIBC__
-    // What was needed to build the tracks, as much as they are, would stay with the process.
-    malloc_trim(0);
-#endif
   }
   const std::size_t observations = arrays.frame.size();
   return nb::make_tuple(arrays.num_frames, arrays.width, arrays.height,
