@@ -284,7 +284,7 @@ def _write_frames(
     queue: list[Future[None]] = []
     num_taken = 0
     last = max(wanted)
-    # OpenCV releases the interpreter lock while it compresses.
+    # OpenCV and ISA-L release the interpreter lock while they compress.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
             for index, picture in decoded:
