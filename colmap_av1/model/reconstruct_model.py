@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,6 @@ from colmap_av1.model.undistort import (
     undistortion,
 )
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
@@ -91,25 +90,6 @@ def _undistortions(placed: PosedImages, views: Sequence[PosedCamera]) -> list[Un
 
 def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:
     return how(picture) if how is not None else picture
-
-
-def _pictures(run: Run, placed: PosedImages) -> Iterator[tuple[int, _Image]]:
-    """The pictures of the images as they were taken, by index."""
-    for take in np.unique(placed.take).tolist():
-        own = np.flatnonzero(placed.take == take)
-        if take >= len(run.sources):
-            yield int(own[0]), read_image(run.inputs.photos[take - len(run.sources)].path)
-            continue
-        first = int(placed.first_frame[take])
-        image_of = {int(placed.frames[i]) - first: int(i) for i in own}
-        decoded = decodable_frames(
-            *(run.sources[take].pictures, max(image_of) + 1, run.options.match),
-            wanted=image_of,
-            use="colours are looked at",
-            kept=run.sources[take].kept,
-        )
-        for frame, picture in decoded:
-            yield image_of[frame], picture
 
 
 def _written_images(
@@ -188,10 +168,12 @@ def _written_cloud(
 
 def _looked_at(
     run: Run,
+    takes: Takes,
     placed: PosedImages,
     views: Sequence[PosedCamera],
-    undistort: Sequence[Undistortion | None],
     cloud: ModelPoints,
+    *,
+    undistort: Sequence[Undistortion | None],
 ) -> tuple[FarViews, ModelPoints]:
     """How far views from far apart disagree in the images, and the points in their colours.
 
@@ -200,8 +182,11 @@ def _looked_at(
     far = FarViewCheck(placed.images, _pinholes(views), lambda image: points_seen(cloud, image))
     colours = Colours(cloud, [view.size for view in views])
     compared = set(far.wanted)
+    places = np.searchsorted(takes.images.frames, placed.frames).tolist()
+    index_of = {place: index for index, place in enumerate(places)}
     with run.clock.measure("colours"):
-        for done, (index, picture) in enumerate(_pictures(run, placed), start=1):
+        for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
+            index = index_of[place]
             colours.add(index, picture, undistort[index])
             if index in compared:
                 far.add(index, _undistorted(picture, undistort[index]), views[index].mask)
@@ -263,7 +248,7 @@ def model_stage(
         check_unchanged(*run.files)
         with clock.measure("coverage"):
             covered = coverage(views, cloud.xyz)
-        far_views, cloud = _looked_at(run, placed, views, undistort, cloud)
+        far_views, cloud = _looked_at(run, takes, placed, views, cloud, undistort=undistort)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
