@@ -28,7 +28,6 @@ Rows = list[tuple[str, str]]
 # Rarer reference distances are summed up.
 _LEAST_LISTED_SHARE = 0.005
 _NUM_LISTED_GAPS = 4
-_NOT_KEPT = "converted and not kept, see --keep_stream"
 
 
 def match_rows(report: MatchReport) -> Rows:
@@ -77,7 +76,7 @@ def map_rows(report: MapReport) -> Rows:
         ("focal length", f"{figures.focal_length:.2f} px"),
     ]
     if report.far_views is not None:
-        rows += far_view_rows(report.far_views.median, report.far_views.largest)
+        rows += _far_view_rows(report.far_views.median, report.far_views.largest)
     rows += _place_rows(report.place)
     if len(report.num_registered) > 1:
         others = ", ".join(map(str, report.num_registered[1:]))
@@ -108,7 +107,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
-        *far_view_rows(report.far_views, report.far_views_largest),
+        *_far_view_rows(report.far_views, report.far_views_largest),
         ("focal length", f"{report.focal_length:.2f} px"),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
@@ -138,7 +137,7 @@ def _place_rows(place: Mapping[str, Any]) -> Rows:
     return rows + ([("placed by", "; ".join(place["how"]))] if place["how"] else [])
 
 
-def far_view_rows(median: float | None, largest: float | None) -> Rows:
+def _far_view_rows(median: float | None, largest: float | None) -> Rows:
     """How far views from far apart in time disagree; none where none see the same."""
     if median is None:
         return []
@@ -152,7 +151,7 @@ def model_rows(figures: ModelFigures, far_views: FarViews) -> Rows:
         ("points", f"{figures.num_points}, in {figures.mean_track_length:.2f} images on average"),
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
-        *far_view_rows(far_views.median, far_views.largest),
+        *_far_view_rows(far_views.median, far_views.largest),
         ("focal length", f"{figures.focal_length:.2f} px"),
     ]
 

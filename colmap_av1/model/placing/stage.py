@@ -50,7 +50,7 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
         (partial / folder).mkdir(parents=True)
         poses = posed.facts["poses"]
         if found.is_moved:
-            images = moved_images(placed.images, found.similarity.apply_to_poses)
+            images = _moved_images(placed.images, found.similarity.apply_to_poses)
             write_model(partial / folder, placed.cameras, images, no_points())
             poses = "in_place"
         return {"poses": poses, "place": found.facts, "place_warnings": list(found.warnings)}
@@ -65,7 +65,7 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
     )
 
 
-def moved_images(images: Sequence[ModelImage], move: Any) -> list[ModelImage]:
+def _moved_images(images: Sequence[ModelImage], move: Any) -> list[ModelImage]:
     """The images with their poses moved, all at once."""
     poses = move(np.array([image.cam_from_world for image in images]))
     return [replace(image, cam_from_world=pose) for image, pose in zip(images, poses, strict=True)]
