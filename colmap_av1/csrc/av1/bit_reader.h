@@ -14,7 +14,6 @@ class BitReader {
 
   // Position in bits from the start of the data.
   std::size_t position() const { return position_; }
-  std::size_t bits_left() const { return size_bits_ - position_; }
 
   int bit() {
     if (position_ >= size_bits_) throw BitstreamError("header ends inside a field");
