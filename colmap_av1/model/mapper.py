@@ -102,7 +102,6 @@ def run_mapper(
     options: MapOptions,
     *,
     image_path: Path | None = None,
-    placed: Callable[[], None] | None = None,
 ) -> list[int]:
     """Map a database in this process.
 
@@ -112,12 +111,11 @@ def run_mapper(
             the most images first: a mapper may make one of two images beside the real one.
         options: which mapper, and how.
         image_path: folder of the images; None: the points stay black.
-        placed: called at each image that the incremental mapper places.
 
     Returns:
         Images with a pose in each model.
     """
-    return run_mapping(_mapping_settings(database, output, options, image_path), placed)
+    return run_mapping(_mapping_settings(database, output, options, image_path))
 
 
 def _mapping_settings(

@@ -8,12 +8,14 @@ from pathlib import Path
 
 # No list of frames, images or poses comes near it.
 _LARGEST = 1 << 28
+# Characters of a text that a message shows.
+_MOST_SHOWN = 40
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def shown(text: str, most: int = 40) -> str:
+def shown(text: str) -> str:
     """The start of a text of a file, for messages: without what would steer a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text[:most])
+    return "".join(c if c.isprintable() else "?" for c in text[:_MOST_SHOWN])
 
 
 def read_lines(path: str | os.PathLike[str]) -> list[str]:
