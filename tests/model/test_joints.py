@@ -58,14 +58,34 @@ def test_a_joint_that_few_points_hold(
 
 def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
     """Thirty images in a row; 100 points join neighbours, 500 are seen by the first and last."""
+    write_row(tmp_path, [[k, k + 1, k + 2] for k in range(28) for _ in range(100)], 500)
+    found = model_joints(read_model(tmp_path)).num_points
+    assert found.tolist() == [600, *[200] * 27, 600]
+
+
+def test_a_cut_is_no_weak_joint_where_its_sides_see_each_other_elsewhere(tmp_path: Path) -> None:
+    views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
+    write_row(tmp_path, views, 20)
+    assert model_joints(read_model(tmp_path)).weak == [14]
+    write_row(tmp_path, views, 150)
+    assert model_joints(read_model(tmp_path)).weak == []
+
+
+def write_row(folder: Path, views: list[list[int]], again: int) -> None:
+    """Write a model of thirty images in a row.
+
+    Args:
+        folder: gets the model.
+        views: for points, which images see them.
+        again: further points, that the first two and the last two see.
+    """
     camera = make_camera(CameraOptions(), 640, 480)
     poses = [np.column_stack([np.eye(3), [-0.1 * k, 0.0, 0.0]]) for k in range(30)]
     images = [
         ModelImage(k + 1, f"{k:03}.png", int(camera.camera_id), pose)
         for k, pose in enumerate(poses)
     ]
-    views = [[k, k + 1, k + 2] for k in range(28) for _ in range(100)]
-    views += [[0, 1, 28, 29]] * 500
+    views = [*views, *[[0, 1, 28, 29]] * again]
     count = len(views)
     points = ModelPoints(
         xyz=np.tile([1.5, 0.0, 5.0], (count, 1)),
@@ -75,9 +95,7 @@ def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None
         image=np.concatenate(views),
         xy=np.zeros((sum(map(len, views)), 2)),
     )
-    write_model(tmp_path, {int(camera.camera_id): camera}, images, points)
-    found = model_joints(read_model(tmp_path)).num_points
-    assert found.tolist() == [600, *[200] * 27, 600]
+    write_model(folder, {int(camera.camera_id): camera}, images, points)
 
 
 def test_parts_that_are_joined_wrongly(

@@ -26,6 +26,9 @@ _WEAK = 0.07
 _REACH = 10
 # So many points hold any joint, however many others have: bent ones had 50 at most.
 _ENOUGH = 100
+# Share of the points of usual joints that images before a joint share with those after it, however
+# far apart, from which on it is not weak: parts of a cut video may see each other elsewhere.
+_ELSEWHERE = 0.5
 # A point has depth where it is seen under this angle in degrees: many times what its error and that
 # of the poses come to.
 _LEAST_ANGLE = 0.2
@@ -44,6 +47,7 @@ class Joints:
         pairs: names of the images before and after each joint, in the order of their names.
         num_points: int64 [n] points that join them: which images on both sides see, up to ten
             images apart, and three images at least.
+        num_elsewhere: int64 [n] points that images on both sides see, however far apart.
         num_scaled: int64 [n] those of the points that carry the scale across: which have depth by
             the views up to the image before, and by those from it on.
         num_deep: int64 [n] points that have depth by the views up to the image before, or by those
@@ -52,13 +56,18 @@ class Joints:
 
     pairs: tuple[tuple[str, str], ...]
     num_points: NDArray[np.int64]
+    num_elsewhere: NDArray[np.int64]
     num_scaled: NDArray[np.int64]
     num_deep: NDArray[np.int64]
 
     @property
     def weak(self) -> list[int]:
         """Joints, by index, that hold far less than the others do: a model may be bent there."""
-        return self._below(_WEAK, most=_ENOUGH)
+        if len(self.num_points) == 0:
+            return []
+        enough = _ELSEWHERE * float(np.median(self.num_points))
+        below = self._below(_WEAK, most=_ENOUGH)
+        return [i for i in below if self.num_elsewhere[i] < enough]
 
     @property
     def doubtful(self) -> list[int]:
@@ -151,6 +160,7 @@ def model_joints(reconstruction: Any) -> Joints:
     return Joints(
         tuple((images[k].name, images[k + 1].name) for k in joints),
         num_points=between(views[near], views[near + 1])[joints],
+        num_elsewhere=between(first, last)[joints],
         num_scaled=between(deep_from, deep_to + 1)[joints],
         num_deep=np.minimum(before, after)[joints],
     )
