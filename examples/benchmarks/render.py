@@ -25,7 +25,10 @@ LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
 REFERENCE = "sift-exhaustive"
 
 # Ways whose renderings are compared, the one first that the others are held against.
-SPLAT_WAYS = ("SIFT sequential", "reconstruct", "reconstruct --gaussians")
+SPLAT_WAYS = (
+    *("SIFT sequential", "reconstruct"),
+    *("reconstruct --gaussians", "reconstruct --gaussians, none added"),
+)
 _QUALITIES = ("psnr_y", "ssim_db", "vmaf")
 
 Row = dict[str, str]

@@ -4,9 +4,9 @@ python examples/benchmarks/splats.py --cache benchmark_phone
 
 For each clip the two folders of `phone_to_folder.py` are made, in its cache, and Gaussians are
 trained on half of the images of each, from its own poses and points, and rendered for the others;
-of `reconstruct`, from the Gaussians of `--gaussians`, too. The trainer is a small one for CPUs,
-`../shared/tools/gs_cpu`: what it gives is to be compared with what it gives for another cloud, not
-with other trainers' figures. Its time is of training alone.
+of `reconstruct`, from the Gaussians of `--gaussians`, too, and from these while training adds none.
+The trainer is a small one for CPUs, `../shared/tools/gs_cpu`: what it gives is to be compared with
+what it gives for another cloud, not with other trainers' figures. Its time is of training alone.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from colmap_av1.model.splats.gaussians import write_model_gaussians
 TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
 FROM_GAUSSIANS = Path(__file__).with_name("train_from_gaussians.py")
 OURS = render.SPLAT_WAYS[1:]
-GAUSSIANS = OURS[-1]
+GAUSSIANS, NONE_ADDED = OURS[-2:]
 # Which frames become images, where that differs from the other benchmark.
 IMAGES = {"kitchen": ImageOptions(every=4)}
 WIDTH, ITERATIONS = 225, 3000
@@ -100,7 +100,7 @@ def train(
     output.mkdir(parents=True)
     run = [sys.executable, str(TRAINER / "colmap_to_npz.py"), str(model), str(cloud)]
     subprocess.run([*run, "--images", str(images)], check=True, capture_output=True)
-    if way == GAUSSIANS:
+    if way in (GAUSSIANS, NONE_ADDED):
         write_model_gaussians(folder / "init.ply", model)
         run = [sys.executable, str(FROM_GAUSSIANS), str(folder / "init.ply"), str(TRAINER)]
     else:
@@ -108,6 +108,7 @@ def train(
     run += [str(cloud), str(images), str(output)]
     run += ["--width", str(WIDTH), "--iters", str(ITERATIONS), "--reset-every", "0"]
     run += ["--threads", "1", "--seed", str(seed), "--milestones", ",".join(map(str, MILESTONES))]
+    run += ["--no-densify"] if way == NONE_ADDED else []
     with (output / "log.txt").open("w") as log:
         subprocess.run(run, check=True, stdout=log, stderr=log)
     for line in (output / "log.jsonl").read_text().splitlines():
