@@ -97,6 +97,16 @@ def correlate_patches(
     *,
     min_deviation: float,
 ) -> NDArray[np.float32]: ...
+def find_patches(
+    patches: NDArray[np.uint8],
+    index: NDArray[np.int64],
+    *,
+    middle: NDArray[np.float32],
+    change: NDArray[np.float32],
+    target: NDArray[np.uint8],
+    start: NDArray[np.float32],
+    max_move: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 def reprojection_errors(
     *,
     cam_from_world: NDArray[np.float64],

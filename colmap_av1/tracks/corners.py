@@ -146,20 +146,21 @@ def _follow(
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
 
     def look(
-        source: NDArray[np.uint8], target: NDArray[np.uint8], p: _Floats, to: _Floats
+        source: NDArray[np.uint8], target: NDArray[np.uint8], p: _Floats, to: _Floats, levels: int
     ) -> tuple[_Floats, NDArray[np.bool_]]:
         # OpenCV counts from the centre of the first pixel.
         found, ok, _ = cv2.calcOpticalFlowPyrLK(
             *(source, target, p - 0.5, to - 0.5),
             winSize=_WINDOW,
-            maxLevel=_LEVELS,
+            maxLevel=levels,
             criteria=_CRITERIA,
             flags=flags,
         )
         return np.asarray(found + np.float32(0.5), np.float32), ok.ravel() == 1
 
-    found, there = look(before, now, at, at + way)
-    back, home = look(now, before, found, found - way)
+    found, there = look(before, now, at, at + way, _LEVELS)
+    # From where it should end: it is asked whether it stays there, not whether it is found.
+    back, home = look(now, before, found, at, 0)
     missed = np.abs(back - at).max(axis=1)
     return found, there & home & (missed <= _MAX_RETURN)
 

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "bindings/arrays.h"
+#include "model/patch_search.h"
 #include "model/patches.h"
 #include "model/points.h"
 #include "model/projection.h"
@@ -92,6 +93,30 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
                                      span_of(at_two), min_deviation);
   }
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
+}
+
+using Positions = InputArray<float, nb::shape<-1, 2>>;
+
+nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, const Indices& index,
+                       const Positions& middle,
+                       const InputArray<float, nb::shape<-1, 2, 2>>& change, const Picture& target,
+                       const Positions& start, float max_move) {
+  if (patches.shape(1) != patches.shape(2)) {
+    throw nb::value_error("patches are no squares");
+  }
+  model::FoundPatches found;
+  {
+    const nb::gil_scoped_release release;
+    found = model::find_patches({.pixels = {patches.data(), patches.size()},
+                                 .side = static_cast<std::int64_t>(patches.shape(1)),
+                                 .index = {index.data(), index.size()},
+                                 .middle = {middle.data(), middle.size()},
+                                 .change = {change.data(), change.size()}},
+                                grey_picture(target), {start.data(), start.size()}, max_move);
+  }
+  const std::size_t count = found.missed.size();
+  return nb::make_tuple(adopt<float>(std::move(found.xy), {count, 2}),
+                        adopt(std::move(found.missed)), adopt(std::move(found.likeness)));
 }
 
 model::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
@@ -224,6 +249,11 @@ void bind_model(nb::module_& m) {
         nb::kw_only(), "min_deviation"_a,
         "Correlations [n, d] of the patches around positions [n, 2] in one grey picture with those "
         "around positions [n, d, 2] in another.");
+  m.def("find_patches", &find_patches, "patches"_a, "index"_a, nb::kw_only(), "middle"_a,
+        "change"_a, "target"_a, "start"_a, "max_move"_a,
+        "Where a grey picture shows patches [p, side, side] as another view changes them: (xy "
+        "[n, 2], pixels by which the way back misses [n], inf where they are not found, likeness "
+        "[n]).");
   m.def("reprojection_errors", &reprojection_errors, nb::kw_only(), "cam_from_world"_a, "focal"_a,
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a,
         "Reprojection error in pixels of each observation of points, inf behind the camera.");

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "fuzz/input.h"
+#include "model/patch_search.h"
 #include "model/patches.h"
 #include "model/points.h"
 #include "model/projection.h"
@@ -198,6 +199,24 @@ void run_patches(Input& input) {
     check(std::all_of(found.begin(), found.end(),
                       [](float value) { return std::abs(value) < 1.001F; }),
           "correlations are at most 1");
+  });
+  const std::size_t num_sought = places.size() / 2;
+  const Indices index = indices(input, num_sought, pixels.empty() ? 0 : 1);
+  std::vector<float> change(4 * num_sought);
+  for (float& value : change) value = static_cast<float>(real(input));
+  // The picture itself where it is a square, so that something is found.
+  const model::CutPatches patches{
+      .pixels = pixels, .side = width, .index = index, .middle = places, .change = change};
+  const auto max_move = static_cast<float>(real(input));
+  refused_or([&] {
+    const auto found = model::find_patches(patches, picture, places, max_move);
+    for (std::size_t i = 0; i < num_sought; ++i) {
+      const bool is_found = std::isfinite(found.missed[i]);
+      check(found.missed[i] >= 0 && std::abs(found.likeness[i]) < 1.001F, "patches are compared");
+      check(!is_found || (std::abs(found.xy[2 * i] - places[2 * i]) <= max_move &&
+                          std::abs(found.xy[2 * i + 1] - places[2 * i + 1]) <= max_move),
+            "patches are found near their start");
+    }
   });
 }
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1 import _core
 from colmap_av1.model.coverage import PosedCamera, evenly_spread
 from colmap_av1.model.mapping.grey_pictures import GreyPictures
 from colmap_av1.model.mapping.slopes import surface_slopes
@@ -28,13 +28,10 @@ _Floats = NDArray[np.float64]
 _Indices = NDArray[np.int64]
 _Grey = NDArray[np.uint8]
 
-# Width in pixels of the window that is compared, of the picture around a point as another image is
-# to show it, and of what is kept of the image that shows it.
-_WINDOW = 11
+# Width in pixels of what another image is to show around a point, the window that is compared and
+# some around it, and of what is kept of the image that shows it.
 _SHOWN = 17
 _KEPT = 37
-# Lucas-Kanade's steps, and the pixels below which one is the last.
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
 # Cosine of the angle between two views of a point, and factor by which what is around it grows,
 # beyond which it looks too different.
 _LEAST_COSINE = float(np.cos(np.radians(40.0)))
@@ -228,10 +225,18 @@ def _found_in(
     seen = place[index] >= 0
     expected[seen] = at[place[index[seen]]] / scale
     grey = pictures.read(number)
-    shown = _as_shown(patches.grey[index], patches.fraction[index], change)
-    where, sure = _look(shown, grey, expected)
-    sure[sure] = _likeness(shown[sure], grey, where[sure]) >= _LEAST_LIKENESS
-    xy = where * scale
+    found, missed, likeness = _core.find_patches(
+        *(patches.grey, index),
+        middle=patches.fraction[index].astype(np.float32),
+        change=change.astype(np.float32),
+        target=grey,
+        start=expected.astype(np.float32),
+        max_move=_MAX_MOVE,
+    )
+    sure = (missed <= _MAX_RETURN) & (likeness >= _LEAST_LIKENESS)
+    margin = _SHOWN // 2
+    sure &= ((found >= margin) & (found < np.array(size) - margin)).all(axis=1)
+    xy = found * scale
     sure[sure] = view.keeps(xy[sure])
     return index[sure], xy[sure]
 
@@ -278,98 +283,3 @@ def _near_views(patches: _Patches, index: _Indices, view: PosedCamera) -> NDArra
     ray = patches.xyz[index] - view.centre
     cosine = (patches.ray[index] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
     return np.asarray(cosine >= _LEAST_COSINE)
-
-
-def _as_shown(patches: _Grey, fraction: _Floats, change: _Floats) -> _Grey:
-    """The pictures around points as another image should show them, uint8 [m, _SHOWN, _SHOWN].
-
-    Args:
-        patches: those around them [m, _KEPT, _KEPT].
-        fraction: float64 [m, 2] see `_Patches`.
-        change: float64 [m, 2, 2] see `_in_view`.
-    """
-    offset = np.arange(_SHOWN, dtype=np.float32) - _SHOWN // 2
-    right, down = offset[None, None, :], offset[None, :, None]
-    shown = np.empty((len(patches), _SHOWN, _SHOWN), np.uint8)
-    # Tiles of one picture, below each other; OpenCV's have fewer than 32,768 rows.
-    chunk = 32_000 // _KEPT
-    for first in range(0, len(patches), chunk):
-        own = slice(first, first + chunk)
-        along = change[own].astype(np.float32)[..., None, None]
-        middle = (fraction[own] + _KEPT // 2).astype(np.float32)
-        middle[:, 1] += _KEPT * np.arange(len(middle), dtype=np.float32)
-        x, y = (
-            along[:, k, 0] * right + along[:, k, 1] * down + middle[:, k, None, None]
-            for k in (0, 1)
-        )
-        tiles = patches[own].reshape(-1, _KEPT)
-        found = cv2.remap(tiles, x.reshape(-1, _SHOWN), y.reshape(-1, _SHOWN), cv2.INTER_LINEAR)
-        shown[own] = found.reshape(-1, _SHOWN, _SHOWN)
-    return shown
-
-
-def _look(shown: _Grey, grey: _Grey, expected: _Floats) -> tuple[_Floats, NDArray[np.bool_]]:
-    """Look for small pictures in a large one by Lucas-Kanade.
-
-    Args:
-        shown: the small ones [m, _SHOWN, _SHOWN].
-        grey: the large one.
-        expected: float64 [m, 2] where the middles of the small ones should be.
-
-    Returns:
-        float64 [m, 2] where they are, and which are found.
-    """
-    # As tiles of one picture all are looked for at once.
-    columns = max(1, grey.shape[1] // _SHOWN)
-    rows = -(-len(shown) // columns)
-    below, right = (
-        max(0, n * _SHOWN - m) for n, m in zip((rows, columns), grey.shape, strict=True)
-    )
-    canvas = cv2.copyMakeBorder(grey, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    tiles = np.zeros((rows * columns, _SHOWN, _SHOWN), np.uint8)
-    tiles[: len(shown)] = shown
-    atlas = np.zeros_like(canvas)
-    atlas[: rows * _SHOWN, : columns * _SHOWN] = (
-        tiles.reshape(rows, columns, _SHOWN, _SHOWN)
-        .transpose(0, 2, 1, 3)
-        .reshape(rows * _SHOWN, columns * _SHOWN)
-    )
-    row, column = np.divmod(np.arange(len(shown)), columns)
-    middle = (np.column_stack([column, row]) * _SHOWN + _SHOWN // 2).astype(np.float32)
-    how: dict[str, Any] = {
-        "winSize": (_WINDOW, _WINDOW),
-        "maxLevel": 0,
-        "criteria": _CRITERIA,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-    }
-    # OpenCV counts from the centre of the first pixel.
-    start = (expected - 0.5).astype(np.float32)
-    found, there, _ = cv2.calcOpticalFlowPyrLK(atlas, canvas, middle, start.copy(), **how)
-    back, home, _ = cv2.calcOpticalFlowPyrLK(canvas, atlas, found, middle.copy(), **how)
-    sure = (there.ravel() == 1) & (home.ravel() == 1)
-    sure &= np.abs(back - middle).max(axis=1) <= _MAX_RETURN
-    sure &= np.abs(found - start).max(axis=1) <= _MAX_MOVE
-    margin = _WINDOW // 2 + 1
-    inside = (found >= margin) & (found < np.array(grey.shape[::-1]) - margin)
-    return found.astype(np.float64) + 0.5, sure & inside.all(axis=1)
-
-
-def _likeness(shown: _Grey, grey: _Grey, at: _Floats) -> _Floats:
-    """Normalised correlation of small pictures with what a large one shows at some places."""
-    margin = (_SHOWN - _WINDOW) // 2
-    own = shown[:, margin:-margin, margin:-margin].reshape(-1, _WINDOW**2).astype(np.float32)
-    offset = np.arange(_WINDOW, dtype=np.float32) - _WINDOW // 2 - 0.5
-    x, y = (at[:, k, None].astype(np.float32) + offset for k in (0, 1))
-    other = np.empty_like(own)
-    # OpenCV's pictures have fewer than 32,768 rows.
-    chunk = 32_000 // _WINDOW
-    for first in range(0, len(at), chunk):
-        part = slice(first, first + chunk)
-        across = np.broadcast_to(x[part, None, :], (len(x[part]), _WINDOW, _WINDOW))
-        down = np.broadcast_to(y[part, :, None], across.shape)
-        places = (across.reshape(-1, _WINDOW), down.reshape(-1, _WINDOW))
-        found = cv2.remap(grey, *places, cv2.INTER_LINEAR)
-        other[part] = found.reshape(-1, _WINDOW**2)
-    a, b = (w - w.mean(axis=1, keepdims=True) for w in (own, other))
-    norm = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.asarray((a * b).sum(axis=1) / np.maximum(norm, 1e-6), np.float64)
