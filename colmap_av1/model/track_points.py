@@ -106,10 +106,11 @@ def rays_of(tracks: Tracks, view: NDArray[np.int64], cameras: Sequence[Any]) -> 
     # Part by part: what is made on the way is several times as large.
     for start in range(0, len(rays), _CHUNK):
         part = slice(start, start + _CHUNK)
-        xy, camera_id = tracks.xy[part].astype(np.float64), camera_of_view[view[part]]
+        xy = tracks.xy[part].astype(np.float64)
         if len(by_id) == 1:
             rays[part] = cameras[0].cam_from_img(xy)
             continue
+        camera_id = camera_of_view[view[part]]
         for own_id in np.unique(camera_id).tolist():
             own = camera_id == own_id
             rays[part][own] = by_id[own_id].cam_from_img(xy[own])

@@ -81,6 +81,9 @@ def on_pinholes(
 ) -> NDArray[np.float64]:
     """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
     params = np.array([pinhole.params for pinhole in pinholes])
+    if len(params) and (params == params[0]).all():
+        # Nothing to look up for each ray, which takes most of the time.
+        return np.asarray(rays * params[0, :2] + params[0, 2:])
     xy = np.empty(rays.shape)
     for axis in range(2):
         xy[:, axis] = rays[:, axis] * params[view, axis] + params[view, 2 + axis]
