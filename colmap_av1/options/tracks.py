@@ -48,7 +48,11 @@ class TrackOptions(Options):
         16, "longest step of a displacement, in shown frames; None: any", least=0
     )
     max_block_area: int | None = option(
-        1024, "largest block whose motion is trusted, in px^2; None: any", least=0
+        1024,
+        "largest block whose motion is trusted, in px^2, but for blocks that move as nearly all of "
+        "the picture does, by one affine motion: of a camera that stands still, or sees something "
+        "flat; None: any",
+        least=0,
     )
     max_uncoded_block_area: int | None = option(
         1024,

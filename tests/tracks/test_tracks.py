@@ -28,7 +28,7 @@ from colmap_av1.tracks.tracks import (
     shorter_tracks,
 )
 
-BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32 = 0, 3, 6, 9
+BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32, BLOCK_64X64 = 0, 3, 6, 9, 12
 NEWMV, GLOBALMV = 16, 15
 LOCALWARP = 2
 LAST, GOLDEN, ALTREF = 1, 4, 7
@@ -406,6 +406,25 @@ def test_steps_longer_than_the_limit_are_not_taken() -> None:
     assert count(2) == 0
 
 
+@pytest.mark.parametrize("uncoded", [0, 1])
+@pytest.mark.parametrize("step", [(0.0, 0.0), (0.75, -0.25)])
+def test_largest_blocks_are_trusted_where_the_whole_frame_moves_evenly(
+    step: tuple[float, float], uncoded: int
+) -> None:
+    def count(elsewhere: int) -> int:
+        """Tracks through five frames, of which so many of the 48 rows of units move otherwise."""
+        motion = np.zeros((48, 64, 2), np.int16)
+        motion[...] = round(8 * step[1]), round(8 * step[0])
+        motion[48 - elsewhere :] = 0, 40
+        frames = low_delay([motion] * 5, width=256, height=192, mi_size=BLOCK_64X64)
+        for one in frames:
+            one.skip[...] = uncoded
+        return len(build_tracks(frames, replace(SMALL_PICTURES, smoothness=None)).offsets) - 1
+
+    assert count(0) >= count(4) > 0.8 * 44 * 64
+    assert count(6) == 0
+
+
 def test_hidden_frames_carry_tracks_and_are_not_observed() -> None:
     step = (0.5, 0.25)
     frames = [
@@ -650,7 +669,10 @@ def test_long_tracks_are_kept() -> None:
 
 
 def test_large_and_uncoded_blocks_are_not_followed() -> None:
-    frames = low_delay([(0.0, 0.0)] * 4, mi_size=BLOCK_16X16)
+    # There and back, every second row against the others: no motion of the picture as a whole.
+    there = np.zeros((12, 16, 2), np.int16)
+    there[::2], there[1::2] = (0, 4), (0, -4)
+    frames = low_delay([there, -there] * 2, mi_size=BLOCK_16X16)
     for f in frames:
         f.mi_size[:, 8:] = BLOCK_32X32
         f.skip[:4] = 1

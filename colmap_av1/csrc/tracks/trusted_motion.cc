@@ -5,10 +5,12 @@
 #include <cstddef>
 #include <limits>
 #include <optional>
+#include <vector>
 
 #include "av1/constants.h"
 #include "av1/spec_tables.h"
 #include "tracks/displacement.h"
+#include "tracks/even_motion.h"
 #include "tracks/fill_motion.h"
 #include "tracks/trust.h"
 
@@ -16,6 +18,9 @@ namespace colmap_av1::tracks {
 namespace {
 
 using Verdict = TrustScratch::Verdict;
+
+// Units that say whether a frame moves evenly, about.
+constexpr int kEvenSamples = 2048;
 
 // How the units around a block move, against the block.
 struct Agreement {
@@ -77,20 +82,47 @@ bool is_within_border(const TrustedMotion& motion, float border, Point from, Poi
   return !is_in_border(from) && !is_in_border(to);
 }
 
-// The displacements of visible units by the rules that need no other unit.
+TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) {
+  return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
+}
+
+// What moves evenly, of the frame's first list; nothing where blocks are all small enough.
+EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
+                       const DisplacementModel& model, const TrustedMotion& motion) {
+  const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
+  bool any_large = false;
+  int looked_at = 0;
+  std::vector<TimedMotion> spread;
+  for (int row = step / 2; row < motion.visible_rows; row += step) {
+    for (int col = step / 2; col < motion.visible_cols; col += step) {
+      const int unit = row * motion.cols + col;
+      ++looked_at;
+      const Displacement d = model.at(unit, 0);
+      if (d.ref == 0) continue;
+      any_large |= !is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
+      spread.push_back(timed(motion, motion.unit_centre(unit), d));
+    }
+  }
+  if (!any_large || 2 * static_cast<int>(spread.size()) < looked_at) spread.clear();
+  return {spread, motion.coded_width, motion.height};
+}
+
+// The displacements of visible units by the rules that need no other unit but those of the picture
+// as a whole.
 void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
                         TrustedMotion& motion) {
   const DisplacementModel model(frame);
+  const EvenMotion even = even_motion(frame, options, model, motion);
   const auto border = static_cast<float>(options.border.value_or(0));
   for (int row = 0; row < motion.visible_rows; ++row) {
     for (int col = 0; col < motion.visible_cols; ++col) {
       const int unit = row * motion.cols + col;
-      if (!is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0)) continue;
+      const bool small = is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
+      const Point centre = motion.unit_centre(unit);
       for (int list = 0; list < motion.num_lists; ++list) {
         const Displacement d = model.at(unit, list);
         if (d.ref == 0 || !options.is_within_reach(motion.ref_interval[d.ref])) continue;
-        const Point centre{kUnit * static_cast<float>(col) + kUnit / 2.F,
-                           kUnit * static_cast<float>(row) + kUnit / 2.F};
+        if (!small && !even.agrees(timed(motion, centre, d))) continue;
         if (border > 0.F &&
             !is_within_border(motion, border, centre, {centre.x + d.dx, centre.y + d.dy})) {
           continue;
