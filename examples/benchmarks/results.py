@@ -62,10 +62,15 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def commit() -> str:
-    """The commit of this checkout, marked where it has been changed since."""
-    words = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty", "--exclude", "*"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
+    """The commit of this checkout, marked where more of it than results has been changed since."""
+    git = ["git", "-C", str(RESULTS.parent)]
+    words = ["describe", "--always", "--exclude", "*"]
+    done = subprocess.run([*git, *words], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        return "unknown"
+    others = [":(top)", f":(exclude){RESULTS.name}"]
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *others], check=False)
+    return done.stdout.strip() + ("-dirty" if changed.returncode != 0 else "")
 
 
 def machine() -> str:
