@@ -81,17 +81,11 @@ def _vaapi(quality: int, speed: int) -> list[str]:
 
 
 def _libaom(quality: int, speed: int) -> list[str]:
-    is_realtime = speed >= _LIBAOM_REALTIME
-    how = ["-usage", "realtime" if is_realtime else "good", "-lag-in-frames", "0"]
-    how += ["-cpu-used", str(min(speed, _FFMPEG_FASTEST))]
+    # Its realtime mode starts at speed 5.
+    usage = "realtime" if speed >= _LIBAOM_REALTIME else "good"
+    how = ["-usage", usage, "-cpu-used", str(min(speed, _FFMPEG_FASTEST)), "-lag-in-frames", "0"]
     how += ["-row-mt", "1", "-crf", str(quality), "-b:v", "0"]
-    params = [f"cpu-used={speed}"] if speed > _FFMPEG_FASTEST else []
-    if is_realtime:
-        # Probabilities that are not adapted cost a tenth more bytes and save a tenth of the time.
-        # Adapted, they make one thread choose otherwise than several do: streams would depend on
-        # the machine.
-        params.append("cdf-update-mode=0")
-    return [*how, "-aom-params", ":".join(params)] if params else how
+    return how if speed <= _FFMPEG_FASTEST else [*how, "-aom-params", f"cpu-used={speed}"]
 
 
 def _svt(quality: int, speed: int) -> list[str]:
@@ -114,8 +108,7 @@ ENCODERS = {
         upload="format=nv12,hwupload",
     ),
     # Speed 7 takes a third to a half of the time of 6 for models that are nearly as good; 8 saves
-    # little more and gives up to 8 % fewer points. 10 takes half of it, but where the picture moves
-    # slowly it codes blocks too large to be trusted. What else was tried: "Encoders" in
+    # little more and gives up to 8 % fewer points. What else was tried: "Encoders" in
     # examples/benchmarks/README.md.
     "libaom": _Encoder("libaom-av1", 20, 7, _libaom),
     "svt": _Encoder("libsvtav1", 20, 8, _svt),

@@ -30,7 +30,6 @@ from colmap_av1.match import match
 from colmap_av1.motion.info import inspect
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import EncodeOptions, MatchOptions
-from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
@@ -89,27 +88,6 @@ def test_speeds_of_libaom_that_ffmpeg_does_not_have(phone: Path, tmp_path: Path)
     assert streams[0] != streams[1]
     with pytest.raises(EncodeError, match=r"libaom: .*another --encoder"):
         find_encoder(EncodeOptions(encoder="libaom", speed=99))
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "sched_setaffinity") or threads_or_cpus(None) < 2, reason="one CPU"
-)
-@pytest.mark.parametrize("speed", [None, 7])
-def test_streams_of_libaom_are_the_same_on_any_number_of_cpus(
-    encode: Encode, tmp_path: Path, speed: int | None
-) -> None:
-    video = encode(make_frames(12, 640, 360), tmp_path / "video.mp4", *H264)
-    options = EncodeOptions(encoder="libaom", speed=speed)
-    streams = []
-    cpus = os.sched_getaffinity(0)
-    for number in (1, len(cpus)):
-        os.sched_setaffinity(0, sorted(cpus)[:number])
-        try:
-            report = encode_video(video, tmp_path / f"{number}.ivf", options=options)
-        finally:
-            os.sched_setaffinity(0, cpus)
-        streams.append(report.output.read_bytes())
-    assert streams[0] == streams[1]
 
 
 def test_pictures_are_those_of_the_video(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
