@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <iterator>
 #include <limits>
 #include <optional>
 #include <vector>
@@ -21,6 +22,10 @@ using Verdict = TrustScratch::Verdict;
 
 // Units that say whether a frame moves evenly, about.
 constexpr int kEvenSamples = 2048;
+constexpr int kSuperblock = 16;  // in units, of the smaller ones
+// Share of them that lie in blocks small enough where the picture shows something. Where a camera
+// stands still, and without noise, they are 0.02.
+constexpr double kDetail = 0.01;
 
 // How the units around a block move, against the block.
 struct Agreement {
@@ -86,24 +91,28 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
   return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
 }
 
-// What moves evenly, of the frame's first list; nothing where blocks are all small enough.
+// What moves evenly, of the frame's first list. Nothing where blocks are all small enough, nor
+// where hardly any are: of one colour, all of a picture seems to stand.
 EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
                        const DisplacementModel& model, const TrustedMotion& motion) {
   const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
-  bool any_large = false;
-  int looked_at = 0;
+  int num_small = 0;
+  int num_large = 0;
   std::vector<TimedMotion> spread;
-  for (int row = step / 2; row < motion.visible_rows; row += step) {
-    for (int col = step / 2; col < motion.visible_cols; col += step) {
+  // Beyond the last whole superblock blocks are small for want of room.
+  for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
+    for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
-      ++looked_at;
+      const bool small = is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
+      ++(small ? num_small : num_large);
       const Displacement d = model.at(unit, 0);
-      if (d.ref == 0) continue;
-      any_large |= !is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
-      spread.push_back(timed(motion, motion.unit_centre(unit), d));
+      if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
     }
   }
-  if (!any_large || 2 * static_cast<int>(spread.size()) < looked_at) spread.clear();
+  const int num_units = num_small + num_large;
+  if (num_large == 0 || num_small < kDetail * num_units || 2 * std::ssize(spread) < num_units) {
+    spread.clear();
+  }
   return {spread, motion.coded_width, motion.height};
 }
 
