@@ -156,8 +156,7 @@ def renderings_table(columns: Sequence[Column]) -> Table:
     """Renderings of trained Gaussians."""
     header = ["front-end", "PSNR-Y, dB", "SSIM, dB", "LPIPS", "VMAF", "Q", "difference of Q"]
     header += ["Gaussians", "training, s", "baseline's PSNR-Y after", "its VMAF after"]
-    baseline = _training_baseline(columns)
-    base = () if baseline is None or baseline.training is None else baseline.training.states
+    baseline, base = _training_baseline(columns)
     rows = []
     words = ""
     for column in columns:
@@ -182,18 +181,19 @@ def renderings_table(columns: Sequence[Column]) -> Table:
         "Means over the test images, which are the odd ones; trained on the even ones. Q: Zhu and "
         "Milanfar's measure of sharpness, and its absolute difference to that of the photograph."
     )
-    if base and baseline is not None:
+    if base:
         about += (
-            f" The baseline is {baseline.name}: the time until its last PSNR-Y and VMAF are "
+            f" The baseline is {baseline}: the time until its last PSNR-Y and VMAF are "
             "reached, as a share of that of its training."
         )
     return Table("Renderings", f"{about} No LPIPS: {words}." if words else about, header, rows)
 
 
-def _training_baseline(columns: Sequence[Column]) -> Column | None:
-    """The column that other trainings are held against; None where none of them is there."""
-    trained = {column.name: column for column in columns if column.training is not None}
-    return next((trained[name] for name in _TRAINING_BASELINES if name in trained), None)
+def _training_baseline(columns: Sequence[Column]) -> tuple[str, Sequence[Milestone]]:
+    """Name and milestones of what other trainings are held against; nothing where it is not."""
+    trained = {column.name: column.training.states for column in columns if column.training}
+    name = next((name for name in _TRAINING_BASELINES if name in trained), "")
+    return name, trained.get(name, ())
 
 
 def milestones_table(columns: Sequence[Column]) -> Table | None:
@@ -202,8 +202,7 @@ def milestones_table(columns: Sequence[Column]) -> Table | None:
     if not trained:
         return None
     stops = sorted({state.iteration for _, states in trained for state in states})
-    baseline = _training_baseline(columns)
-    base = () if baseline is None or baseline.training is None else baseline.training.states
+    baseline, base = _training_baseline(columns)
     times = [state.seconds for state in base if math.isfinite(state.seconds)]
     header = ["front-end", *(f"{stop:,} iterations" for stop in stops)]
     header += [f"{seconds:,.0f} s" for seconds in times]
@@ -213,9 +212,9 @@ def milestones_table(columns: Sequence[Column]) -> Table | None:
         row = [name, *(_qualities_cell(at.get(stop)) for stop in stops)]
         rows.append(row + [_qualities_cell_after(states, seconds) for seconds in times])
     about = "PSNR-Y in dB / SSIM in dB / VMAF, means over the test images."
-    if times and baseline is not None:
+    if times:
         about += (
-            f" The seconds of training are those of {baseline.name}'s milestones; between its own "
+            f" The seconds of training are those of {baseline}'s milestones; between its own "
             "a training counts as rising evenly."
         )
     return Table("Renderings on the way", about, header, rows)
