@@ -107,12 +107,12 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
   model::FoundPatches found;
   {
     const nb::gil_scoped_release release;
-    found = model::find_patches({.pixels = {patches.data(), patches.size()},
+    found = model::find_patches({.pixels = span_of(patches),
                                  .side = static_cast<std::int64_t>(patches.shape(1)),
-                                 .index = {index.data(), index.size()},
-                                 .middle = {middle.data(), middle.size()},
-                                 .change = {change.data(), change.size()}},
-                                grey_picture(target), {start.data(), start.size()}, max_move);
+                                 .index = span_of(index),
+                                 .middle = span_of(middle),
+                                 .change = span_of(change)},
+                                grey_picture(target), span_of(start), max_move);
   }
   const std::size_t count = found.missed.size();
   return nb::make_tuple(adopt<float>(std::move(found.xy), {count, 2}),
