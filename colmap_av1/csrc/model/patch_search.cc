@@ -22,12 +22,6 @@ constexpr float kLeastChange = 0.1F;
 // Pixels by which pictures go on beyond their edges.
 constexpr std::int64_t kMargin = 16;
 
-// Rows are as long as several processor registers, so that a compiler works on whole ones.
-constexpr int lanes_of(int side) { return (side + 3) / 4 * 4; }
-
-template <int kSide>
-using Block = std::array<std::array<float, lanes_of(kSide)>, kSide>;
-
 template <std::size_t kCount>
 float sum_of(const std::array<float, kCount>& values) {
   float sum = 0;
@@ -36,64 +30,6 @@ float sum_of(const std::array<float, kCount>& values) {
   }
   return sum;
 }
-
-// A picture as numbers to compute with, that goes on beyond its edges as it ends.
-class FloatPicture {
- public:
-  explicit FloatPicture(const GreyPicture& picture)
-      : width_(picture.width + 2 * kMargin), height_(picture.height + 2 * kMargin) {
-    if (picture.width <= 0 || picture.height <= 0 ||
-        picture.pixels.size() != static_cast<std::size_t>(picture.width * picture.height)) {
-      throw std::invalid_argument("pixels do not fit the picture's size");
-    }
-    pixels_.resize(static_cast<std::size_t>(width_ * height_));
-    for (std::int64_t y = 0; y < height_; ++y) {
-      const std::int64_t row = std::clamp<std::int64_t>(y - kMargin, 0, picture.height - 1);
-      const std::uint8_t* from = picture.pixels.data() + row * picture.width;
-      float* to = pixels_.data() + y * width_;
-      std::fill_n(to, kMargin, static_cast<float>(from[0]));
-      std::copy_n(from, picture.width, to + kMargin);
-      std::fill_n(to + kMargin + picture.width, kMargin,
-                  static_cast<float>(from[picture.width - 1]));
-    }
-  }
-
-  // The block of pixels around (x, y), and whether it lies within the picture and its margin.
-  template <int kSide>
-  bool sample(float x, float y, Block<kSide>& block) const {
-    constexpr int kLanes = lanes_of(kSide);
-    const float left = x - 0.5F * kSide + static_cast<float>(kMargin);
-    const float top = y - 0.5F * kSide + static_cast<float>(kMargin);
-    // Of pixels that are read the last ones are one beyond the block. False for what is no number.
-    if (!(left >= 0 && top >= 0 && left < static_cast<float>(width_ - kLanes) &&
-          top < static_cast<float>(height_ - kSide))) {
-      return false;
-    }
-    const auto column = static_cast<std::int64_t>(left);
-    const auto row = static_cast<std::int64_t>(top);
-    const float right_share = left - static_cast<float>(column);
-    const float lower_share = top - static_cast<float>(row);
-    const float* pixels = pixels_.data() + row * width_ + column;
-    Block<kSide + 1> rows;
-    for (auto& own : rows) {
-      for (int i = 0; i < kLanes; ++i) {
-        own[i] = pixels[i] + right_share * (pixels[i + 1] - pixels[i]);
-      }
-      pixels += width_;
-    }
-    for (int r = 0; r < kSide; ++r) {
-      for (int i = 0; i < kLanes; ++i) {
-        block[r][i] = rows[r][i] + lower_share * (rows[r + 1][i] - rows[r][i]);
-      }
-    }
-    return true;
-  }
-
- private:
-  std::vector<float> pixels_;
-  std::int64_t width_;
-  std::int64_t height_;
-};
 
 struct Step {
   float x = 0;
@@ -276,7 +212,7 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
     throw std::invalid_argument("patches and positions do not fit each other");
   }
   const auto num_patches = static_cast<std::int64_t>(patches.pixels.size() / size);
-  const FloatPicture picture(target);
+  const FloatPicture picture(target, kMargin);
   FoundPatches found{.xy = {start.begin(), start.end()},
                      .missed = std::vector<float>(count, std::numeric_limits<float>::infinity()),
                      .likeness = std::vector<float>(count, -1.0F)};

@@ -5,7 +5,7 @@
 #include <span>
 #include <vector>
 
-#include "model/patches.h"
+#include "model/grey_picture.h"
 
 namespace colmap_av1::model {
 

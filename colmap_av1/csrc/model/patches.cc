@@ -9,9 +9,9 @@ namespace colmap_av1::model {
 namespace {
 
 constexpr int kSamples = kPatch * kPatch;
-// By rows, so that a compiler works on a whole one at a time.
-using Row = std::array<float, kPatch>;
-using Patch = std::array<Row, kPatch>;
+static_assert(lanes_of(kPatch) == kPatch, "each lane counts");
+using Patch = Block<kPatch>;
+using Row = Patch::value_type;
 
 // By halves: a processor adds what does not wait for each other at once.
 float sum_of(Row row) {
@@ -21,53 +21,6 @@ float sum_of(Row row) {
     }
   }
   return row[0];
-}
-
-// A picture whose pixels are numbers to compute with, each of which many patches have in common.
-struct FloatPicture {
-  explicit FloatPicture(const GreyPicture& picture)
-      : pixels(picture.pixels.begin(), picture.pixels.end()),
-        width(picture.width),
-        height(picture.height) {}
-
-  std::vector<float> pixels;  // [height][width]
-  std::int64_t width;
-  std::int64_t height;
-};
-
-// What lies a share of the way from each of the pixels to the next one.
-Row between(const float* pixels, float share) {
-  Row found;
-  for (int i = 0; i < kPatch; ++i) {
-    found[i] = pixels[i] + share * (pixels[i + 1] - pixels[i]);
-  }
-  return found;
-}
-
-// The patch around (x, y), and whether it lies within the picture.
-bool sample(const FloatPicture& picture, float x, float y, Patch& patch) {
-  const float left = x - 0.5F * kPatch;
-  const float top = y - 0.5F * kPatch;
-  // Of pixels that are read the last ones are one beyond the patch. False for what is no number.
-  if (!(left >= 0 && top >= 0 && left < static_cast<float>(picture.width - kPatch) &&
-        top < static_cast<float>(picture.height - kPatch))) {
-    return false;
-  }
-  const auto column = static_cast<std::int64_t>(left);
-  const auto row = static_cast<std::int64_t>(top);
-  const float right_share = left - static_cast<float>(column);
-  const float lower_share = top - static_cast<float>(row);
-  const float* pixels = picture.pixels.data() + row * picture.width + column;
-  Row upper = between(pixels, right_share);
-  for (Row& own : patch) {
-    pixels += picture.width;
-    const Row lower = between(pixels, right_share);
-    for (int i = 0; i < kPatch; ++i) {
-      own[i] = upper[i] + lower_share * (lower[i] - upper[i]);
-    }
-    upper = lower;
-  }
-  return true;
 }
 
 float mean_of(const Patch& patch) {
@@ -118,20 +71,11 @@ float correlation(const Patch& normalised, const Patch& other, float min_norm) {
   return norm >= min_norm && norm > 0 ? sum_of(products) / norm : -1;
 }
 
-void check(const GreyPicture& picture) {
-  if (picture.width < 0 || picture.height < 0 ||
-      picture.pixels.size() != static_cast<std::size_t>(picture.width * picture.height)) {
-    throw std::invalid_argument("pixels do not fit the picture's size");
-  }
-}
-
 }  // namespace
 
 std::vector<float> correlate_patches(const GreyPicture& one, std::span<const float> at_one,
                                      const GreyPicture& two, std::span<const float> at_two,
                                      float min_deviation) {
-  check(one);
-  check(two);
   const std::size_t count = at_one.size() / 2;
   if (at_one.size() % 2 != 0 || at_two.size() % 2 != 0 ||
       (count == 0 ? !at_two.empty() : at_two.size() % at_one.size() != 0)) {
@@ -144,12 +88,12 @@ std::vector<float> correlate_patches(const GreyPicture& one, std::span<const flo
   std::vector<float> found(count * tried, -1.0F);
   for (std::size_t i = 0; i < count; ++i) {
     Patch own;
-    if (!sample(first, at_one[2 * i], at_one[2 * i + 1], own) || !normalise(own, min_norm)) {
+    if (!first.sample<kPatch>(at_one[2 * i], at_one[2 * i + 1], own) || !normalise(own, min_norm)) {
       continue;
     }
     for (std::size_t k = i * tried; k < (i + 1) * tried; ++k) {
       Patch other;
-      if (sample(second, at_two[2 * k], at_two[2 * k + 1], other)) {
+      if (second.sample<kPatch>(at_two[2 * k], at_two[2 * k + 1], other)) {
         found[k] = correlation(own, other, min_norm);
       }
     }

@@ -1,21 +1,15 @@
 // Correlation of square patches of two pictures.
 #pragma once
 
-#include <cstdint>
 #include <span>
 #include <vector>
+
+#include "model/grey_picture.h"
 
 namespace colmap_av1::model {
 
 // Side of a patch in pixels.
 inline constexpr int kPatch = 8;
-
-// Borrowed: a grey picture, rows one after the other.
-struct GreyPicture {
-  std::span<const std::uint8_t> pixels;  // [height][width]
-  std::int64_t width = 0;
-  std::int64_t height = 0;
-};
 
 // Zero-mean normalised cross-correlations of the patch around each of n positions in one picture
 // with those around d positions in another, [n][d], from -1 to 1. Positions are (x, y) in pixels,
