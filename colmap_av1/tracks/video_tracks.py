@@ -158,6 +158,8 @@ def _made_source(
         )
     shown = "{}x{}".format(*video.picture_size)
     conversion = f"{video.codec} at {shown} to AV1 at {size} by {made.encoder}"
+    if video.is_interlaced:
+        conversion += ", deinterlaced"
     return VideoSource(stream, video, is_kept, conversion)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.video.container import reason_of
+from colmap_av1.video.deinterlacing import deinterlaced
 from colmap_av1.video.display import Display, shown_picture
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.kept_pictures import KeptPictures, Stored
@@ -65,6 +66,10 @@ def _decoded(
     if video.presented is not None:
         index_of = {int(f): i for i, f in enumerate(video.presented)}
 
+    def frames(threads: int | None) -> Generator[Any, None, None]:
+        stored = decode(video, operating_point, threads)
+        return deinterlaced(stored) if video.is_interlaced else stored
+
     def given(number: int, frame: Any) -> Iterator[Stored]:
         index = number if index_of is None else index_of.get(number)
         if index is not None and (wanted is None or index in wanted):
@@ -72,14 +77,14 @@ def _decoded(
 
     count = 0
     try:
-        for frame in decode(video, operating_point, num_threads):
+        for frame in frames(num_threads):
             yield from given(count, frame)
             count += 1
     except BitstreamError:
         if num_threads == 1:
             raise
         # Threads lose the frames in flight at the damage; one thread has none in flight.
-        for number, frame in enumerate(decode(video, operating_point, 1)):
+        for number, frame in enumerate(frames(1)):
             if number >= count:
                 yield from given(number, frame)
 

@@ -31,6 +31,7 @@ from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.coded_size import scaling
 from colmap_av1.video.container import VideoFile, open_stream, read_file
+from colmap_av1.video.deinterlacing import DEINTERLACING
 from colmap_av1.video.encoders import (
     ENCODERS,
     KEY_FRAME_DISTANCE,
@@ -39,7 +40,7 @@ from colmap_av1.video.encoders import (
     reason_of,
     settings,
 )
-from colmap_av1.video.facts import with_counted_packets
+from colmap_av1.video.facts import Video, read_video, with_counted_packets
 from colmap_av1.video.metadata.positions import read_positions
 from colmap_av1.video.metadata.telemetry import carrying, loss_of
 from colmap_av1.video.stored_frames import count_frames
@@ -84,10 +85,11 @@ def encode(
     """Convert a video to AV1 with backward references only, and one intra frame.
 
     Every frame of the video becomes one of the stream, none is dropped or doubled, and time
-    stamps are kept. Pictures are turned as players turn them, and downscaled where the options say
-    so; sound is left out. Where the video was taken, and how it was held, goes over to streams that
-    can hold it, else a warning says so. The stream appears under its name only when whole. Of a
-    damaged video the frames before the damage are converted, with a warning.
+    stamps are kept. Of pictures of two fields the first is taken. Pictures are turned as players
+    turn them, and downscaled where the options say so; sound is left out. Where the video was
+    taken, and how it was held, goes over to streams that can hold it, else a warning says so. The
+    stream appears under its name only when whole. Of a damaged video the frames before the damage
+    are converted, with a warning.
 
     Args:
         video: a video that ffmpeg decodes.
@@ -115,7 +117,7 @@ def encode(
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
     remove_leftovers(output.parent, output.name)
-    file = with_counted_packets(read_file(video))
+    file = with_counted_packets(read_video(video))
     place = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
     beside, carried = carrying(file, place, output_format) if telemetry else ([], [])
@@ -128,7 +130,7 @@ def encode(
         before += ["-ignore_editlist", "1"]
     how = [
         *("-i", f"file:{path}", *beside, "-map", f"0:{file.index}"),
-        *("-vf", ",".join([*scaling(options), encoder.upload])),
+        *("-vf", ",".join([*_filters(file, options), encoder.upload])),
         *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
         *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
         *("-progress", "pipe:1", "-f", output_format, *carried),
@@ -221,6 +223,11 @@ def stream_of(
         )
     how = {"overwrite": True, "strict": strict, "telemetry": False}
     return encode(file, output, **how, options=options, progress=progress)
+
+
+def _filters(video: Video, options: EncodeOptions) -> list[str]:
+    # Scaling would mix the fields, so it comes last.
+    return [*([DEINTERLACING] if video.is_interlaced else []), *scaling(options)]
 
 
 def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]) -> int:

@@ -9,7 +9,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import av
 import av.error
@@ -34,6 +34,8 @@ from colmap_av1.video.unchanged import file_state
 # FFmpeg names it in its summary of a file; PyAV gives no other access to it.
 _CROPPING = re.compile(r"^ +Frame Cropping: (\d+)/(\d+)/(\d+)/(\d+)$", re.MULTILINE)
 
+_File = TypeVar("_File", bound=VideoFile)
+
 # Of several, that an edit list shows: fewer make no video.
 _FEWEST_SHOWN = 2
 
@@ -51,6 +53,7 @@ class Video(VideoFile):
             an edit list shows several times counts once.
         doubtful_times: what of its container's times cannot be, and is left out, in words; None:
             nothing.
+        is_interlaced: its pictures are of two fields, one taken after the other.
         projection: how pictures of all directions lie in the plane, as `projection_of` numbers it;
             None: these are of a plane.
     """
@@ -59,6 +62,7 @@ class Video(VideoFile):
     display: Display
     presented: NDArray[np.int32] | None
     doubtful_times: str | None
+    is_interlaced: bool
     projection: int | None
 
 
@@ -99,6 +103,7 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
         display=display,
         presented=presented,
         doubtful_times=doubt,
+        is_interlaced=bool(frame.interlaced_frame),
         projection=projection_of(frame.side_data),
     )
 
@@ -206,7 +211,7 @@ def picture_times(video: Video) -> NDArray[np.float64] | None:
     return np.sort(np.array(times)) if times else None
 
 
-def with_counted_packets(file: VideoFile) -> VideoFile:
+def with_counted_packets(file: _File) -> _File:
     """The same facts, with the packets counted where the container does not say their number.
 
     Raises:
