@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 import types
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, ClassVar, TypeVar, cast
@@ -115,9 +116,14 @@ def declared_of(field: dataclasses.Field[Any]) -> Declared:
     return found
 
 
-def field_types(kind: type) -> dict[str, Any]:
+def field_types(kind: type) -> Mapping[str, Any]:
     """The types of a dataclass's fields, by name."""
-    return typing.get_type_hints(kind)
+    return _known_types(kind)
+
+
+@functools.cache  # a command line asks some hundred times
+def _known_types(kind: type) -> Mapping[str, Any]:
+    return types.MappingProxyType(typing.get_type_hints(kind))
 
 
 def members_of(hint: Any) -> tuple[Any, ...]:
