@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Pictures, Takes
-from colmap_av1.matching.features import (
+from colmap_av1.matching.features.sift import (
     FeatureExtractor,
     Features,
     masked_features,

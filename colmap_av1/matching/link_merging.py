@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.takes import Takes
-from colmap_av1.matching.features import Features
+from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.mapper_limits import MIN_INLIERS

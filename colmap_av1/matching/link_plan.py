@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.images.takes import Takes
-from colmap_av1.matching.features import Features
+from colmap_av1.matching.features.retrieval import similar_images
+from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.link_merging import connected_images
-from colmap_av1.matching.retrieval import similar_images
 from colmap_av1.matching.weak_gaps import weak_gaps
 from colmap_av1.options import LinkOptions, MatchOptions
 

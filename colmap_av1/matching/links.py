@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
 from colmap_av1.images.takes import Pictures, Takes
-from colmap_av1.matching.features import Features
+from colmap_av1.matching.features.overlays import without_overlays
+from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
 from colmap_av1.matching.link_matches import (
     Links,
@@ -216,7 +217,7 @@ def link_images(
         return {image: known[image] for image in wanted if image in known}
 
     def link(plan: Plan) -> LinkedImages:
-        features = look_at(plan.wanted, plan.effort)
+        features = without_overlays(look_at(plan.wanted, plan.effort), cameras)
         with clock.measure("links"):
             return _link(
                 *(plan, takes, matched, cameras, features), options=options, progress=progress

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_av1.matching.features import (
+from colmap_av1.matching.features.sift import (
     FeatureExtractor,
     Features,
     match_features,

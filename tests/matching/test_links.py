@@ -23,10 +23,10 @@ from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.evaluate import model_poses
 from colmap_av1.match import match
-from colmap_av1.matching.features import FeatureExtractor, Features, match_features
+from colmap_av1.matching.features.retrieval import similar_images
+from colmap_av1.matching.features.sift import FeatureExtractor, Features, match_features
 from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.link_merging import links_as_tracks
-from colmap_av1.matching.retrieval import similar_images
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.weak_gaps import weak_frames, weak_gaps
 from colmap_av1.model.colmap_model import camera_centres
@@ -259,6 +259,27 @@ def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
     assert made.far_views is not None
     assert made.far_views < 0.6
     _check_poses(made, LEFT_OUT, 0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_text_over_the_pictures_is_no_place_seen_again(
+    shared: Path, encode: Encode, tmp_path: Path
+) -> None:
+    """As drones' displays are recorded: the same in all pictures, 130 of which it would link."""
+    left_out = {*range(29, 39), *range(56, 66)}
+    clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
+    frames = np.array([picture for i, picture in enumerate(clip) if i not in left_out])
+    lines = {28: "DJI MINI 4 PRO  H 34.2m", 56: "D 112m HS 4.1 VS 0.0", 84: "REC 4K30 HDR 1/400"}
+    lines |= {742: "(c) Skyview Films GmbH", 770: "2026-05-11 ISO100 EV-0.3"}
+    for frame in frames:
+        for y, line in lines.items():
+            cv2.putText(frame, line, (14, y), cv2.FONT_HERSHEY_SIMPLEX, 0.75, (255, 255, 255), 2)
+    display = encode(frames, tmp_path / "display.mp4")
+    report = match(tmp_path / "a.db", display)
+    assert report.links.weak_gaps == ((28, 29), (45, 46))
+    assert report.links.num_links > 20
+    assert report.links.num_revisits < 25
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from colmap_av1.errors import ImageError
 from colmap_av1.images.files import read_image
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.names import image_file, natural_order
-from colmap_av1.matching.features import Features, masked_features, quick_features
+from colmap_av1.matching.features.overlays import without_overlays
+from colmap_av1.matching.features.sift import Features, masked_features, quick_features
 from colmap_av1.matching.link_matches import match_pairs
 from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
 from colmap_av1.model.colmap_model import ModelImage, camera_centres, posed_images
@@ -134,10 +135,11 @@ class FarViewCheck:
 
     def result(self) -> FarViews:
         """What the pictures say; all that are needed have been added."""
+        features = without_overlays(self._features, self._cameras)
         # Each pair is freed of outliers by a geometry of its own, not by the poses.
         found = match_pairs(
             self._pairs,
-            self._features,
+            features,
             cameras=self._cameras,
             verify=VerifyOptions(),
             run=RunOptions(),
@@ -146,11 +148,11 @@ class FarViewCheck:
         names, errors = [], []
         for (i, j), geometry in zip(found.pairs.tolist(), found.geometries, strict=True):
             a, b = geometry.inlier_matches.T
-            error = self._errors(i, j, self._features[i].xy[a], self._features[j].xy[b])
+            error = self._errors(i, j, features[i].xy[a], features[j].xy[b])
             if len(error):
                 names.append((self._images[i].name, self._images[j].name))
                 errors.append(float(np.median(error)))
-        sizes = [len(features.xy) for features in self._features.values()]
+        sizes = [len(own.xy) for own in features.values()]
         return FarViews(
             tuple(names),
             np.array(errors),

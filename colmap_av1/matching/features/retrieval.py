@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.matching.features import Features
+from colmap_av1.matching.features.sift import Features
 
 _NUM_WORDS = 64
 # Descriptors that the vocabulary is trained on.

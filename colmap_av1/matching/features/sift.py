@@ -108,6 +108,11 @@ def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask |
     return Features(features.xy[kept], features.descriptors[kept])
 
 
+def alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Bool [n] whether descriptors [n, 128] show the same, by COLMAP's limit."""
+    return np.asarray(np.einsum("ij,ij->i", a, b) >= np.cos(_MAX_ANGLE))
+
+
 def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     """Match features that are nearest to each other, by COLMAP's limits.
 
