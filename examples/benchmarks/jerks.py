@@ -6,8 +6,7 @@ Each place is a clip of its own: up to three gaps are cut into a sequence, at ea
 200 px and at most 12 degrees lie between two frames; in every second clip the frames on either side
 are blurred along the motion. `reconstruct` maps the clip as it does any, and `match` fills a
 database that COLMAP's mapper maps. Camera centres are compared with those of the whole
-sequence: the true ones, or those of SIFT's model of it, or, where that itself is not sure to half a
-per cent, those that the same way gives without a jerk. A model is bent whose centres are off by
+sequence: the true ones, or those of SIFT's model of it. A model is bent whose centres are off by
 more than half a per cent of their extent; what is said of it, and images left out, are counted.
 """
 
@@ -26,6 +25,7 @@ import clips as ruler
 import cv2
 import imageio_ffmpeg
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import phone_clip
 import render
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
@@ -54,11 +54,11 @@ from colmap_av1.model.colmap_model import read_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.video.decoding import decode_frames
 
-SEQUENCES = ("log_building", "ditch", "street", "holiday_display", "kitchen")
+# A rendered clip, its pictures at half their size, among sequences of ../shared.
+RENDERED = "orbit"
+RENDERED_SECONDS = 4
+SEQUENCES = ("log_building", "ditch", "street", "holiday_display", RENDERED)
 WAYS = ("reconstruct", "match, mapper")
-# Their true poses are off by 4 % of the extent, and models of all frames by different ways differ
-# by more than what makes one bent: the reference is the model that the same way makes of them.
-NOISY = ("kitchen",)
 PIXELS = (60.0, 200.0)
 DEGREES = 12.0
 MOST_GAPS = 3
@@ -66,6 +66,7 @@ MOST_GAPS = 3
 ROOM = 10
 # Lengths in pixels of the blur, of every second clip.
 BLURS = (9, 17, 25)
+EVERY_FRAME = ImageOptions(every=1)
 # Points of an image that say how far the picture moves.
 POINTS = 3000
 
@@ -82,8 +83,7 @@ class Whole:
         camera: what is known of its camera.
         forward_motion: see `MapOptions`.
         model: SIFT's model of it, by which places are chosen.
-        poses: by way, float64 [num_frames, 3, 4] true poses, or SIFT's model's, or that way's;
-            NaN where there is none.
+        poses: float64 [num_frames, 3, 4] true poses, or SIFT's model's; NaN where there is none.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Whole:
     camera: CameraOptions
     forward_motion: bool
     model: Any
-    poses: dict[str, NDArray[np.float64]]
+    poses: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -150,53 +150,49 @@ def main() -> int:
     # By sequence, so that the pictures of one are held at a time.
     for place in sorted(places, key=lambda place: (place % len(SEQUENCES), place)):
         name = SEQUENCES[place % len(SEQUENCES)]
-        if name not in arguments.sequences or not ruler.is_there(name):
+        if name not in arguments.sequences or not (name == RENDERED or ruler.is_there(name)):
             continue
         if whole is None or whole.name != name:
-            whole = whole_sequence(name, cache / name, arguments.ways, console)
+            whole = whole_sequence(name, cache / name, console)
         for row in try_place(whole, place, arguments.ways, cache / "place", console):
             save(arguments.results, [asdict(row)], ("place", "way"))
     print(render.jerks(read_rows(arguments.results)), end="")
     return 0
 
 
-def whole_sequence(name: str, folder: Path, ways: Sequence[str], console: Console) -> Whole:
-    """A sequence of ../shared with SIFT's model of it, and what models by some ways are held to."""
-    sequence = read_sequence(ruler.SEQUENCES / name)
-    video = ruler.as_shot(sequence, folder / "source")
-    known = sequence.camera is not None
-    camera = ruler.camera_options(sequence.camera) if known else CameraOptions()
+def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
+    """A clip with SIFT's model of it, and what models are held to."""
+    camera = CameraOptions()
+    if name == RENDERED:
+        full = phone_clip.phone_clip(folder / "clips", RENDERED_SECONDS)
+        halved = [
+            cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            for _, p in decode_frames(full)
+        ]
+        video, num_frames = folder / "orbit.mp4", len(halved)
+        write_clip(video, halved)
+        poses = phone_clip.true_poses(num_frames)
+    else:
+        sequence = read_sequence(ruler.SEQUENCES / name)
+        video = ruler.as_shot(sequence, folder / "source")
+        num_frames, poses = sequence.num_frames, sequence.cam_from_world
+        if sequence.camera is not None:
+            camera = ruler.camera_options(sequence.camera)
     case = next((case for case in ruler.CASES if case.name == name), ruler.Case(name))
-    footage = prepare_footage(
-        video,
-        folder / "footage",
-        num_frames=sequence.num_frames,
-        image_step=case.image_step,
-        camera=camera,
-    )
+    where = folder / "footage"
+    footage = prepare_footage(video, where, num_frames=num_frames, image_step=1, camera=camera)
     console.print(f"{name}: SIFT's model of the whole", markup=False)
     database = run_frontend("sift-sequential", footage, folder / "sift").database
+    known = camera.camera_params is not None
     settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
     mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
     if mapped.model is None:
         raise ColmapAv1Error(f"{name}: SIFT makes no model: see {folder / 'model'}")
     model = read_model(mapped.model)
-    poses = sequence.cam_from_world
     if poses is None:
-        poses = model_poses(model, sequence.num_frames)
+        poses = model_poses(model, num_frames)
     pictures = [picture for _, picture in decode_frames(video)]
-    whole = Whole(
-        *(name, pictures, camera, case.forward_motion, model),
-        poses=dict.fromkeys(ways, poses),
-    )
-    if name in NOISY:
-        for way in ways:
-            console.print(f"{name}: the whole by {way}", markup=False)
-            made, _ = way_of(way, whole, video, folder / "ways", every=case.image_step)
-            if made is None:
-                raise ColmapAv1Error(f"{name}: no model of the whole by {way}")
-            whole.poses[way] = model_poses(made, sequence.num_frames)
-    return whole
+    return Whole(name, pictures, camera, case.forward_motion, model, poses)
 
 
 def try_place(
@@ -222,8 +218,8 @@ def try_place(
     )
     rows = []
     for way in ways:
-        made, said = way_of(way, whole, clip, folder, every=1)
-        num_registered, ate = figures(whole.poses[way], made, kept)
+        made, said = way_of(way, whole, clip, folder)
+        num_registered, ate = figures(whole.poses, made, kept)
         row = Row(
             place=place,
             sequence=whole.name,
@@ -302,9 +298,7 @@ def write_clip(path: Path, pictures: Sequence[Image]) -> None:
     subprocess.run(command, input=b"".join(p.tobytes() for p in pictures), check=True)
 
 
-def way_of(
-    way: str, whole: Whole, clip: Path, folder: Path, *, every: int
-) -> tuple[Any | None, list[str]]:
+def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None, list[str]]:
     """The model that a way makes of a clip, if any, and what it says of it.
 
     Args:
@@ -312,14 +306,13 @@ def way_of(
         whole: what is known of the sequence.
         clip: the video.
         folder: folder for what the way writes, each in a folder of its own; emptied before.
-        every: one in so many frames is an image.
     """
     output = folder / way.partition(",")[0]
     shutil.rmtree(output, ignore_errors=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     run = run_reconstruct if way == "reconstruct" else run_match
     try:
-        given = (clip, output, whole.camera, whole.forward_motion, every)
+        given = (clip, output, whole.camera, whole.forward_motion)
         said = run_measured(run, *given, log=folder / "log").result
     except ColmapAv1Error as error:
         return None, [str(error)]
@@ -327,21 +320,16 @@ def way_of(
     return read_model(output / model), said
 
 
-def run_reconstruct(
-    clip: Path, output: Path, camera: CameraOptions, _: bool, every: int
-) -> list[str]:
+def run_reconstruct(clip: Path, output: Path, camera: CameraOptions, _: bool) -> list[str]:
     """The folder for trainers, as by the command with its defaults."""
-    images = ImageOptions(every=every)
-    options = ReconstructOptions(match=MatchOptions(camera=camera, images=images))
+    options = ReconstructOptions(match=MatchOptions(camera=camera, images=EVERY_FRAME))
     return about_the_model(reconstruct(clip, output, options=options).warnings)
 
 
-def run_match(
-    clip: Path, output: Path, camera: CameraOptions, forward: bool, every: int
-) -> list[str]:
+def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) -> list[str]:
     """A database, mapped by COLMAP's incremental mapper."""
     output.mkdir()
-    options = MatchOptions(camera=camera, images=ImageOptions(every=every))
+    options = MatchOptions(camera=camera, images=EVERY_FRAME)
     matched = match(output / "a.db", clip, image_path=output / "images", options=options)
     settings = MapOptions(refine_intrinsics=camera.camera_params is None, forward_motion=forward)
     mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
