@@ -211,6 +211,9 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
       start.size() != 2 * count) {
     throw std::invalid_argument("patches and positions do not fit each other");
   }
+  if (target.width <= 0 || target.height <= 0) {
+    throw std::invalid_argument("the picture's size is 0");
+  }
   const auto num_patches = static_cast<std::int64_t>(patches.pixels.size() / size);
   const FloatPicture picture(target, kMargin);
   FoundPatches found{.xy = {start.begin(), start.end()},
