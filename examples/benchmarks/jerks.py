@@ -82,7 +82,7 @@ class Whole:
         pictures: its frames.
         camera: what is known of its camera.
         forward_motion: see `MapOptions`.
-        model: SIFT's model of it, by which places are chosen.
+        model: SIFT's model of it, of the rendered clip ours, by which places are chosen.
         poses: float64 [num_frames, 3, 4] true poses, or SIFT's model's; NaN where there is none.
     """
 
@@ -161,38 +161,49 @@ def main() -> int:
 
 
 def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
-    """A clip with SIFT's model of it, and what models are held to."""
-    camera = CameraOptions()
+    """A clip with a model of it, and what models are held to."""
     if name == RENDERED:
-        full = phone_clip.phone_clip(folder / "clips", RENDERED_SECONDS)
-        halved = [
-            cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            for _, p in decode_frames(full)
-        ]
-        video, num_frames = folder / "orbit.mp4", len(halved)
-        write_clip(video, halved)
-        poses = phone_clip.true_poses(num_frames)
-    else:
-        sequence = read_sequence(ruler.SEQUENCES / name)
-        video = ruler.as_shot(sequence, folder / "source")
-        num_frames, poses = sequence.num_frames, sequence.cam_from_world
-        if sequence.camera is not None:
-            camera = ruler.camera_options(sequence.camera)
+        return whole_orbit(folder, console)
+    sequence = read_sequence(ruler.SEQUENCES / name)
+    video = ruler.as_shot(sequence, folder / "source")
+    known = sequence.camera is not None
+    camera = ruler.camera_options(sequence.camera) if known else CameraOptions()
     case = next((case for case in ruler.CASES if case.name == name), ruler.Case(name))
-    where = folder / "footage"
-    footage = prepare_footage(video, where, num_frames=num_frames, image_step=1, camera=camera)
+    footage = prepare_footage(
+        *(video, folder / "footage"),
+        num_frames=sequence.num_frames,
+        image_step=1,
+        camera=camera,
+    )
     console.print(f"{name}: SIFT's model of the whole", markup=False)
     database = run_frontend("sift-sequential", footage, folder / "sift").database
-    known = camera.camera_params is not None
     settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
     mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
     if mapped.model is None:
         raise ColmapAv1Error(f"{name}: SIFT makes no model: see {folder / 'model'}")
     model = read_model(mapped.model)
+    poses = sequence.cam_from_world
     if poses is None:
-        poses = model_poses(model, num_frames)
+        poses = model_poses(model, sequence.num_frames)
     pictures = [picture for _, picture in decode_frames(video)]
     return Whole(name, pictures, camera, case.forward_motion, model, poses)
+
+
+def whole_orbit(folder: Path, console: Console) -> Whole:
+    """The rendered clip, with the model that `reconstruct` makes of it."""
+    full = phone_clip.phone_clip(folder / "clips", RENDERED_SECONDS)
+    pictures = [
+        np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        for _, picture in decode_frames(full)
+    ]
+    write_clip(folder / "orbit.mp4", pictures)
+    console.print(f"{RENDERED}: a model of the whole", markup=False)
+    output = folder / "whole"
+    given = (folder / "orbit.mp4", output, CameraOptions(), False)
+    run_measured(run_reconstruct, *given, log=folder / "log")
+    model = read_model(output / "sparse" / "0")
+    poses = phone_clip.true_poses(len(pictures))
+    return Whole(RENDERED, pictures, CameraOptions(), False, model, poses)
 
 
 def try_place(
