@@ -13,6 +13,8 @@ from typing import Any
 import av.error
 import av.filter
 
+from colmap_av1.errors import BitstreamError
+
 _NAME, _OPTIONS = "bwdif", "mode=send_frame:deint=interlaced"
 # ffmpeg's words for it; a picture of a single moment in between stays as it is.
 DEINTERLACING = f"{_NAME}={_OPTIONS}"
@@ -21,21 +23,24 @@ DEINTERLACING = f"{_NAME}={_OPTIONS}"
 def deinterlaced(frames: Generator[Any, None, None]) -> Generator[Any, None, None]:
     """Frames as they are stored (av.VideoFrame), each with the lines of its first field alone.
 
-    Where `frames` ends by an error, those before it are given first.
+    Raises:
+        BitstreamError: as `frames`; those before the damage have been given.
     """
-    graph = None
+    graph = damage = None
     with closing(frames):
         try:
             for frame in frames:
                 graph = graph or _graph_for(frame)
                 graph.push(frame)
                 yield from _pulled(graph)
-        finally:
-            # It holds frames back, as their lines are taken from the next one, too.
-            if graph is not None:
-                graph.push(None)
-        if graph is not None:
-            yield from _pulled(graph)
+        except BitstreamError as error:
+            damage = error
+    if graph is not None:
+        # It holds frames back, as their lines are taken from the next one, too.
+        graph.push(None)
+        yield from _pulled(graph)
+    if damage is not None:
+        raise damage
 
 
 def _graph_for(frame: Any) -> Any:
