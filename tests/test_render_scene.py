@@ -41,7 +41,8 @@ def test_clip_has_one_picture_per_pose(scene, luma):
 
 
 def test_truth_file_is_the_scene(scene, truth):
-    np.testing.assert_array_equal(truth["cam_from_world"], scene.cam_from_world)
+    # The last bits of a sine are the processor's.
+    np.testing.assert_allclose(truth["cam_from_world"], scene.cam_from_world, rtol=0, atol=1e-13)
     assert truth["cam_from_world"].dtype == np.float64
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert truth[name] == getattr(scene, name)
