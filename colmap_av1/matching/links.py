@@ -217,8 +217,9 @@ def link_images(
         return {image: known[image] for image in wanted if image in known}
 
     def link(plan: Plan) -> LinkedImages:
-        features = without_overlays(look_at(plan.wanted, plan.effort), cameras)
+        features = look_at(plan.wanted, plan.effort)
         with clock.measure("links"):
+            features = without_overlays(features, cameras)
             return _link(
                 *(plan, takes, matched, cameras, features), options=options, progress=progress
             )

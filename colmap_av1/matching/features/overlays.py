@@ -53,8 +53,7 @@ def without_overlays(
         for image, own, share in zip(images, cells, shares, strict=True):
             kept = ~np.isin(own, over) & (share < _LEAST_SHARE)
             if not kept.all():
-                xy, descriptors = features[image].xy[kept], features[image].descriptors[kept]
-                found[image] = Features(xy, descriptors)
+                found[image] = features[image].only(kept)
     return found
 
 

@@ -39,6 +39,10 @@ class Features:
     xy: NDArray[np.float32]
     descriptors: NDArray[np.float32]
 
+    def only(self, kept: NDArray[np.bool_]) -> Features:
+        """Those of them that are kept: bool [n]."""
+        return Features(self.xy[kept], self.descriptors[kept])
+
 
 class FeatureExtractor:
     """Extracts SIFT features by pycolmap, on one thread.
@@ -104,8 +108,7 @@ def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask |
     """The features of a picture on pixels of it that count; None: all do."""
     if mask is None:
         return features
-    kept = mask.keeps(features.xy, picture.shape[1::-1])
-    return Features(features.xy[kept], features.descriptors[kept])
+    return features.only(mask.keeps(features.xy, picture.shape[1::-1]))
 
 
 def alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
