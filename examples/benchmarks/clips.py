@@ -214,12 +214,13 @@ def as_shot(sequence: Sequence, folder: Path) -> Path:
     return video
 
 
-def far_views(model: Path, images: Path) -> dict[str, float]:
+def far_views(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
     """How well views far apart agree with a model's poses: the columns of a row.
 
     Args:
         model: folder of a model with straight lines.
         images: folder of its images.
+        apart: images that lie between those of a pair at least.
 
     Returns:
         Median and 90 % quantile over pairs of images in pixels; nothing where the program that
@@ -227,7 +228,7 @@ def far_views(model: Path, images: Path) -> dict[str, float]:
     """
     if not FAR_VIEWS.is_file():
         return {}
-    command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(FAR)]
+    command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(apart)]
     said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
     found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
     return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}

@@ -567,6 +567,48 @@ def loops(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def stock_mappers(rows: list[Row]) -> str:
+    """Folder 0 of each mapper as it is."""
+
+    def images(row: Row) -> str:
+        return f"{row['registered']} of {row['images']}"
+
+    columns = [
+        words("sequence, way", "sequence", "way"),
+        Column("images in folder 0", images),
+        words("models", "models"),
+        figure("points", "points", ",.0f"),
+        figure("error px", "error_px", ".3f"),
+        figure("centres off, of extent", "ate_of_extent", ".2%"),
+        figure("database CPU s", "database_cpu_s", ".1f"),
+        figure("mapper CPU s", "mapper_cpu_s", ".1f"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
+
+
+def one_model(rows: list[Row]) -> str:
+    """Models of what is cut, in several videos, fast, or seen again."""
+
+    def links_share(row: Row) -> str:
+        return f"{float(row['links_cpu_s']) / float(row['cpu_s']):.0%}"
+
+    def far_views(row: Row) -> str:
+        return f"{float(row['far_views']):.2f} / {float(row['far_views_90']):.2f}"
+
+    columns = [
+        words("case", "case"),
+        words("images", "images"),
+        words("with a pose", "registered"),
+        figure("centres off SIFT's, of extent", "centres_off", ".2%"),
+        Column("far views px", far_views),
+        words("revisits", "revisits"),
+        words("links between videos", "between"),
+        figure("CPU s", "cpu_s", ".0f"),
+        Column("links", links_share),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'case')}"
+
+
 def splats(rows: list[Row]) -> str:
     """Renderings of Gaussians trained from all ways' folders, means of the seeds.
 
@@ -653,6 +695,8 @@ TABLES: dict[str, Callable[..., str]] = {
     "read_memory": plain,
     "rolling_shutter": rolling_shutter,
     "splats": splats,
+    "stock_mappers": stock_mappers,
+    "one_model": one_model,
     "long_video": plain,
     "batch": plain,
     "image_pairs": plain,

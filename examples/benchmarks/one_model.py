@@ -1,0 +1,184 @@
+"""Measure whether what shows the same becomes one model by `reconstruct`, and only that.
+
+python examples/benchmarks/one_model.py --cache benchmark_one_model
+
+Cases: `cut video`, log_building's frames 60 to 84 and then 0 to 29 and 46 to 59; `two halves`, its
+frames 0 to 42 and 43 to 84 as two videos; `two scenes`, ditch and log_building; `fast drone`,
+drone_park as it is; `long walk`, kitchen_long as it is, which comes back to where it was. Camera
+centres are compared with those of SIFT's model of the whole sequence, each model by itself; places
+seen again by the tool that matches pictures of images far apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import clips as ruler
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import render
+from jerks import Whole, whole_sequence, write_clip
+from numpy.typing import NDArray
+from results import add_results, read_rows, save
+from rich.console import Console
+
+from colmap_av1 import ColmapAv1Error, ReconstructOptions, ReconstructReport, reconstruct
+from colmap_av1.evaluate import pose_errors, read_sequence, run_measured
+from colmap_av1.evaluate.metrics.sequence import frame_number
+from colmap_av1.model.colmap_model import posed_images, read_model
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of a sequence as a video; None: its own video, all of it."""
+
+    sequence: str
+    frames: tuple[int, ...] | None = None
+
+
+# The videos of each case.
+CASES = {
+    "cut video": [Clip("log_building", (*range(60, 85), *range(30), *range(46, 60)))],
+    "two halves": [
+        Clip("log_building", tuple(range(43))),
+        Clip("log_building", tuple(range(43, 85))),
+    ],
+    "two scenes": [Clip("ditch"), Clip("log_building")],
+    "fast drone": [Clip("drone_park")],
+    "long walk": [Clip("kitchen_long")],
+}
+# How many images lie at least between those that are compared: in the long walk these are so far
+# apart that no track joins them.
+APART = {"long walk": 74}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of a case.
+
+    Attributes:
+        case: its name.
+        images: that were asked for.
+        registered: images of each model.
+        centres_off: largest error of a model's centres, as a share of the extent of SIFT's; None
+            where a model holds images of two scenes, or SIFT was not asked.
+        far_views: how far views that see the same miss each other, in pixels, in the median.
+        far_views_90: the 90 % quantile.
+        revisits: links between images that see a place again.
+        between: links between videos.
+        links_cpu_s: CPU seconds that links took.
+        cpu_s: CPU seconds of all.
+        said: warnings about what is not connected.
+    """
+
+    case: str
+    images: int
+    registered: str
+    centres_off: float | None
+    far_views: float | None
+    far_views_90: float | None
+    revisits: int
+    between: int
+    links_cpu_s: float
+    cpu_s: float
+    said: str
+
+
+def main() -> int:
+    """Try the cases, and keep and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for videos and models")
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    add_results(parser, "one_model")
+    arguments = parser.parse_args()
+    console = Console(stderr=True)
+    cache = arguments.cache.resolve()
+    for case in arguments.cases:
+        try:
+            row = measure(case, cache, console)
+        except ColmapAv1Error as error:
+            console.print(f"error: {case}: {error}", markup=False)
+            continue
+        save(arguments.results, [asdict(row)], ("case",))
+    print(render.one_model(read_rows(arguments.results)), end="")
+    return 0
+
+
+def measure(case: str, cache: Path, console: Console) -> Row:
+    """The row of a case."""
+    folder = cache / case.replace(" ", "_")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    names = dict.fromkeys(clip.sequence for clip in CASES[case])
+    held_to_sift = case not in APART
+    wholes = {n: whole_sequence(n, cache / n, console) for n in names} if held_to_sift else {}
+    videos = [
+        video_of(clip, wholes.get(clip.sequence), folder / f"{clip.sequence}_{number}.mp4")
+        for number, clip in enumerate(CASES[case])
+    ]
+    console.print(f"{case}: reconstruct", markup=False)
+    run = run_measured(run_reconstruct, videos, folder / "made", log=folder / "log")
+    report: ReconstructReport = run.result
+    outputs = [folder / "made", *(model.output for model in report.other_models)]
+    models = [read_model(output / "sparse" / "0") for output in outputs]
+    off = [centres_off(model, CASES[case], wholes) for model in models] if wholes else [None]
+    return Row(
+        case=case,
+        images=report.num_images,
+        registered=" and ".join(str(model.num_reg_images()) for model in models),
+        centres_off=None if None in off else max(value for value in off if value is not None),
+        **far_views(outputs[0], APART.get(case, ruler.FAR)),
+        revisits=report.links["num_revisits"],
+        between=report.links["num_between"],
+        links_cpu_s=report.cpu_seconds.get("links", 0.0),
+        cpu_s=run.cpu_seconds,
+        said="; ".join(report.warnings),
+    )
+
+
+def video_of(clip: Clip, whole: Whole | None, path: Path) -> Path:
+    """The video of a clip, by a name of its own."""
+    if clip.frames is None:
+        return Path(shutil.copyfile(read_sequence(ruler.SEQUENCES / clip.sequence).source, path))
+    assert whole is not None
+    write_clip(path, [whole.pictures[frame] for frame in clip.frames])
+    return path
+
+
+def run_reconstruct(videos: Sequence[Path], output: Path) -> ReconstructReport:
+    """The folder for trainers, as by the command with its defaults."""
+    return reconstruct(list(videos), output, options=ReconstructOptions())
+
+
+def centres_off(model: Any, clips: Sequence[Clip], wholes: dict[str, Whole]) -> float | None:
+    """How far a model's centres are off SIFT's, of their extent; None for images of two scenes."""
+    found: list[NDArray[np.float64]] = []
+    wanted: list[NDArray[np.float64]] = []
+    scenes = set()
+    for name, image in posed_images(model).items():
+        # Images of several videos lie in a folder each, named like the video, here by its number.
+        number = int(Path(name).parent.name.rpartition("_")[2]) if len(clips) > 1 else 0
+        clip, frame = clips[number], frame_number(name)
+        scenes.add(clip.sequence)
+        found.append(image.cam_from_world)
+        kept = frame if clip.frames is None else clip.frames[frame]
+        wanted.append(wholes[clip.sequence].poses[kept])
+    errors = pose_errors(np.array(found), np.array(wanted)) if len(scenes) == 1 else None
+    return None if errors is None else errors.ate / errors.extent
+
+
+def far_views(output: Path, apart: int) -> dict[str, float | None]:
+    """How far views so many images apart and more miss each other: the columns of the row."""
+    found = ruler.far_views(output / "sparse" / "0", output / "images", apart)
+    return {name: found.get(name) for name in ("far_views", "far_views_90")}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
