@@ -22,10 +22,10 @@ from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
-# Poses that are nearly right need no more steps: those after the seventh or eighth lower the error
-# by less than a thousandth each, and bring cameras no nearer to their true places.
+# The robust loss makes progress slow: steps that each lower the error by less than a thousandth
+# still bring far views of one place together.
 _ADJUSTMENT_STEPS = 20
-_ADJUSTMENT_TOLERANCE = 1e-3
+_ADJUSTMENT_TOLERANCE = 1e-4
 # Images up to which the matrix of all cameras is taken as dense: tracks of many images fill it, and
 # looking for its structure takes as long as solving it.
 _MOST_DENSE_IMAGES = 400
