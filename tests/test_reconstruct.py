@@ -546,9 +546,9 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
     adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
     errors, before = (pose_errors(p, truth.cam_from_world) for p in (adjusted, poses))
-    # With a loss that counts errors of half a pixel nearly in full it would be 0.44 and 0.59.
-    assert errors.ate < 0.4 * before.ate
-    assert errors.rotation < 0.45 * before.rotation
+    # With a loss that counts errors of half a pixel nearly in full it would be 0.40 and 0.75.
+    assert errors.ate < 0.35 * before.ate
+    assert errors.rotation < 0.6 * before.rotation
 
 
 def cameras_of(database: Path) -> list[tuple[int, bytes]]:

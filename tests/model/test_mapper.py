@@ -127,7 +127,7 @@ def test_the_end_of_a_video_bends_back(
     images = sorted(model.images.values(), key=lambda image: image.name)
     last = {image.image_id for image in images[-6:]}
     joint = images[-7].projection_center()
-    turn = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    turn = Rotation.from_euler("y", 4, degrees=True).as_matrix()
     bent = pycolmap.Sim3d(1.5, pycolmap.Rotation3d(turn), joint - 1.5 * turn @ joint)
     for point in model.points3D.values():
         if np.mean([element.image_id in last for element in point.track.elements]) > 0.5:
