@@ -30,6 +30,7 @@ from colmap_av1.matching.image_matches import (
     shape_of,
     verify_images,
 )
+from colmap_av1.matching.initial_pairs import bar_false_starts
 from colmap_av1.matching.link_merging import about_thin_gaps
 from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.shutter.correct import without_shutter
@@ -206,6 +207,7 @@ def match(
         cameras, linked = _match_images(
             images, database, listed, options, clock=clock, progress=progress
         )
+        written = bar_false_starts(linked.matched, cameras.of_images, clock=clock)
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -218,7 +220,7 @@ def match(
     with clock.measure("database"):
         positions = image_positions(images.takes, inputs.videos, inputs.photos)
         write_matched_images(
-            *(database, images.takes.images.names, cameras.new, linked.matched),
+            *(database, images.takes.images.names, cameras.new, written),
             on_existing=options.on_existing,
             places=positions.places,
         )
@@ -243,7 +245,7 @@ def match(
         seconds=clock.seconds,
         links=linked.report,
         warnings=(*inputs.warnings, *notes, *blurred),
-        **_figures([own.tracks for own in videos], linked.matched),
+        **_figures([own.tracks for own in videos], written),
     )
 
 

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
+
+from colmap_av1.images.camera import make_camera
+from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.initial_pairs import bar_false_starts
+from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.verify import verify_pairs
+from colmap_av1.options import CameraOptions
+from colmap_av1.util.progress import Clock
+
+CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
+PAIR = np.array([[0, 1]], dtype=np.int32)
+ANGLE = 6.0
+
+
+def two_views(
+    bend: float, rng: np.random.Generator, count: int = 160, angle: float = ANGLE
+) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
+    """Two views of a wall that bends away from them, `angle` degrees apart."""
+    x = rng.uniform((-0.4, -0.25), (0.4, 0.25), (count, 2))
+    depth = 1 + 0.3 * x[:, 0] + bend * (x**2).sum(axis=1)
+    points = np.c_[x * depth[:, None], depth]
+    turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
+    moved = (points - [np.radians(angle), 0, 0]) @ turn.T
+    keypoints = []
+    for frame, seen in enumerate((points, moved)):
+        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.15, (count, 2))
+        keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
+    own = np.arange(count, dtype=np.uint32)
+    return keypoints, np.c_[own, own]
+
+
+def verified(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> TwoViewGeometry:
+    return verify_pairs(keypoints, PAIR, [matches], CAMERA)[0]
+
+
+def barred(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
+    matched = MatchedImages(keypoints, PAIR, [geometry.inlier_matches], [geometry], False)
+    return bar_false_starts(matched, [CAMERA] * 2, clock=Clock()).geometries[0]
+
+
+def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> float:
+    """The triangulation angle by which COLMAP's mapper judges a pair, in degrees."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.min_num_trials = 30
+    options.ransac.max_error = 4.0
+    options.ransac.random_seed = 0
+    views = [w for k in keypoints for w in (CAMERA, k.xy.astype(float))]
+    found = pycolmap.estimate_two_view_geometry(*views, matches, options)
+    assert pycolmap.estimate_two_view_geometry_pose(*views, found)
+    return float(np.degrees(found.tri_angle))
+
+
+def test_parallax_taken_for_noise() -> None:
+    """Pairs that the mapper would take for half as far apart again do not begin a model."""
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        keypoints, matches = two_views(1.2, rng)
+        geometry = verified(keypoints, matches)
+        assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
+        assert angle_of_mapper(keypoints, geometry.inlier_matches) > 1.4 * ANGLE
+        found = barred(keypoints, geometry)
+        own, kept = (set(map(tuple, g.inlier_matches.tolist())) for g in (geometry, found))
+        assert kept < own
+        assert len(kept) == len(found.inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
+        rest = replace(found, inlier_matches=geometry.inlier_matches)
+        assert vars(rest) == vars(geometry)
+
+
+def test_plane() -> None:
+    """Where the pose of the homography is right the pair stays."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        keypoints, matches = two_views(0.0, rng, angle=14.0)
+        geometry = verified(keypoints, matches)
+        assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
+        assert 10 < angle_of_mapper(keypoints, geometry.inlier_matches) < 18
+        assert barred(keypoints, geometry) is geometry
+
+
+@pytest.mark.parametrize("count", [0, 15, 49])
+def test_pairs_that_cannot_start(count: int) -> None:
+    keypoints, matches = two_views(1.2, np.random.default_rng(2), count)
+    geometry = verified(keypoints, matches)
+    assert barred(keypoints, geometry) is geometry
+
+
+def test_unknown_focal_length() -> None:
+    keypoints, matches = two_views(1.2, np.random.default_rng(3))
+    unknown = make_camera(CameraOptions(), WIDTH, HEIGHT)
+    geometry = verify_pairs(keypoints, PAIR, [matches], unknown)[0]
+    assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
+    assert barred(keypoints, geometry) is geometry
