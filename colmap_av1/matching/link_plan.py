@@ -148,27 +148,23 @@ def plan_links(
     return Plan(gaps, around, key, between)
 
 
-def thorough_plan(
-    plan: Plan, takes: Takes, matched: MatchedImages, images_apart: float, *, anywhere: bool
-) -> Plan:
+def plan_anywhere(plan: Plan, takes: Takes, matched: MatchedImages, images_apart: float) -> Plan:
+    """The plan with places seen again: what lies on either side of a cut may go on anywhere."""
+    return replace(plan, key=_spread_over_videos(takes, matched, images_apart))
+
+
+def thorough_plan(plan: Plan, takes: Takes) -> Plan:
     """The plan with all of SIFT's features, for what few links connect.
 
     Args:
         plan: what was tried.
         takes: the images.
-        matched: the images, matched along tracks.
-        images_apart: images that each of these stands for, see `link_images`.
-        anywhere: look for places seen again anywhere: what lies on either side of a cut may go on
-            anywhere.
     """
-    key = plan.key
-    if anywhere and not key:
-        key = _spread_over_videos(takes, matched, images_apart)
     between: list[int] = []
     for first, last in _bounds_of_videos(takes):
         own = [image for image in plan.between if first <= image < last]
         between += own[:: max(1, -(-len(own) // _MOST_THOROUGH))]
-    return replace(plan, key=key, between=between, effort="full")
+    return replace(plan, between=between, effort="full")
 
 
 def _probes(

@@ -38,6 +38,7 @@ from colmap_av1.matching.link_plan import (
     pairs_beside,
     pairs_between,
     places_of,
+    plan_anywhere,
     plan_links,
     revisit_pairs,
     thorough_plan,
@@ -236,9 +237,11 @@ def link_images(
     else:
         nothing = no_tracks(takes.num_frames, _largest(cameras))
         linked = LinkedImages(matched, nothing, LinkReport(**_take_report(matched, takes)))
+    if linked.report.doubtful_gaps and not plan.key:
+        plan = plan_anywhere(plan, takes, matched, images_apart)
+        linked = link(plan)
     if plan.wanted and (linked.report.doubtful_gaps or linked.report.parts):
-        anywhere = bool(linked.report.doubtful_gaps)
-        linked = link(thorough_plan(plan, takes, matched, images_apart, anywhere=anywhere))
+        linked = link(thorough_plan(plan, takes))
     if len(linked.matched.pairs) == 0:
         if options.links.links != "none" and not found["light"]:
             look_at(np.linspace(0, len(takes.take) - 1, _NUM_GLANCED).round().astype(int), "light")

@@ -318,6 +318,22 @@ def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None
     assert alignment_error(found, centres) < bound * extent
 
 
+@pytest.mark.slow
+@pytest.mark.shared
+def test_cut_to_what_was_seen_elsewhere_needs_few_features(
+    shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The images on either side of the cut show nothing in common, others do."""
+    monkeypatch.delattr("colmap_av1.matching.links.thorough_plan")
+    clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
+    cut = encode(np.array([*clip[60:], *clip[:30], *clip[46:60]]), tmp_path / "cut.mp4")
+    report = match(tmp_path / "a.db", cut)
+    assert report.links.weak_gaps == report.links.broken_gaps == ((24, 25), (54, 55))
+    assert report.links.open_gaps == ()
+    assert report.links.num_revisits >= 2
+    assert check(tmp_path / "a.db").num_connected_images == 69
+
+
 def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
     """A cut from one place to another that shows nothing of the first."""
     first = np.array([image[:128, :192] for image in pictures()[:14]])
