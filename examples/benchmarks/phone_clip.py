@@ -5,7 +5,8 @@ python examples/benchmarks/phone_clip.py --seconds 10 --cache benchmark_phone
 The courtyard of `render_scene.py` at 1920x1080 and 30 frames a second, walked to and fro: with a
 hand's shake, motion blur of a 60th of a second, noise of a sensor, and H.264 of 16 Mbit a second
 with a key frame every second. A second of it is rendered in a minute or two; seconds that are in
-the cache are not rendered again, and a longer clip begins as a shorter one.
+the cache are not rendered again, and a longer clip begins as a shorter one. Half a minute is
+rendered; of longer clips the rest shows it backwards, forwards, and so on.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ _SAMPLES = 2  # over the exposure
 # Standard deviation in grey levels of a sensor's noise, and how far demosaicing spreads it.
 _NOISE, _SPREAD = 4.0, 0.6
 _SEED = 20240301
+# Seconds that are rendered at most.
+_RENDERED = 30
 PHONE = "-c:v libx264 -preset veryfast -b:v 16M -maxrate 24M -bufsize 24M -g 30 -bf 0"
 _LOSSLESS = "-c:v libx264 -preset ultrafast -qp 0"
 
@@ -61,7 +64,7 @@ def phone_clip(cache: Path, seconds: int) -> Path:
     if video.exists():
         return video
     cache.mkdir(parents=True, exist_ok=True)
-    parts = [_rendered_second(cache, number) for number in range(seconds)]
+    parts = [_second(cache, number) for number in range(seconds)]
     listed = cache / f"parts_{seconds}s.txt"
     listed.write_text("".join(f"file '{part.absolute()}'\n" for part in parts))
     with whole_file(video) as partial:
@@ -90,7 +93,8 @@ def poses_at(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def true_poses(num_frames: int) -> NDArray[np.float64]:
     """[n, 3, 4] poses of the first frames, at the middle of their exposure."""
-    return poses_at(np.arange(num_frames) / FPS)
+    sweep, frame = np.divmod(np.arange(num_frames), _RENDERED * FPS)
+    return poses_at(np.where(sweep % 2, _RENDERED * FPS - 1 - frame, frame) / FPS)
 
 
 @functools.cache
@@ -126,6 +130,20 @@ def _picture(frame: int) -> NDArray[np.uint8]:
     noise = cv2.GaussianBlur(noise, (0, 0), _SPREAD)
     noise *= _NOISE / noise.std()
     return np.asarray(np.clip(np.round(total / _SAMPLES + noise), 0, 255).astype(np.uint8))
+
+
+def _second(cache: Path, number: int) -> Path:
+    """A second of the clip, backwards in every second sweep of what is rendered."""
+    sweep, own = divmod(number, _RENDERED)
+    if sweep % 2 == 0:
+        return _rendered_second(cache, own)
+    forwards = _rendered_second(cache, _RENDERED - 1 - own)
+    part = forwards.with_name(f"back_{forwards.name}")
+    if not part.exists():
+        with whole_file(part) as partial:
+            words = ["-i", str(forwards), "-vf", "reverse", *_LOSSLESS.split()]
+            ruler.ffmpeg(*words, "-f", "mp4", str(partial))
+    return part
 
 
 def _rendered_second(cache: Path, number: int) -> Path:
