@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -29,6 +30,10 @@ _ADJUSTMENT_TOLERANCE = 1e-4
 # Images up to which the matrix of all cameras is taken as dense: tracks of many images fill it, and
 # looking for its structure takes as long as solving it.
 _MOST_DENSE_IMAGES = 400
+# Points that an image must see to be held by them, as COLMAP's mapper asks of one before it gets a
+# pose, unless all see few: then this share of what is usual. An image that a pillar fills saw 8
+# where others saw 300 and more, and was off by 300 times as much as they.
+FEW_SEEN = (30, 0.1)
 _LOG_START = f"{made_by('map')}\n".encode()
 
 # The file by itself: the whole package takes twice as long to import as pycolmap. Without '' on the
@@ -173,6 +178,24 @@ def adjust_model(
     }
     _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
     _check_whole(model)
+
+
+def without_unseen_images(model: Path) -> Any:
+    """Leave out of a model the images that hardly any of its points are seen in; read it.
+
+    Args:
+        model: folder of a COLMAP model; it is overwritten where an image is left out.
+    """
+    found = read_model(model)
+    counts = {number: image.num_points3D for number, image in found.images.items()}
+    most, share = FEW_SEEN
+    few = min(most, share * statistics.median(counts.values()))
+    unseen = [number for number, count in counts.items() if count < few]
+    for number in unseen:
+        found.deregister_frame(found.images[number].frame_id)
+    if unseen:
+        found.write_binary(model)
+    return found
 
 
 def _check_whole(model: Path) -> None:

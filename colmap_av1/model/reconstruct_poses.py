@@ -25,7 +25,7 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.model.mapper import adjust_model, map_poses
+from colmap_av1.model.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
 from colmap_av1.model.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.model.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.model.track_points import seen_in, to_model_points, triangulate_tracks
@@ -324,7 +324,7 @@ def adjustment_stage(
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
-        joints = model_joints(read_model(folder))
+        joints = model_joints(without_unseen_images(folder))
         return {
             "poses": "adjusted",
             "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
@@ -333,7 +333,7 @@ def adjustment_stage(
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
-    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALES, refine, *how)
+    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALES, FEW_SEEN, refine, *how)
     return run_stage(
         run.stages,
         "adjustment",

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.model import mapper as mapper_module
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.model.colmap_model import posed_images, read_model
 from colmap_av1.options import MapOptions, Mapper
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.progress import Progress, no_progress
@@ -171,3 +171,33 @@ def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
             )
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(("kept", "stays"), [(8, False), (29, False), (30, True)])
+def test_images_that_see_hardly_any_point_are_left_out(
+    made: ReconstructReport, tmp_path: Path, kept: int, stays: bool
+) -> None:
+    """Nothing but a few points tells their pose, as where something near fills the picture."""
+    model = read_model(made.output / ".stages" / "adjusted")
+    assert model.num_reg_images() == NUM_IMAGES
+    image = min(model.images.values(), key=lambda image: image.name)
+    seen = [index for index, p in enumerate(image.points2D) if p.has_point3D()]
+    for index in seen[kept:]:
+        model.delete_observation(image.image_id, index)
+    model.write_binary(tmp_path)
+    found = mapper_module.without_unseen_images(tmp_path)
+    names = {own.name for own in model.images.values()} - (set() if stays else {image.name})
+    assert set(posed_images(found)) == set(posed_images(read_model(tmp_path))) == names
+
+
+def test_images_of_a_model_of_few_points_stay(made: ReconstructReport, tmp_path: Path) -> None:
+    model = read_model(made.output / ".stages" / "adjusted")
+    by_length = sorted(model.points3D, key=lambda number: -model.points3D[number].track.length())
+    for number in by_length[25:]:
+        model.delete_point3D(number)
+    model.write_binary(tmp_path)
+    before = (tmp_path / "images.bin").read_bytes()
+    found = mapper_module.without_unseen_images(tmp_path)
+    assert 0 < min(image.num_points3D for image in found.images.values()) <= 25
+    assert found.num_reg_images() == NUM_IMAGES
+    assert (tmp_path / "images.bin").read_bytes() == before
