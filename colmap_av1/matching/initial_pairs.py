@@ -1,16 +1,23 @@
-"""Pairs that COLMAP's incremental mapper would start from with a pose that is not theirs."""
+"""Pairs from which COLMAP's incremental mapper would begin a model that fails."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.initial_adjustment import (
+    PairInliers,
+    inliers_of,
+    pose_of_essential,
+    pose_of_homography,
+    runaway_starts,
+    triangulation_angle,
+)
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_ANGLE, INITIAL_MIN_INLIERS
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
@@ -33,16 +40,17 @@ _SHARE = 0.9
 def bar_false_starts(
     matched: MatchedImages, cameras: Sequence[pycolmap.Camera], *, clock: Clock
 ) -> MatchedImages:
-    """Leave pairs whose homography tells a wrong pose fewer matches than a first pair needs.
+    """Leave pairs with which a model would begin wrongly fewer matches than a first pair needs.
 
     COLMAP's mapper takes a pair's pose from its homography wherever that explains most of the
-    matches (`EstimateTwoViewGeometryPose`). Where the matches themselves deny this pose, a model
-    that begins with it fails after a few images, and the mapper writes it all the same, first. The
-    pair keeps what it needs to link its images; tracks go through the pairs between.
+    matches (`EstimateTwoViewGeometryPose`). Where the matches themselves deny this pose, or the
+    adjustment of the pair alone takes its camera far off, a model that begins with it fails after
+    a few images, and the mapper writes it all the same, first. The pair keeps what it needs to
+    link its images; tracks go through the pairs between.
 
     Args:
-        matched: the images. Pairs without an essential matrix, as no focal length is known, cannot
-            be told and stay.
+        matched: the images. Whether the pose of the homography is right cannot be told of pairs
+            without an essential matrix, as no focal length is known.
         cameras: the camera of each image.
         clock: gets the stage "verification".
     """
@@ -52,8 +60,10 @@ def bar_false_starts(
             if _may_start(geometry):
                 # They tell as much as all do.
                 few = _thinned(geometry)
-                if _denied(few, *_inliers(matched, cameras, pair, few)):
+                if _denied(few, inliers_of(matched, cameras, pair, few)):
                     geometries[k] = few
+        for k in runaway_starts(replace(matched, geometries=geometries), cameras):
+            geometries[k] = _thinned(geometries[k])
     return replace(matched, geometries=geometries)
 
 
@@ -66,46 +76,20 @@ def _may_start(geometry: TwoViewGeometry) -> bool:
     )
 
 
-def _inliers(
-    matched: MatchedImages,
-    cameras: Sequence[pycolmap.Camera],
-    pair: Sequence[int],
-    geometry: TwoViewGeometry,
-) -> tuple[list[_Floats], list[_Floats]]:
-    """The inliers in both images, normalised coordinates [2, n], and the calibration matrices."""
-    points, matrices = [], []
-    for image, chosen in zip(pair, geometry.inlier_matches.T, strict=True):
-        xy = matched.keypoints[image].xy[chosen].astype(np.float64)
-        points.append(np.asarray(cameras[image].cam_from_img(xy), dtype=np.float64))
-        matrices.append(np.asarray(cameras[image].calibration_matrix()))
-    # Some pixels of a wide lens have no ray in front of the camera.
-    known = np.isfinite(points[0] + points[1]).all(axis=1)
-    return [x[known].T for x in points], matrices
-
-
-def _denied(geometry: TwoViewGeometry, x: list[_Floats], matrices: list[_Floats]) -> bool:
+def _denied(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
     """Whether the matches say that the pose of the homography is not that of the pair."""
-    rays = [np.vstack([own, np.ones(own.shape[1])]) for own in x]
-    rays = [own / np.linalg.norm(own, axis=0) for own in rays]
-    found = pycolmap.pose_from_homography_matrix(geometry.H, *matrices, *(own.T for own in rays))
-    pose = np.asarray(found["cam2_from_cam1"].matrix())
-    angle = _angle(pose[:, :3], rays)
-    if angle < _ANGLE:
-        return False
     of_pair = geometry.E
     assert of_pair is not None
-    a, b = (np.ascontiguousarray(own.T) for own in x)
-    rotation = cv2.recoverPose(of_pair, a, b, np.eye(3))[1]
-    if angle < _MUCH_WIDER * _angle(rotation, rays):
+    assert geometry.H is not None
+    pose = pose_of_homography(geometry.H, inliers)
+    angle = triangulation_angle(pose[:, :3], inliers.rays)
+    if angle < _ANGLE:
+        return False
+    rotation = pose_of_essential(of_pair, inliers)[:, :3]
+    if angle < _MUCH_WIDER * triangulation_angle(rotation, inliers.rays):
         return False
     of_pose = essential_of_poses(np.eye(3, 4), pose)
-    return _error(of_pose, x) > _MUCH_WORSE * _error(of_pair, x)
-
-
-def _angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
-    """Triangulation angle of the matches in degrees, by the rotation to the second camera."""
-    cosine = ((rotation @ rays[0]) * rays[1]).sum(axis=0)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+    return _error(of_pose, inliers.x) > _MUCH_WORSE * _error(of_pair, inliers.x)
 
 
 def _error(E: _Floats, x: Sequence[_Floats]) -> float:

@@ -8,6 +8,8 @@ MIN_INLIERS = 15
 INITIAL_MIN_INLIERS = 100
 INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
+# Points of it that are seen with that angle: the third image needs them (abs_pose_min_num_inliers).
+INITIAL_MIN_POINTS = 30
 # Where no pair has that angle, the mapper halves it twice.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
 # The value of init_max_forward_motion with which forward motion keeps no pair from being first.

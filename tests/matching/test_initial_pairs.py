@@ -20,6 +20,7 @@ from colmap_av1.options import CameraOptions
 from colmap_av1.util.progress import Clock
 
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
+GUESSED = make_camera(CameraOptions(camera_model="SIMPLE_RADIAL"), WIDTH, HEIGHT)
 PAIR = np.array([[0, 1]], dtype=np.int32)
 ANGLE = 6.0
 
@@ -36,6 +37,22 @@ def two_views(
     keypoints = []
     for frame, seen in enumerate((points, moved)):
         xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.15, (count, 2))
+        keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
+    own = np.arange(count, dtype=np.uint32)
+    return keypoints, np.c_[own, own]
+
+
+def turned_views(
+    spread: float, depth: float, count: int, rng: np.random.Generator
+) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
+    """Two views 20 degrees apart, of what lies within `spread` of the axis and `depth` of 1."""
+    x = rng.uniform((-spread, -spread), (spread, spread), (count, 2))
+    points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
+    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    moved = (points - [0, 0, 1]) @ turn.T + [0, 0, 1]
+    keypoints = []
+    for frame, seen in enumerate((points, moved)):
+        xy = GUESSED.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
         keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
     own = np.arange(count, dtype=np.uint32)
     return keypoints, np.c_[own, own]
@@ -102,3 +119,29 @@ def test_unknown_focal_length() -> None:
     geometry = verify_pairs(keypoints, PAIR, [matches], unknown)[0]
     assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
     assert barred(keypoints, geometry) is geometry
+
+
+def test_camera_adjusted_far_off() -> None:
+    """Where a hundred matches leave the focal length and the distortion open, a pair is not first.
+
+    But where there is no better one it stays: nothing is gained then.
+    """
+    rng = np.random.default_rng(4)
+    better = turned_views(0.25, 0.3, 400, rng)
+    num_barred = 0
+    for _ in range(10):
+        narrow = turned_views(0.1, 0.02, 120, rng)
+        pairs = [narrow, better]
+        keypoints = [k for own, _ in pairs for k in own]
+        geometries = [verify_pairs(own, PAIR, [m], GUESSED)[0] for own, m in pairs]
+        assert len(geometries[0].inlier_matches) >= INITIAL_MIN_INLIERS
+        both = np.array([[0, 1], [2, 3]], dtype=np.int32)
+        matched = MatchedImages(keypoints, both, [m for _, m in pairs], geometries, False)
+        found = bar_false_starts(matched, [GUESSED] * 4, clock=Clock()).geometries
+        assert found[1] is geometries[1]
+        if found[0] is not geometries[0]:
+            num_barred += 1
+            assert len(found[0].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
+        alone = replace(matched, keypoints=narrow[0], pairs=PAIR, geometries=geometries[:1])
+        assert bar_false_starts(alone, [GUESSED] * 2, clock=Clock()).geometries[0] is geometries[0]
+    assert num_barred > 5

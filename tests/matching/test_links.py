@@ -376,3 +376,9 @@ def test_camera_too_fast_for_motion_is_linked(shared: Path, tmp_path: Path) -> N
     assert len(report.links.weak_gaps) == 36
     assert len(report.links.broken_gaps) > 12
     assert check(tmp_path / "a.db").num_connected_images == 37
+    # No focal length is known, and what the camera flies over is flat.
+    for seed in range(2):
+        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, extract_colors=False)
+        (tmp_path / f"{seed}").mkdir()
+        where = tmp_path / "a.db", tmp_path, tmp_path / f"{seed}"
+        assert pycolmap.incremental_mapping(*where, options)[0].num_reg_images() == 37

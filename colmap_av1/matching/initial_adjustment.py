@@ -1,0 +1,322 @@
+"""Pairs from which COLMAP's incremental mapper would adjust a camera far off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.mapper_limits import (
+    INITIAL_MAX_FORWARD_MOTION,
+    INITIAL_MIN_ANGLE,
+    INITIAL_MIN_INLIERS,
+    INITIAL_MIN_POINTS,
+    MIN_INLIERS,
+)
+from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
+
+_Floats = NDArray[np.float64]
+
+# The mapper looks for a first pair in the images of most matches, in as many at a time as there
+# are cores, and takes what is found first; where nothing is, in all others.
+_NUM_FIRST_IMAGES, _NUM_LOOKED = 16, 100
+# It searches a pair's pose anew, at random and with so many trials at least, within 4 px: what it
+# takes at one time it leaves at another where it is this close to its limits, as a factor of the
+# inliers and the angle and in forward motion.
+_NUM_TRIALS, _MAX_ERROR = 30, 4.0
+_NUM_SEEDS = 2
+_MARGIN, _FORWARD_MARGIN = 1.1, 0.02
+# Matches that show whether to search at all.
+_NUM_GLANCED = 64
+_LEAST_ANGLE = 0.75 * INITIAL_MIN_ANGLE
+# How far a focal length may be adjusted, as a factor, and a distortion parameter, by addition. The
+# mapper registers no images beside such whose parameters passed 1.
+_FAR, _DISTORTED = 2.0, 0.5
+# The limits of the mapper itself: focal lengths in longer sides of the image, distortion
+# (min_focal_length_ratio, max_focal_length_ratio, max_extra_param).
+_SANE = 0.1, 10.0, 1.0
+# As the mapper where there are few images.
+_NUM_ITERATIONS, _GRADIENT_TOLERANCE = 100, 0.1
+
+
+@dataclass(frozen=True)
+class PairInliers:
+    """The inliers of a pair.
+
+    Attributes:
+        cameras: that of the first image and of the second.
+        xy: float64 [n, 2] of each image, in pixels.
+        x: float64 [2, n] of each image, normalised coordinates without distortion.
+    """
+
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera]
+    xy: tuple[_Floats, _Floats]
+    x: tuple[_Floats, _Floats]
+
+    @property
+    def rays(self) -> list[_Floats]:
+        """Unit vectors to the inliers, float64 [3, n] of each image."""
+        rays = [np.vstack([own, np.ones(own.shape[1])]) for own in self.x]
+        return [own / np.linalg.norm(own, axis=0) for own in rays]
+
+
+def inliers_of(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    pair: Sequence[int],
+    geometry: TwoViewGeometry,
+) -> PairInliers:
+    """The inliers of a pair that have a ray in front of both cameras."""
+    a, b = (
+        matched.keypoints[image].xy[chosen].astype(np.float64)
+        for image, chosen in zip(pair, geometry.inlier_matches.T, strict=True)
+    )
+    return _seen((cameras[pair[0]], cameras[pair[1]]), (a, b))
+
+
+def _seen(
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera], xy: tuple[_Floats, _Floats]
+) -> PairInliers:
+    """The matches that have a ray in front of both cameras."""
+    a, b = (
+        np.asarray(camera.cam_from_img(own), dtype=np.float64)
+        for camera, own in zip(cameras, xy, strict=True)
+    )
+    # Some pixels of a wide lens have none.
+    known = np.isfinite(a + b).all(axis=1)
+    return PairInliers(cameras, (xy[0][known], xy[1][known]), (a[known].T, b[known].T))
+
+
+def pose_of_homography(H: _Floats, inliers: PairInliers) -> _Floats:
+    """The pose that COLMAP's mapper takes from a homography, float64 [3, 4]."""
+    matrices = [camera.calibration_matrix() for camera in inliers.cameras]
+    found = pycolmap.pose_from_homography_matrix(H, *matrices, *(own.T for own in inliers.rays))
+    return np.asarray(found["cam2_from_cam1"].matrix())
+
+
+def pose_of_essential(E: _Floats, inliers: PairInliers) -> _Floats:
+    """The pose by an essential matrix that has most inliers in front, float64 [3, 4]."""
+    a, b = (np.ascontiguousarray(own.T) for own in inliers.x)
+    _, rotation, translation, _ = cv2.recoverPose(E, a, b, np.eye(3))
+    return np.column_stack([rotation, translation])
+
+
+def triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
+    """Triangulation angle of the matches in degrees, by the rotation to the second camera."""
+    cosine = ((rotation @ rays[0]) * rays[1]).sum(axis=0)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+
+
+def runaway_starts(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> list[int]:
+    """Find pairs that would begin a model with a camera that is adjusted far off.
+
+    The mapper adjusts focal length and distortion to its first two images alone. Where a hundred
+    matches leave these open, they may end anywhere: no third image joins, and the mapper writes
+    the two as its first model. Pairs are looked at in the mapper's order, those of each image up
+    to one that it takes for certain and that holds.
+
+    Args:
+        matched: the images.
+        cameras: the camera of each image.
+
+    Returns:
+        Indices of pairs. None of them where no pair holds that is looked at: the mapper then fares
+        no better with another.
+    """
+    starts: dict[int, _Start | None] = {}
+    num_certain = 0
+    for num_looked, of_image in enumerate(_in_order(matched, cameras)):
+        if num_looked >= _NUM_FIRST_IMAGES and num_certain:
+            break
+        for k in of_image:
+            if k not in starts:
+                pair = matched.pairs[k].tolist()
+                starts[k] = _look(matched, cameras, pair, matched.geometries[k])
+            start = starts[k]
+            if start is not None and start.holds and start.is_certain:
+                num_certain += 1
+                break
+    holds = {k: start.holds for k, start in starts.items() if start is not None}
+    return [k for k in sorted(holds) if not holds[k]] if any(holds.values()) else []
+
+
+def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Iterator[list[int]]:
+    """The pairs of each image that the mapper looks at first, those of most matches first."""
+    counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
+    used = np.where(counts >= MIN_INLIERS, counts, 0)
+    pairs = matched.pairs.reshape(-1, 2)
+    totals = np.zeros(len(cameras), dtype=np.intp)
+    for side in pairs.T:
+        np.add.at(totals, side, used)
+    known = np.array([camera.has_prior_focal_length for camera in cameras], dtype=bool)
+    for image in np.lexsort((-totals, ~known))[:_NUM_LOOKED]:
+        own = np.flatnonzero((pairs == image).any(axis=1) & (counts >= INITIAL_MIN_INLIERS))
+        yield own[np.argsort(-counts[own], kind="stable")].tolist()
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A pair with which the mapper may begin.
+
+    Attributes:
+        holds: the cameras stay near what they were.
+        is_certain: the mapper begins with it at any time.
+    """
+
+    holds: bool
+    is_certain: bool
+
+
+def _look(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    pair: Sequence[int],
+    geometry: TwoViewGeometry,
+) -> _Start | None:
+    """Begin with a pair as the mapper does; None where it leaves it."""
+    step = max(1, len(geometry.inlier_matches) // _NUM_GLANCED)
+    some = replace(geometry, inlier_matches=geometry.inlier_matches[::step])
+    if not _is_wide(some, inliers_of(matched, cameras, pair, some)):
+        return None
+    inliers = inliers_of(matched, cameras, pair, geometry)
+    begun = []
+    for seed in range(_NUM_SEEDS):
+        start = _begun(inliers, seed)
+        if start is not None:
+            begun.append(start)
+            if not start.holds:
+                return start
+    if not begun:
+        return None
+    return _Start(True, len(begun) == _NUM_SEEDS and all(start.is_certain for start in begun))
+
+
+def _is_wide(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
+    """Whether the views are about as far apart as the mapper asks, and not along the axis."""
+    if geometry.config in FLAT_CONFIGS and geometry.H is not None:
+        pose = pose_of_homography(geometry.H, inliers)
+    else:
+        E = geometry.E
+        if E is None and geometry.F is not None:
+            a, b = (camera.calibration_matrix() for camera in inliers.cameras)
+            E = b.T @ geometry.F @ a
+        if E is None:
+            return False
+        pose = pose_of_essential(E, inliers)
+    angle = triangulation_angle(pose[:, :3], inliers.rays)
+    forward = abs(pose[2, 3])
+    return bool(angle >= _LEAST_ANGLE and forward <= INITIAL_MAX_FORWARD_MOTION + _FORWARD_MARGIN)
+
+
+def _begun(inliers: PairInliers, seed: int) -> _Start | None:
+    """Search the pose of a pair and adjust it; None where the mapper looks for another pair."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.min_num_trials = _NUM_TRIALS
+    options.ransac.max_error = _MAX_ERROR
+    pycolmap.set_random_seed(seed)
+    if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 there is one for all
+        options.ransac.random_seed = seed
+    own = np.arange(len(inliers.xy[0]), dtype=np.uint32)
+    views = (inliers.cameras[0], inliers.xy[0], inliers.cameras[1], inliers.xy[1])
+    found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
+    if not pycolmap.estimate_two_view_geometry_pose(*views, found):
+        return None
+    angle = float(np.degrees(found.tri_angle))
+    pose = np.asarray(found.cam2_from_cam1.matrix())
+    forward = abs(pose[2, 3])
+    count = len(found.inlier_matches)
+    # The margins on this side: another search may take what this one leaves.
+    if (
+        count * _MARGIN < INITIAL_MIN_INLIERS
+        or angle * _MARGIN < INITIAL_MIN_ANGLE
+        or forward > INITIAL_MAX_FORWARD_MOTION + _FORWARD_MARGIN
+    ):
+        return None
+    rows = found.inlier_matches[:, 0]
+    # From COLMAP 4.2 on a focal length that is not known is estimated with the pose.
+    a, b = getattr(found, "camera1", None), getattr(found, "camera2", None)
+    if a is not None and b is not None:
+        if inliers.cameras[0] is inliers.cameras[1]:
+            b = a
+        inliers = _seen((a, b), (inliers.xy[0][rows], inliers.xy[1][rows]))
+        rows = np.arange(len(inliers.xy[0]))
+    holds = _holds(inliers, rows, pose)
+    if holds is None:
+        return None
+    enough = count >= _MARGIN * INITIAL_MIN_INLIERS
+    wide = angle >= _MARGIN * INITIAL_MIN_ANGLE
+    aside = bool(forward <= INITIAL_MAX_FORWARD_MOTION - _FORWARD_MARGIN)
+    return _Start(holds, enough and wide and aside)
+
+
+def _holds(inliers: PairInliers, rows: NDArray[np.integer[Any]], pose: _Floats) -> bool | None:
+    """Whether the cameras stay near what they were; None where too few points come about."""
+    x = [own[:, rows] for own in inliers.x]
+    points = cv2.triangulatePoints(np.eye(3, 4), pose, *x)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = np.asarray(points[:3] / points[3]).T
+    inside = np.isfinite(points).all(axis=1)
+    points = np.where(inside[:, None], points, 0.0)
+    seen = points @ pose[:, :3].T + pose[:, 3]
+    inside &= (points[:, 2] > 0) & (seen[:, 2] > 0)
+    # Angles between lines of sight, in the second camera.
+    sides = np.stack([seen - pose[:, 3], seen])
+    lengths = np.linalg.norm(sides, axis=2)
+    cosine = (sides[0] * sides[1]).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-12)
+    inside &= np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) >= INITIAL_MIN_ANGLE
+    if inside.sum() < INITIAL_MIN_POINTS:
+        return None
+    model = _adjusted(inliers, pose, points[inside], rows[inside].tolist())
+    return all(
+        _is_near(model.images[k + 1].camera, camera) for k, camera in enumerate(inliers.cameras)
+    )
+
+
+def _is_near(found: pycolmap.Camera, given: pycolmap.Camera) -> bool:
+    if given.has_bogus_params(*_SANE):
+        return False
+    focal = given.focal_length_idxs()
+    extra = given.extra_params_idxs()
+    factors = found.params[focal] / given.params[focal]
+    added = np.abs(found.params[extra] - given.params[extra])
+    return bool(((factors < _FAR) & (factors > 1 / _FAR)).all() and (added < _DISTORTED).all())
+
+
+def _adjusted(
+    inliers: PairInliers, pose: _Floats, points: _Floats, rows: Sequence[int]
+) -> pycolmap.Reconstruction:
+    """Adjust the pair as the mapper does: both images, what they see, focal lengths, distortion."""
+    model = pycolmap.Reconstruction()
+    cameras = list({id(camera): camera for camera in inliers.cameras}.values())
+    for number, camera in enumerate(cameras, 1):
+        own = pycolmap.Camera(camera.todict() | {"camera_id": number})
+        model.add_camera_with_trivial_rig(own)
+    poses = pycolmap.Rigid3d(), pycolmap.Rigid3d(pose)
+    for k, (camera, xy, own) in enumerate(zip(inliers.cameras, inliers.xy, poses, strict=True), 1):
+        number = next(n for n, of_pair in enumerate(cameras, 1) if of_pair is camera)
+        image = pycolmap.Image(image_id=k, name=str(k), camera_id=number, keypoints=xy)
+        model.add_image_with_trivial_frame(image, own)
+    for xyz, row in zip(points, rows, strict=True):
+        track = pycolmap.Track()
+        track.add_element(1, row)
+        track.add_element(2, row)
+        model.add_point3D(xyz, track)
+    config = pycolmap.BundleAdjustmentConfig()
+    config.add_image(1)
+    config.add_image(2)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    solver = getattr(options, "ceres", options).solver_options  # its own before COLMAP 4
+    solver.num_threads = 1
+    solver.max_num_iterations = _NUM_ITERATIONS
+    solver.function_tolerance = solver.parameter_tolerance = 0.0
+    solver.gradient_tolerance = _GRADIENT_TOLERANCE
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    return model
