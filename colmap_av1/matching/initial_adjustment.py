@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -223,7 +222,11 @@ def _begun(inliers: PairInliers, seed: int) -> _Start | None:
     if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 there is one for all
         options.ransac.random_seed = seed
     own = np.arange(len(inliers.xy[0]), dtype=np.uint32)
-    views = (inliers.cameras[0], inliers.xy[0], inliers.cameras[1], inliers.xy[1])
+    # A focal length that is a guess counts as known: COLMAP 4.2 would estimate it with the pose, by
+    # a solver that some pairs crash.
+    a, b = (pycolmap.Camera(own.todict()) for own in inliers.cameras)
+    a.has_prior_focal_length = b.has_prior_focal_length = True
+    views = (a, inliers.xy[0], b, inliers.xy[1])
     found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
     if not pycolmap.estimate_two_view_geometry_pose(*views, found):
         return None
@@ -238,15 +241,7 @@ def _begun(inliers: PairInliers, seed: int) -> _Start | None:
         or forward > INITIAL_MAX_FORWARD_MOTION + _FORWARD_MARGIN
     ):
         return None
-    rows = found.inlier_matches[:, 0]
-    # From COLMAP 4.2 on a focal length that is not known is estimated with the pose.
-    a, b = getattr(found, "camera1", None), getattr(found, "camera2", None)
-    if a is not None and b is not None:
-        if inliers.cameras[0] is inliers.cameras[1]:
-            b = a
-        inliers = _seen((a, b), (inliers.xy[0][rows], inliers.xy[1][rows]))
-        rows = np.arange(len(inliers.xy[0]))
-    holds = _holds(inliers, rows, pose)
+    holds = _holds(inliers, found.inlier_matches[:, 0], pose)
     if holds is None:
         return None
     enough = count >= _MARGIN * INITIAL_MIN_INLIERS
@@ -255,7 +250,7 @@ def _begun(inliers: PairInliers, seed: int) -> _Start | None:
     return _Start(holds, enough and wide and aside)
 
 
-def _holds(inliers: PairInliers, rows: NDArray[np.integer[Any]], pose: _Floats) -> bool | None:
+def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
     """Whether the cameras stay near what they were; None where too few points come about."""
     x = [own[:, rows] for own in inliers.x]
     points = cv2.triangulatePoints(np.eye(3, 4), pose, *x)
