@@ -228,7 +228,7 @@ def match(
     notes = inputs.with_names([own.tracked.warnings for own in videos])
     notes += (*positions.warnings, *cameras.warnings, *linked.report.warnings)
     if options.on_existing != "append":  # what a database holds already may join the images, too
-        notes += about_thin_gaps(linked.matched, images.takes)
+        notes += about_thin_gaps(written, images.takes)
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),

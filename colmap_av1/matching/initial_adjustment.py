@@ -31,9 +31,9 @@ _NUM_FIRST_IMAGES, _NUM_LOOKED = 16, 100
 _NUM_TRIALS, _MAX_ERROR = 30, 4.0
 _NUM_SEEDS = 2
 _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
-# Matches that show whether to search at all.
+# Matches that show whether to search at all, and the share of the angle that they have to.
 _NUM_GLANCED = 64
-_LEAST_ANGLE = 0.75 * INITIAL_MIN_ANGLE
+_LEAST = 0.75
 # How far a focal length may be adjusted, as a factor, and a distortion parameter, by addition. The
 # mapper registers no images beside such whose parameters passed 1.
 _FAR, _DISTORTED = 2.0, 0.5
@@ -181,73 +181,83 @@ def _look(
     """Begin with a pair as the mapper does; None where it leaves it."""
     step = max(1, len(geometry.inlier_matches) // _NUM_GLANCED)
     some = replace(geometry, inlier_matches=geometry.inlier_matches[::step])
-    if not _is_wide(some, inliers_of(matched, cameras, pair, some)):
+    glanced = inliers_of(matched, cameras, pair, some)
+    pose = _pose(geometry, glanced)
+    if pose is None or not _is_wide(pose, triangulation_angle(pose[:, :3], glanced.rays), _LEAST):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
     begun = []
-    for seed in range(_NUM_SEEDS):
-        start = _begun(inliers, seed)
+    for found in _poses(geometry, inliers):
+        start = _begun(inliers, *found)
         if start is not None:
             begun.append(start)
             if not start.holds:
                 return start
     if not begun:
         return None
-    return _Start(True, len(begun) == _NUM_SEEDS and all(start.is_certain for start in begun))
+    return _Start(True, len(begun) >= _NUM_SEEDS and all(start.is_certain for start in begun))
 
 
-def _is_wide(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
-    """Whether the views are about as far apart as the mapper asks, and not along the axis."""
+def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
+    """The pose by a pair's geometry, float64 [3, 4]."""
     if geometry.config in FLAT_CONFIGS and geometry.H is not None:
-        pose = pose_of_homography(geometry.H, inliers)
-    else:
-        E = geometry.E
-        if E is None and geometry.F is not None:
-            a, b = (camera.calibration_matrix() for camera in inliers.cameras)
-            E = b.T @ geometry.F @ a
-        if E is None:
-            return False
-        pose = pose_of_essential(E, inliers)
-    angle = triangulation_angle(pose[:, :3], inliers.rays)
-    forward = abs(pose[2, 3])
-    return bool(angle >= _LEAST_ANGLE and forward <= INITIAL_MAX_FORWARD_MOTION + _FORWARD_MARGIN)
+        return pose_of_homography(geometry.H, inliers)
+    E = geometry.E
+    if E is None and geometry.F is not None:
+        a, b = (camera.calibration_matrix() for camera in inliers.cameras)
+        E = b.T @ geometry.F @ a
+    return None if E is None else pose_of_essential(E, inliers)
 
 
-def _begun(inliers: PairInliers, seed: int) -> _Start | None:
-    """Search the pose of a pair and adjust it; None where the mapper looks for another pair."""
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.min_num_trials = _NUM_TRIALS
-    options.ransac.max_error = _MAX_ERROR
-    pycolmap.set_random_seed(seed)
-    if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 there is one for all
-        options.ransac.random_seed = seed
+def _is_wide(pose: _Floats, angle: float, margin: float) -> bool:
+    """Whether views are far enough apart for the mapper, and not along the axis, or nearly so."""
+    most = INITIAL_MAX_FORWARD_MOTION + (_FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN)
+    return bool(angle >= margin * INITIAL_MIN_ANGLE and abs(pose[2, 3]) <= most)
+
+
+def _poses(
+    geometry: TwoViewGeometry, inliers: PairInliers
+) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:
+    """Poses that the mapper may begin with: rows of their inliers, [R | t], angle in degrees."""
     own = np.arange(len(inliers.xy[0]), dtype=np.uint32)
     # A focal length that is a guess counts as known: COLMAP 4.2 would estimate it with the pose, by
     # a solver that some pairs crash.
-    a, b = (pycolmap.Camera(own.todict()) for own in inliers.cameras)
+    a, b = (pycolmap.Camera(camera.todict()) for camera in inliers.cameras)
     a.has_prior_focal_length = b.has_prior_focal_length = True
-    views = (a, inliers.xy[0], b, inliers.xy[1])
-    found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
-    if not pycolmap.estimate_two_view_geometry_pose(*views, found):
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.min_num_trials = _NUM_TRIALS
+    options.ransac.max_error = _MAX_ERROR
+    for seed in range(_NUM_SEEDS):
+        pycolmap.set_random_seed(seed)
+        if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 there is one for all
+            options.ransac.random_seed = seed
+        views = (a, inliers.xy[0], b, inliers.xy[1])
+        found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
+        if pycolmap.estimate_two_view_geometry_pose(*views, found):
+            pose = np.asarray(found.cam2_from_cam1.matrix())
+            yield found.inlier_matches[:, 0], pose, float(np.degrees(found.tri_angle))
+    if not all(camera.has_prior_focal_length for camera in inliers.cameras):
+        # Where it does not estimate one, it takes a homography that explains most of the matches.
+        flat = pycolmap.estimate_homography_matrix(*inliers.xy, options.ransac)
+        if flat is not None:
+            rows = np.flatnonzero(flat["inlier_mask"]).astype(np.uint32)
+            rays = [own[:, rows] for own in inliers.rays]
+            pose = pose_of_homography(flat["H"], inliers)
+            yield rows, pose, triangulation_angle(pose[:, :3], rays)
+
+
+def _begun(
+    inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats, angle: float
+) -> _Start | None:
+    """Adjust a pair from a pose; None where the mapper looks for another pair."""
+    # Another search may take what this one leaves.
+    if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
         return None
-    angle = float(np.degrees(found.tri_angle))
-    pose = np.asarray(found.cam2_from_cam1.matrix())
-    forward = abs(pose[2, 3])
-    count = len(found.inlier_matches)
-    # The margins on this side: another search may take what this one leaves.
-    if (
-        count * _MARGIN < INITIAL_MIN_INLIERS
-        or angle * _MARGIN < INITIAL_MIN_ANGLE
-        or forward > INITIAL_MAX_FORWARD_MOTION + _FORWARD_MARGIN
-    ):
-        return None
-    holds = _holds(inliers, found.inlier_matches[:, 0], pose)
+    holds = _holds(inliers, rows, pose)
     if holds is None:
         return None
-    enough = count >= _MARGIN * INITIAL_MIN_INLIERS
-    wide = angle >= _MARGIN * INITIAL_MIN_ANGLE
-    aside = bool(forward <= INITIAL_MAX_FORWARD_MOTION - _FORWARD_MARGIN)
-    return _Start(holds, enough and wide and aside)
+    enough = len(rows) >= _MARGIN * INITIAL_MIN_INLIERS
+    return _Start(holds, enough and _is_wide(pose, angle, _MARGIN))
 
 
 def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
