@@ -301,12 +301,21 @@ def _adjusted(
     cameras = list({id(camera): camera for camera in inliers.cameras}.values())
     for number, camera in enumerate(cameras, 1):
         own = pycolmap.Camera(camera.todict() | {"camera_id": number})
-        model.add_camera_with_trivial_rig(own)
+        model.add_camera(own)
+        rig = pycolmap.Rig(rig_id=number)
+        rig.add_ref_sensor(own.sensor_id)
+        model.add_rig(rig)
     poses = pycolmap.Rigid3d(), pycolmap.Rigid3d(pose)
     for k, (camera, xy, own) in enumerate(zip(inliers.cameras, inliers.xy, poses, strict=True), 1):
         number = next(n for n, of_pair in enumerate(cameras, 1) if of_pair is camera)
         image = pycolmap.Image(image_id=k, name=str(k), camera_id=number, keypoints=xy)
-        model.add_image_with_trivial_frame(image, own)
+        frame = pycolmap.Frame(frame_id=k, rig_id=number)
+        frame.add_data_id(image.data_id)
+        frame.rig_from_world = own
+        model.add_frame(frame)
+        image.frame_id = k
+        model.add_image(image)
+        model.register_frame(k)
     for xyz, row in zip(points, rows, strict=True):
         track = pycolmap.Track()
         track.add_element(1, row)
