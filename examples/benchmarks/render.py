@@ -28,6 +28,7 @@ REFERENCE = "sift-exhaustive"
 SPLAT_WAYS = (
     *("SIFT sequential", "reconstruct"),
     *("reconstruct --gaussians", "reconstruct --gaussians, none added"),
+    "densify --gaussians, SIFT's poses",
 )
 _QUALITIES = ("psnr_y", "ssim_db", "vmaf")
 

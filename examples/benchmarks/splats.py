@@ -4,7 +4,10 @@ python examples/benchmarks/splats.py --cache benchmark_phone
 
 For each clip the two folders of `phone_to_folder.py` are made, in its cache, and Gaussians are
 trained on half of the images of each, from its own poses and points, and rendered for the others;
-of `reconstruct`, from the Gaussians of `--gaussians`, too, and from these while training adds none.
+of `reconstruct`, from the Gaussians of `--gaussians`, too, and from these while training adds none;
+and from those that `densify --gaussians` makes on the poses that SIFT led to.
+All pictures are undistorted as `reconstruct` does it: renderings are held against them, and come
+nearer to those that another program leaves a little softer, whatever was trained from.
 The trainer is a small one for CPUs, `../shared/tools/gs_cpu`: what it gives is to be compared with
 what it gives for another cloud, not with other trainers' figures. Its time is of training alone.
 """
@@ -19,22 +22,29 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import clips as ruler
-import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import cv2
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import phone_to_folder
+import pycolmap
 import render
 from phone_to_folder import Clip
 from results import Value, add_results, read_rows, save
 from rich.console import Console
 
-from colmap_av1 import ImageOptions
+from colmap_av1 import DensifyOptions, ImageOptions, MatchOptions, densify
+from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
 from colmap_av1.model.splats.gaussians import write_model_gaussians
+from colmap_av1.model.undistort import on_pinholes, pinhole_camera, undistortion
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
 
 TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
 FROM_GAUSSIANS = Path(__file__).with_name("train_from_gaussians.py")
-OURS = render.SPLAT_WAYS[1:]
-GAUSSIANS, NONE_ADDED = OURS[-2:]
+OURS = render.SPLAT_WAYS[1:-1]
+GAUSSIANS, NONE_ADDED, ON_SIFT = render.SPLAT_WAYS[-3:]
 # Which frames become images, where that differs from the other benchmark.
 IMAGES = {"kitchen": ImageOptions(every=4)}
 WIDTH, ITERATIONS = 225, 3000
@@ -80,15 +90,58 @@ def main() -> int:
 
 
 def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
-    """The images and the model that one way makes of a clip; the trainer undistorts SIFT's."""
+    """The images and the model that one way makes of a clip, undistorted."""
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
     if way in OURS:
         return output / "images", output / "sparse" / "0"
     names = sorted(path.name for path in (output / "images").iterdir())
-    _, model, images = phone_to_folder.sift_of(clip, folder / "sift", names)
-    if model is None:
-        raise SystemExit(f"{clip.name}: SIFT gave no model")
+    undistorted = folder / "splats" / "sift"
+    images, model = undistorted / "images", undistorted / "model"
+    given = [file_digest(clip.video), names, clip.camera, pycolmap.__version__]
+
+    def map_sift() -> dict[str, Any]:
+        _, found, pictures = phone_to_folder.sift_of(clip, folder / "sift", names)
+        if found is None:
+            raise SystemExit(f"{clip.name}: SIFT gave no model")
+        shutil.copytree(found, undistorted / "distorted")
+        images.mkdir()
+        undistort_images(found, pictures, images)
+        undistort_model(found, model)
+        return {}
+
+    products = [undistorted / "distorted", images, model]
+    run_stage_in(undistorted, given, map_sift, products=products)
+    if way == ON_SIFT:
+        dense = folder / "splats" / "densify"
+        shutil.rmtree(dense, ignore_errors=True)
+        options = DensifyOptions(match=MatchOptions(images=clip.images, camera=clip.camera))
+        densify(undistorted / "distorted", clip.video, dense / "distorted", options=options)
+        undistort_model(dense / "distorted", dense / "model")
+        model = dense / "model"
     return images, model
+
+
+def undistort_images(model: Path, images: Path, output: Path) -> None:
+    """Write the undistorted images of a model of one camera into a folder."""
+    reconstruction = read_model(model)
+    (camera,) = reconstruction.cameras.values()
+    change = undistortion(camera, pinhole_camera(camera))
+    for image in posed_images(reconstruction).values():
+        picture = np.asarray(cv2.imread(str(images / image.name)), np.uint8)
+        cv2.imwrite(str(output / image.name), picture if change is None else change(picture))
+
+
+def undistort_model(model: Path, output: Path) -> None:
+    """Write a model of one camera with the undistorted one."""
+    reconstruction = read_model(model)
+    (camera,) = reconstruction.cameras.values()
+    pinhole = pinhole_camera(camera)
+    posed = list(posed_images(reconstruction).values())
+    points = model_points(reconstruction, posed)
+    rays = np.asarray(camera.cam_from_img(points.xy))[:, :2]
+    on_image = on_pinholes(rays, np.zeros(len(rays), np.int64), [pinhole])
+    output.mkdir()
+    write_model(output, {camera.camera_id: pinhole}, posed, replace(points, xy=on_image))
 
 
 def train(
@@ -100,7 +153,7 @@ def train(
     output.mkdir(parents=True)
     run = [sys.executable, str(TRAINER / "colmap_to_npz.py"), str(model), str(cloud)]
     subprocess.run([*run, "--images", str(images)], check=True, capture_output=True)
-    if way in (GAUSSIANS, NONE_ADDED):
+    if way in (GAUSSIANS, NONE_ADDED, ON_SIFT):
         write_model_gaussians(folder / "init.ply", model)
         run = [sys.executable, str(FROM_GAUSSIANS), str(folder / "init.ply"), str(TRAINER)]
     else:
