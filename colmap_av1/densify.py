@@ -59,6 +59,7 @@ from colmap_av1.tracks.video_tracks import (
     track_video,
 )
 from colmap_av1.util.arguments import checks_arguments
+from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -116,6 +117,7 @@ class _TrackedImages:
 
 
 @checks_arguments
+@one_blas_thread()
 def densify(
     model: str | os.PathLike[str],
     video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],

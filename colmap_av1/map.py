@@ -150,7 +150,7 @@ def map_database(
     try:
         with clock.measure("far views"):
             far_views = model_far_views(model, image_path, progress)
-        warnings.append(far_views.warning)
+        warnings.append(far_views.warning())
     except ImageError as error:  # the model stands all the same
         warnings.append(f"far views are not compared: {error}")
     return MapReport(

@@ -39,6 +39,7 @@ from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, keep_frames
 from colmap_av1.util.arguments import checks_arguments
+from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.unchanged import unchanged
 
@@ -147,6 +148,7 @@ class MatchReport:
 
 
 @checks_arguments
+@one_blas_thread()
 def match(
     database: str | os.PathLike[str],
     video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],

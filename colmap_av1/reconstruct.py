@@ -26,9 +26,10 @@ from colmap_av1.model.reconstruct_tracks import (
 )
 from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.model.track_points import LEAST_AGREEING
-from colmap_av1.options import ReconstructOptions
+from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
+from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import scratch_folder, whole_file
 from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -118,6 +119,7 @@ class ReconstructReport:
 
 
 @checks_arguments
+@one_blas_thread()
 def reconstruct(
     video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
@@ -179,7 +181,7 @@ def reconstruct(
             opened.enter_context(
                 open_source(
                     own,
-                    with_stream_kept(options.match, stages, label),
+                    with_stream_kept(_as_converted(options), stages, label),
                     beside=output,
                     clock=clock,
                     progress=progress,
@@ -206,6 +208,14 @@ def reconstruct(
     return report
 
 
+def _as_converted(options: ReconstructOptions) -> MatchOptions:
+    """The options with which videos are converted: quickly where pictures correct the poses."""
+    encode = options.match.encode
+    if encode.effort == "auto" and options.mapping.adjust:
+        encode = replace(encode, effort="quick")
+    return replace(options.match, encode=encode)
+
+
 def _run_stages(run: Run) -> ReconstructReport:
     numbers = range(len(run.sources))
     tracked = [track_stage(run, video) for video in numbers]
@@ -218,7 +228,8 @@ def _run_stages(run: Run) -> ReconstructReport:
     kept = {stage_of_video(run, video): tracked[video] for video in numbers}
     posed = mended_poses(run, videos, takes, tracked)
     del videos  # as large as the tracks that the poses agree with
-    kept |= posed.stages
+    assert posed.far_views is not None
+    kept |= {**posed.stages, "far_views": posed.far_views}
     kept |= written_model(run, posed, takes)
     further, unplaced = further_models(run, posed, takes)
     facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}

@@ -40,7 +40,10 @@ from colmap_av1.options import (
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
 
-STAGES = ("tracks", "matches", "poses", "resection", "moving", "adjustment", "place", "model")
+STAGES = (
+    *("tracks", "matches", "poses", "resection", "moving", "adjustment", "far_views"),
+    *("place", "model"),
+)
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 
@@ -533,7 +536,7 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     shutil.copytree(made.output, tmp_path / "plain")
     mapping = replace(OPTIONS.mapping, adjust=False)
     placed = reconstruct(SCENE, tmp_path / "plain", options=replace(OPTIONS, mapping=mapping))
-    assert placed.resumed == STAGES[:-3]
+    assert placed.resumed == STAGES[:-4]
     # All images by the mapper, none by resection.
     options = replace(OPTIONS, mapping=replace(mapping, key_images=False))
     plain = reconstruct(SCENE, tmp_path / "plain", options=options)

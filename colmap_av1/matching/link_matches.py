@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Pictures, Takes
@@ -23,6 +22,7 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewGeometry
 from colmap_av1.matching.verify import agreeing_matches, verify_pairs
 from colmap_av1.options import LinkOptions, RunOptions, VerifyOptions
+from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Progress
 
 # Inliers of a pair across a gap, and of a place seen again, which must be surer: nothing says that
@@ -105,9 +105,7 @@ def match_pairs(
     there = [i in features and j in features for i, j in pairs.tolist()]
     pairs = pairs[np.array(there, dtype=np.bool_)]
     matches = []
-    # Threads of the matrix product, which wait for work in a loop, cost several times as much as
-    # products of this size.
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         for i, j in pairs.tolist():
             matches.append(match_features(features[i], features[j]))
             progress("link matches", len(matches), len(pairs))

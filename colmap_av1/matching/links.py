@@ -73,6 +73,7 @@ class LinkReport:
 
     Attributes:
         num_images: images whose pictures were looked at.
+        looked_again: places seen again were looked for.
         num_tried: pairs whose features were matched.
         num_links: pairs that were linked.
         num_revisits: those of them that see a place again.
@@ -89,6 +90,7 @@ class LinkReport:
     """
 
     num_images: int = 0
+    looked_again: bool = False
     num_tried: int = 0
     num_links: int = 0
     num_revisits: int = 0
@@ -334,6 +336,7 @@ def _link(
     same = same_videos(links, features, cameras, takes)
     report = LinkReport(
         num_images=len(plan.wanted),
+        looked_again=bool(plan.key),
         num_tried=len(tried | beside),
         num_links=len(links.pairs),
         num_revisits=len(revisits & found),

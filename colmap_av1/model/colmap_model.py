@@ -120,13 +120,6 @@ def no_points() -> ModelPoints:
     )
 
 
-def points_seen(points: ModelPoints, image: int) -> NDArray[np.float64]:
-    """Float64 [n, 3] positions of the points that an image, by index, sees with a known error."""
-    observations = np.flatnonzero(points.image == image)
-    owners = np.searchsorted(points.offsets, observations, side="right") - 1
-    return points.xyz[owners[points.error[owners] >= 0]]
-
-
 def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
     rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]

@@ -22,6 +22,7 @@ from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
+from colmap_av1.util.start import BLAS_THREADS
 
 # The robust loss makes progress slow: steps that each lower the error by less than a thousandth
 # still bring far views of one place together.
@@ -224,8 +225,9 @@ def _run_apart(
     hint: str,
 ) -> None:
     """Run the settings in a process; `hear` gets the names and values that it prints."""
-    # Libraries are found where this process has them.
-    path = os.pathsep.join(sys.path)
+    # Libraries are found where this process has them. Idle threads of BLAS would wait in a loop.
+    path, num_threads = os.pathsep.join(sys.path), str(settings["num_threads"])
+    environment = {**os.environ, "PYTHONPATH": path, BLAS_THREADS: num_threads}
     done, reason = False, ""
     log.write_bytes(_LOG_START)
     give_back_free_memory()  # the process needs its own beside this one's
@@ -235,7 +237,7 @@ def _run_apart(
             bound([sys.executable, "-c", _CHILD, child.__file__, json.dumps(settings)]),
             stdout=subprocess.PIPE,
             stderr=file,
-            env={**os.environ, "PYTHONPATH": path},
+            env=environment,
             text=True,
         ) as process,
     ):

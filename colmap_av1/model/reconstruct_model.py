@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
-from colmap_av1.model.agreement.far_views import FarViewCheck, FarViews
-from colmap_av1.model.colmap_model import ModelImage, ModelPoints, points_seen, write_model
+from colmap_av1.model.colmap_model import ModelImage, ModelPoints, write_model
 from colmap_av1.model.coverage import PosedCamera, coverage, views_of
 from colmap_av1.model.moving.short_tracks import surely_still
 from colmap_av1.model.reconstruct_poses import (
@@ -166,7 +165,7 @@ def _written_cloud(
     )
 
 
-def _looked_at(
+def _coloured(
     run: Run,
     takes: Takes,
     placed: PosedImages,
@@ -174,25 +173,20 @@ def _looked_at(
     cloud: ModelPoints,
     *,
     undistort: Sequence[Undistortion | None],
-) -> tuple[FarViews, ModelPoints]:
-    """How far views from far apart disagree in the images, and the points in their colours.
+) -> ModelPoints:
+    """The points in the colours of the pictures.
 
     The images themselves are not read: decompressing them takes several times as long.
     """
-    far = FarViewCheck(placed.images, _pinholes(views), lambda image: points_seen(cloud, image))
     colours = Colours(cloud, [view.size for view in views])
-    compared = set(far.wanted)
     places = np.searchsorted(takes.images.frames, placed.frames).tolist()
     index_of = {place: index for index, place in enumerate(places)}
     with run.clock.measure("colours"):
         for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
             index = index_of[place]
             colours.add(index, picture, undistort[index])
-            if index in compared:
-                far.add(index, _undistorted(picture, undistort[index]), views[index].mask)
             run.progress("colours", done, len(views))
-    with run.clock.measure("far views"):
-        return far.result(), replace(cloud, rgb=colours.rgb())
+        return replace(cloud, rgb=colours.rgb())
 
 
 def _write_masks(
@@ -248,7 +242,7 @@ def model_stage(
         check_unchanged(*run.files)
         with clock.measure("coverage"):
             covered = coverage(views, cloud.xyz)
-        far_views, cloud = _looked_at(run, takes, placed, views, cloud, undistort=undistort)
+        cloud = _coloured(run, takes, placed, views, cloud, undistort=undistort)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
@@ -262,9 +256,6 @@ def model_stage(
             "coverage": covered,
             "mean_error": mean_error(cloud),
             "focal_length": float(views[0].camera.params[0]),
-            "far_views": far_views.median,
-            "far_views_largest": far_views.largest,
-            "far_views_warning": far_views.warning,
             "agreeing": agreeing,
         }
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from colmap_av1.images.masks import Mask
 from colmap_av1.images.takes import Takes
+from colmap_av1.model.agreement.stage import far_view_stage
 from colmap_av1.model.mapping.corners import corners_in_images
 from colmap_av1.model.moving.following import follow_behind, has_moving_masks
 from colmap_av1.model.moving.stage import moving_stage, read_moving, without_moving
@@ -31,6 +32,7 @@ class Posed:
         moving: by the names of images, masks that leave out what moves by itself.
         in_place: tracks lie where the pictures show them; what a shutter's read-out has moved does
             not.
+        far_views: the stage that held views from far apart against the poses; None: none did.
     """
 
     stages: dict[str, Kept]
@@ -38,6 +40,7 @@ class Posed:
     links: Tracks
     moving: dict[str, Mask]
     in_place: bool
+    far_views: Kept | None = None
 
     @property
     def last(self) -> Kept:
@@ -48,15 +51,23 @@ class Posed:
 def mended_poses(
     run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
 ) -> Posed:
-    """Estimate poses; where little holds them together, again with links in place of motion."""
+    """Estimate poses; where they do not hold together, again with links.
+
+    These take the place of motion where few points join what lies on either side of two images, and
+    connect places seen again where pictures far apart in time contradict the poses.
+    """
     first: list[Posed] = []
 
     def make(_: Path) -> dict[str, Any]:
-        first.append(_pose_stages(run, videos, takes, tracked, doubted=()))
-        return {"doubted": _unlinked_joints(run, takes, first[0].stages)}
+        posed = _pose_stages(run, videos, takes, tracked, doubted=())
+        first.append(posed)
+        return {
+            "doubted": _unlinked_joints(run, takes, posed.stages),
+            "apart": _are_unlinked_and_apart(run, posed),
+        }
 
     options = run.options
-    doubted = run_stage(
+    found = run_stage(
         run.stages,
         "joints",
         [
@@ -69,10 +80,30 @@ def mended_poses(
         into=run.stages,
         products=[],
         make=make,
-    ).facts["doubted"]
-    if first and not doubted:
+    ).facts
+    if first and not found["doubted"] and not found["apart"]:
         return first[0]
-    return _pose_stages(run, videos, takes, tracked, doubted=doubted)
+    again = _with_all_links(run) if found["apart"] else run
+    return _pose_stages(again, videos, takes, tracked, doubted=found["doubted"])
+
+
+def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
+    """Whether views far apart contradict the poses, and links of such have not been looked for."""
+    assert posed.far_views is not None
+    looked = run.options.match.links.links != "auto" or _looked_again(posed.stages)
+    return bool(posed.far_views.facts["apart"]) and not looked
+
+
+def _looked_again(stages: dict[str, Kept]) -> bool:
+    """Whether places seen again have been looked for."""
+    return bool(stages["matches"].facts["links"]["looked_again"])
+
+
+def _with_all_links(run: Run) -> Run:
+    """The run with links between places seen again in any video."""
+    match = run.options.match
+    match = replace(match, links=replace(match.links, links="sift"))
+    return replace(run, options=replace(run.options, match=match))
 
 
 def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
@@ -107,7 +138,10 @@ def _pose_stages(
     # Where no read-out is found nothing has been moved, whether one was looked for or not.
     in_place = not any(stage.facts["read_out"] for stage in tracked)
     believed = believed_tracks(run, videos, takes)
-    return refined_poses(run, stages, believed, takes, keyed, in_place=in_place)
+    posed = refined_poses(run, stages, believed, takes, keyed, in_place=in_place)
+    linked = _looked_again(stages)
+    far_views = far_view_stage(run, posed.tracks, takes, posed.moving, posed.last, linked=linked)
+    return replace(posed, far_views=far_views)
 
 
 def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:

@@ -60,7 +60,13 @@ class EncodeOptions(Options):
     speed: int | None = option(
         None,
         "preset on the encoder's own scale: -cpu-used of libaom (5 and above: its realtime mode), "
-        "-preset of the others; None: the encoder's default",
+        "-preset of the others; None: what effort says",
+    )
+    effort: Literal["auto", "full", "quick"] = option(
+        "auto",
+        "full: search motion as exactly as poses that come from it alone need; quick: in half of "
+        "the time, for poses that are corrected on the pictures; auto: quick in reconstruct, else "
+        "full",
     )
     downscale: float | None = option(
         None,

@@ -17,6 +17,8 @@ _SCRIPTS = ("colmap-av1", "colmap-av1.exe")
 _MODULE = "colmap_av1"
 # Some systems have no SIGHUP.
 ENDING = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
+# As OpenBLAS reads it when it is loaded.
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 # What is ignored, as nohup asks for, stays ignored.
 HEEDED = (signal.SIG_DFL, signal.default_int_handler)
 
@@ -68,12 +70,25 @@ def let_through() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
 
 
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Let NumPy, if it is loaded in the body, start one thread for its matrix products."""
+    if BLAS_THREADS in os.environ:
+        yield
+        return
+    os.environ[BLAS_THREADS] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[BLAS_THREADS]  # programs that are started have their own
+
+
 def import_pycolmap() -> None:
     """Import pycolmap, and take back the signals for which it installs a handler of its own.
 
-    That one prints a stack trace of C++, and may hang.
+    That one prints a stack trace of C++, and may hang. NumPy's threads would wait in a loop.
     """
-    with held_back(), handlers_kept():
+    with held_back(), handlers_kept(), _one_blas_thread():
         import numpy as np  # noqa: F401, PLC0415 - before pycolmap
         import pycolmap  # noqa: F401, PLC0415
 

@@ -370,7 +370,10 @@ def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
     if mark.get("encoder") not in ENCODERS or mark.get("source") != str(_size(video)):
         return False
     encoder = None if options.encoder == "auto" else options.encoder
-    wanted = {"encoder": encoder, "quality": options.quality, "speed": options.speed}
+    speed = options.speed
+    if speed is None and options.effort == "full":
+        speed = ENCODERS[mark["encoder"]].speed
+    wanted = {"encoder": encoder, "quality": options.quality, "speed": speed}
     if mark.get("downscale", "1.0") != str(float(options.downscale or 1)):
         return False
     return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)

@@ -21,6 +21,9 @@ _PROBE_TIMEOUT = 30.0
 _LIBAOM_REALTIME = 5
 # ffmpeg's own option goes no further, libaom does.
 _FFMPEG_FASTEST = 8
+# Beyond, a fifth of the time would go into bringing the costs of symbols up to date; streams are of
+# the same size without.
+_LIBAOM_FASTER = "mode-cost-upd-freq=3:coeff-cost-upd-freq=3:mv-cost-upd-freq=3"
 # A frame further than any video is long: the first is the only intra frame.
 KEY_FRAME_DISTANCE = "9999"
 # So that every message says how grave it is.
@@ -37,6 +40,7 @@ class _Encoder:
         ffmpeg_name: ffmpeg's name of it.
         quality: default on the scale of EncodeOptions.
         speed: default on the encoder's own scale.
+        quick_speed: that of quick conversions.
         words: ffmpeg's words for a quality and a speed.
         before_input: words before the input.
         upload: filter that hands the pictures to the device, and the pixel format.
@@ -45,6 +49,7 @@ class _Encoder:
     ffmpeg_name: str
     quality: int
     speed: int
+    quick_speed: int
     words: Callable[[int, int], list[str]]
     before_input: tuple[str, ...] = ()
     upload: str = "format=yuv420p"
@@ -85,7 +90,9 @@ def _libaom(quality: int, speed: int) -> list[str]:
     usage = "realtime" if speed >= _LIBAOM_REALTIME else "good"
     how = ["-usage", usage, "-cpu-used", str(min(speed, _FFMPEG_FASTEST)), "-lag-in-frames", "0"]
     how += ["-row-mt", "1", "-crf", str(quality), "-b:v", "0"]
-    return how if speed <= _FFMPEG_FASTEST else [*how, "-aom-params", f"cpu-used={speed}"]
+    if speed <= _FFMPEG_FASTEST:
+        return how
+    return [*how, "-aom-params", f"cpu-used={speed}:{_LIBAOM_FASTER}"]
 
 
 def _svt(quality: int, speed: int) -> list[str]:
@@ -96,12 +103,13 @@ def _svt(quality: int, speed: int) -> list[str]:
 
 # In the order in which they are tried. ffmpeg has no AV1 encoder of Apple's VideoToolbox.
 ENCODERS = {
-    "nvenc": _Encoder("av1_nvenc", 20, 1, _nvenc),
-    "qsv": _Encoder("av1_qsv", 20, 7, _qsv, upload="format=nv12"),
-    "amf": _Encoder("av1_amf", 20, 100, _amf, upload="format=nv12"),
+    "nvenc": _Encoder("av1_nvenc", 20, 1, 1, _nvenc),
+    "qsv": _Encoder("av1_qsv", 20, 7, 7, _qsv, upload="format=nv12"),
+    "amf": _Encoder("av1_amf", 20, 100, 100, _amf, upload="format=nv12"),
     "vaapi": _Encoder(
         "av1_vaapi",
         20,
+        7,
         7,
         _vaapi,
         before_input=("-vaapi_device", "/dev/dri/renderD128"),
@@ -110,8 +118,8 @@ ENCODERS = {
     # Speed 7 takes a third to a half of the time of 6 for models that are nearly as good; 8 saves
     # little more and gives up to 8 % fewer points. What else was tried: "Encoders" in
     # examples/benchmarks/README.md.
-    "libaom": _Encoder("libaom-av1", 20, 7, _libaom),
-    "svt": _Encoder("libsvtav1", 20, 8, _svt),
+    "libaom": _Encoder("libaom-av1", 20, 7, 10, _libaom),
+    "svt": _Encoder("libsvtav1", 20, 8, 8, _svt),
 }
 
 
@@ -157,8 +165,8 @@ def _q_index(quality: int) -> int:
 def settings(encoder: _Encoder, options: EncodeOptions) -> tuple[int, int]:
     """Quality and speed asked for, or the encoder's own."""
     quality = encoder.quality if options.quality is None else options.quality
-    speed = encoder.speed if options.speed is None else options.speed
-    return quality, speed
+    usual = encoder.quick_speed if options.effort == "quick" else encoder.speed
+    return quality, usual if options.speed is None else options.speed
 
 
 def _ffmpeg_programs() -> list[str]:

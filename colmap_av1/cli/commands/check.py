@@ -67,7 +67,7 @@ def _check_model(namespace: argparse.Namespace) -> bool:
     model = read_model(namespace.model)
     with progress_bars(namespace.quiet) as report:
         far_views = model_far_views(model, Path(namespace.image_path), report)
-    told = [far_views.warning, model_joints(model).warning]
+    told = [far_views.warning(), model_joints(model).warning]
     if namespace.database is not None:
         told.append(model_crossings(model, Path(namespace.database)).warning)
     warnings = tuple(warning for warning in told if warning is not None)

@@ -79,8 +79,16 @@ class FarViews:
         return float(np.quantile(self.error, 0.9)) if len(self.error) else None
 
     @property
-    def warning(self) -> str | None:
-        """What the user should know of a model that does not hold together, or of its pictures."""
+    def are_apart(self) -> bool:
+        """Whether the model does not hold together."""
+        return self.largest is not None and self.largest > _FAR_APART
+
+    def warning(self, *, linked: bool = False) -> str | None:
+        """What the user should know of a model that does not hold together, or of its pictures.
+
+        Args:
+            linked: pictures of places seen again have been matched.
+        """
         if not self.pairs and self.num_tried >= _FEWEST_TRIED:
             return (
                 f"the pictures of {self.num_tried} pairs of images far apart in time, which by "
@@ -88,13 +96,13 @@ class FarViews:
                 "features each, sharp ones have hundreds: they are blurred or plain, or the poses "
                 "are wrong"
             )
-        if self.largest is None or self.worst is None or self.largest <= _FAR_APART:
+        if not self.are_apart or self.worst is None:
             return None
         first, second = self.worst
         return (
             f"what images far apart in time show in common is up to {self.largest:.1f} px from "
             f"where the poses put it, most between '{first}' and '{second}': surfaces may be "
-            "doubled there; --links sift matches more pictures"
+            f"doubled there{'' if linked else '; --links sift matches more pictures'}"
         )
 
 
