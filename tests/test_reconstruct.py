@@ -14,6 +14,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from colmap_av1.model.coverage import evenly_spread
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
+    LinkOptions,
     MatchOptions,
     ReadOptions,
     ReconstructOptions,
@@ -383,7 +385,7 @@ def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path)
     assert {record.stem for record in records} == {*STAGES, "joints"}
     part = records[5].read_text()[:-40]
     texts = ["", "[]", "7", "{", "null", '{"key": 3, "facts": null}', part]
-    texts += ['{"key": "", "facts": {}}', "[1]"]
+    texts += ['{"key": "", "facts": {}}', "[1]", '"joints"']
     for record, text in zip(records, texts, strict=True):
         record.write_text(text)
     assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()
@@ -530,6 +532,22 @@ def words_of(process: Path) -> bytes:
         return (process / "cmdline").read_bytes()
     except OSError:
         return b""
+
+
+@pytest.mark.parametrize("links", ["auto", "none"])
+def test_pictures_that_contradict_the_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
+) -> None:
+    """Places seen again are linked then, unless there must be no links."""
+    monkeypatch.setattr("colmap_av1.model.agreement.far_views._FAR_APART", 0.0)
+    options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
+    found = reconstruct(SCENE, tmp_path / "out", options=options)
+    assert found.links["looked_again"] == (links == "auto")
+    assert (found.links["num_images"] > 0) == (links == "auto")
+    assert found.num_registered == NUM_IMAGES
+    told = next(note for note in found.warnings if "surfaces may be doubled there" in note)
+    assert ("--links sift" in told) == (links == "none")
+    assert reconstruct(SCENE, tmp_path / "out", options=options).resumed == STAGES
 
 
 def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:

@@ -46,8 +46,9 @@ from colmap_av1.util.stages import Kept, run_stage
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
 # Tracks of an image that the global mapper starts from, the longest ones: from all of them it takes
-# up to twice the time, to the same poses. What links images is short, and all of it is needed.
-_START_TRACKS = 400
+# two to four times as long, to the same poses. What links videos, or images where motion does not,
+# is short, and all of it is needed; what sees a place again makes long tracks longer.
+_START_TRACKS = 200
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
 # end of a video, say, the mapper may leave images that are off by more with all they see.
@@ -83,7 +84,8 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     if mapper == "auto":
         mapper = "incremental" if matched.facts["guessed"] else "global"
     links = matched.facts["links"]
-    start_tracks = None if links["num_links"] or links["weak_gaps"] else _START_TRACKS
+    hangs = links["num_between"] or links["broken_gaps"] or links["doubtful_gaps"]
+    start_tracks = None if hangs else _START_TRACKS
     how = MapOptions(
         mapper=mapper,
         forward_motion=forward and mapper == "incremental",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
 import shutil
 import subprocess
@@ -141,6 +142,10 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
     for name in names:
         quality, speed = settings(ENCODERS[name], options)
         for program in programs:
+            # To start one that is not linked as a whole takes several times as long as to probe.
+            if program != programs[0] and ENCODERS[name].ffmpeg_name not in _encoders_of(program):
+                reasons.append(f"{name}: {program} does not have it")
+                continue
             reason = _probe(program, ENCODERS[name], quality, speed)
             if reason is None:
                 return name, program
@@ -177,6 +182,19 @@ def _ffmpeg_programs() -> list[str]:
     if on_path is not None and on_path not in programs:
         programs.append(on_path)
     return programs
+
+
+@functools.cache
+def _encoders_of(program: str) -> str:
+    """What an ffmpeg says of its encoders."""
+    command = [program, "-hide_banner", "-encoders"]
+    try:
+        run = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return run.stdout
 
 
 def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:

@@ -33,7 +33,7 @@ from colmap_av1.options import EncodeOptions, MatchOptions
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
-from colmap_av1.video.encoders import find_encoder
+from colmap_av1.video.encoders import ENCODERS, find_encoder
 
 TO_A_FILE = ("encode", "--output", "out.mp4")
 TO_A_DATABASE = ("match", "--database", "a.db")
@@ -88,6 +88,34 @@ def test_speeds_of_libaom_that_ffmpeg_does_not_have(phone: Path, tmp_path: Path)
     assert streams[0] != streams[1]
     with pytest.raises(EncodeError, match=r"libaom: .*another --encoder"):
         find_encoder(EncodeOptions(encoder="libaom", speed=99))
+
+
+def test_quick_conversions(phone: Path, tmp_path: Path) -> None:
+    """They are used again unless full ones are asked for."""
+    quick, full = (EncodeOptions("libaom", effort=effort) for effort in ("quick", "full"))
+    stream = tmp_path / "stream.mp4"
+    assert not stream_of(phone, stream, options=quick).reused
+    same = EncodeOptions("libaom", speed=ENCODERS["libaom"].quick_speed)
+    assert stream_of(phone, stream, options=same).reused
+    assert stream_of(phone, stream, options=EncodeOptions("libaom")).reused
+    assert not stream_of(phone, stream, options=full).reused
+    assert stream_of(phone, stream, options=full).reused
+    assert stream_of(phone, stream, options=quick).reused
+
+
+def test_programs_that_do_not_have_an_encoder_are_not_probed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each further one is asked once for what it has."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, "exit 1")))
+    (tmp_path / "bin").mkdir()
+    called = tmp_path / "called"
+    script = f'echo "$*" >> {called}; case "$*" in *-encoders*) echo libsvtav1; exit;; esac'
+    fake_ffmpeg(tmp_path / "bin", script)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    name, program = find_encoder(EncodeOptions())
+    assert (name, program) == ("svt", str(tmp_path / "bin" / "ffmpeg"))
+    assert ["libsvtav1" in line for line in called.read_text().splitlines()] == [False, True]
 
 
 def test_pictures_are_those_of_the_video(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:

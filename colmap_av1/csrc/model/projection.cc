@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <limits>
 #include <stdexcept>
@@ -60,20 +61,31 @@ PointsInView points_in_view(std::span<const double, 12> cam_from_world, const Ra
 PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, const Pinhole& camera,
                                   std::span<const double> xyz) {
   PointsInPicture found;
+  std::array<double, 3 * kChunk> local;
   std::array<double, 2 * kChunk> pixels;
   std::array<double, kChunk> depth;
+  const double last_x = std::max(0.0, std::nextafter(camera.width, 0.0));
+  const double last_y = std::max(0.0, std::nextafter(camera.height, 0.0));
   for_seen(
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
+        std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
+        // As pixels times depth: most points are not seen, and a division takes as long as all else.
         const auto [u, v, z] = at;
-        const double x = camera.focal_x * (u / z) + camera.centre_x;
-        const double y = camera.focal_y * (v / z) + camera.centre_y;
-        pixels[2 * place] = x;
-        pixels[2 * place + 1] = y;
-        depth[place] = z;
-        return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height);
+        const double x = camera.focal_x * u + camera.centre_x * z;
+        const double y = camera.focal_y * v + camera.centre_y * z;
+        return (z > 0) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z);
       },
       [&](std::size_t count) {
+        for (std::size_t i = 0; i < count; ++i) {
+          const double z = local[3 * i + 2];
+          const double x = camera.focal_x * (local[3 * i] / z) + camera.centre_x;
+          const double y = camera.focal_y * (local[3 * i + 1] / z) + camera.centre_y;
+          // Rounded, what lies at the edge must not lie beyond.
+          pixels[2 * i] = std::clamp(x, 0.0, last_x);
+          pixels[2 * i + 1] = std::clamp(y, 0.0, last_y);
+          depth[i] = z;
+        }
         append(pixels, 2 * count, found.xy);
         append(depth, count, found.depth);
       });

@@ -23,8 +23,8 @@ from colmap_av1.model.track_points import seen_in
 from colmap_av1.tracks.tracks import Tracks, every_nth_track
 from colmap_av1.util.stages import Kept, run_stage
 
-# Tracks whose points tell which images see the same.
-_NUM_TRACKS = 5000
+# Tracks at most whose points tell which images see the same; short ones are left out.
+_NUM_TRACKS = 10_000
 
 
 def far_view_stage(
@@ -74,9 +74,8 @@ def _compared(
 
 def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDArray[np.float64]]:
     """Float64 [n, 3] positions of some points that each image sees."""
-    long = pose_tracks(run, tracks)
-    some = every_nth_track(long, max(1, (len(long.offsets) - 1) // _NUM_TRACKS))
-    seen, view = seen_in(some, placed.frames)
+    some = every_nth_track(tracks, max(1, (len(tracks.offsets) - 1) // _NUM_TRACKS))
+    seen, view = seen_in(pose_tracks(run, some), placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FOR_POSES)
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
     order = np.argsort(view[points.observation], kind="stable")
