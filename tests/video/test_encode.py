@@ -107,11 +107,11 @@ def test_programs_that_do_not_have_an_encoder_are_not_probed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each further one is asked once for what it has."""
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, "exit 1")))
     (tmp_path / "bin").mkdir()
     called = tmp_path / "called"
     script = f'echo "$*" >> {called}; case "$*" in *-encoders*) echo libsvtav1; exit;; esac'
     fake_ffmpeg(tmp_path / "bin", script)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, "exit 1")))
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
     name, program = find_encoder(EncodeOptions())
     assert (name, program) == ("svt", str(tmp_path / "bin" / "ffmpeg"))
