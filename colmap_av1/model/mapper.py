@@ -28,6 +28,8 @@ from colmap_av1.util.start import BLAS_THREADS
 # still bring far views of one place together.
 _ADJUSTMENT_STEPS = 20
 _ADJUSTMENT_TOLERANCE = 1e-4
+# Where an adjustment with a smaller loss follows, which goes on from there to the same end.
+_FIRST_TOLERANCE = 1e-3
 # Images up to which the matrix of all cameras is taken as dense: tracks of many images fill it, and
 # looking for its structure takes as long as solving it.
 _MOST_DENSE_IMAGES = 400
@@ -166,6 +168,7 @@ def adjust_model(
     Raises:
         ModelError: the adjustment failed; the log says more.
     """
+    tolerances = [_FIRST_TOLERANCE] * (len(loss_scales) - 1) + [_ADJUSTMENT_TOLERANCE]
     settings = {
         "task": "adjustment",
         "model": str(model),
@@ -174,7 +177,7 @@ def adjust_model(
         "seed": seed,
         "num_threads": num_threads,
         "max_num_iterations": _ADJUSTMENT_STEPS,
-        "function_tolerance": _ADJUSTMENT_TOLERANCE,
+        "function_tolerances": tolerances,
         "most_dense_images": _MOST_DENSE_IMAGES,
     }
     _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")

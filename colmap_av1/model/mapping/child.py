@@ -94,8 +94,10 @@ def _adjust(settings: dict[str, Any]) -> None:
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]
-    solver.function_tolerance = settings["function_tolerance"]
-    for scale in settings["loss_scales"]:
+    for scale, tolerance in zip(
+        settings["loss_scales"], settings["function_tolerances"], strict=True
+    ):
         options.ceres.loss_function_scale = scale
+        solver.function_tolerance = tolerance
         pycolmap.bundle_adjustment(model, options)
     model.write_binary(settings["model"])
