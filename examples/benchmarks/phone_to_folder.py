@@ -212,7 +212,7 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
 
 def run_encode(video: Path, stream: Path) -> None:
     """Convert a video as `reconstruct` does first."""
-    options = with_downscale(EncodeOptions(), read_video(video).picture_size)
+    options = with_downscale(EncodeOptions(effort="quick"), read_video(video).picture_size)
     encode(video, stream, options=options)
 
 
