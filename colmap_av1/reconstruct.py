@@ -40,6 +40,8 @@ from colmap_av1.video.unchanged import check_unchanged
 
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
+# Images without a pose that a warning names.
+_NUM_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -262,7 +264,9 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
 
 
-def _notes(facts: dict[str, Any], further: Sequence[FurtherModel], unplaced: int) -> list[str]:
+def _notes(
+    facts: dict[str, Any], further: Sequence[FurtherModel], unplaced: Sequence[str]
+) -> list[str]:
     notes = []
     if further:
         notes.append(
@@ -271,7 +275,12 @@ def _notes(facts: dict[str, Any], further: Sequence[FurtherModel], unplaced: int
             "'images' and 'sparse/0'"
         )
     if unplaced:
-        notes.append(f"{unplaced} of {facts['num_images']} images have no pose and are left out")
+        names = ", ".join(f"'{name}'" for name in unplaced[:_NUM_NAMED])
+        more = ", ..." if len(unplaced) > _NUM_NAMED else ""
+        notes.append(
+            f"{len(unplaced)} of {facts['num_images']} images have no pose and are left out: "
+            f"{names}{more}"
+        )
     left_out = [name for name, count in facts["registered"].items() if count == 0]
     if left_out and not further:
         names = ", ".join(f"'{name}'" for name in left_out)

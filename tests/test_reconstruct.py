@@ -550,6 +550,21 @@ def test_pictures_that_contradict_the_poses(
     assert reconstruct(SCENE, tmp_path / "out", options=options).resumed == STAGES
 
 
+def test_images_that_are_left_out_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As if those with less than the usual number of points were hidden.
+    monkeypatch.setattr("colmap_av1.model.mapper.FEW_SEEN", (10_000, 0.95))
+    found = reconstruct(SCENE, tmp_path / "out", options=OPTIONS)
+    written = {path.name for path in (tmp_path / "out" / "images").iterdir()}
+    assert found.num_registered == len(written) < NUM_IMAGES
+    every = [f"frame_{EVERY * i:06d}.png" for i in range(NUM_IMAGES)]
+    missing = [name for name in every if name not in written]
+    (told,) = [note for note in found.warnings if "have no pose" in note]
+    assert told.startswith(f"{len(missing)} of {NUM_IMAGES} images have no pose")
+    assert [name in told for name in missing] == [i < 4 for i in range(len(missing))]
+
+
 def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
     shutil.copytree(made.output, tmp_path / "plain")
     mapping = replace(OPTIONS.mapping, adjust=False)

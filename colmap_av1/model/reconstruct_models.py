@@ -58,13 +58,15 @@ def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
     return {"place": placed, "model": model_stage(run, tracks, takes, posed.moving, placed)}
 
 
-def further_models(run: Run, first: Posed, takes: Takes) -> tuple[tuple[FurtherModel, ...], int]:
+def further_models(
+    run: Run, first: Posed, takes: Takes
+) -> tuple[tuple[FurtherModel, ...], list[str]]:
     """Write the models of images that nothing connects with those of the first.
 
     Images may be in two of them, undistorted by other intrinsics: hence a folder each.
 
     Returns:
-        The models, and how many images are in none.
+        The models, and the names of the images that are in none, in the order of their frames.
     """
     placed = read_posed_images(run, first.last, takes).images
     left = set(takes.images.names) - {image.name for image in placed}
@@ -87,7 +89,7 @@ def further_models(run: Run, first: Posed, takes: Takes) -> tuple[tuple[FurtherM
         figures = (facts["num_points"], facts["mean_error"])
         found.append(FurtherModel(own.output, len(images), images[0], images[-1], *figures))
     _remove_further_models(run, len(found) + 1)
-    return tuple(found), len(left)
+    return tuple(found), [name for name in takes.images.names if name in left]
 
 
 def _named(takes: Takes, names: AbstractSet[str]) -> Takes:

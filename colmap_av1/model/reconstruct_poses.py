@@ -326,9 +326,12 @@ def adjustment_stage(
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
-        joints = model_joints(without_unseen_images(folder))
+        adjusted = without_unseen_images(folder)
+        joints = model_joints(adjusted)
         return {
             "poses": "adjusted",
+            "num_registered": adjusted.num_reg_images(),
+            "registered": _registered(folder, takes),
             "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
             "joints_warning": joints.warning,
         }
