@@ -119,7 +119,15 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     )
     options = replace(OPTIONS, place=place)
     again = reconstruct(video, placed.output, options=options)
-    assert again.resumed == ("tracks", "matches", "poses", "resection", "moving", "adjustment")
+    assert again.resumed == (
+        "tracks",
+        "matches",
+        "poses",
+        "resection",
+        "moving",
+        "adjustment",
+        "far_views",
+    )
     assert again.place["units"] == "metres"
     assert again.place["origin"] is None
     assert again.place["how"][0].startswith("z up by gravity")

@@ -116,7 +116,16 @@ def test_reconstruct_makes_splats_after_a_survey(made: ReconstructReport, tmp_pa
     shutil.copytree(made.output, output)
     options = replace(OPTIONS, triangulate=TriangulateOptions())
     report = reconstruct(SCENE, output, options=options)
-    stages = ("tracks", "matches", "poses", "resection", "moving", "adjustment", "place")
+    stages = (
+        "tracks",
+        "matches",
+        "poses",
+        "resection",
+        "moving",
+        "adjustment",
+        "far_views",
+        "place",
+    )
     assert report.resumed == stages
     assert report.coverage > 0.99 > made.coverage
     assert report.num_points < made.num_points
