@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from dense_scene import OPTIONS, SCENE, Truth
+from dense_scene import OPTIONS, SCENE, STAGES, Truth
 from telemetry import gps5, grav, with_gpmf
 
 from colmap_av1 import MapOptions, OptionError, PlaceOptions, map_database, reconstruct
@@ -119,15 +119,7 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     )
     options = replace(OPTIONS, place=place)
     again = reconstruct(video, placed.output, options=options)
-    assert again.resumed == (
-        "tracks",
-        "matches",
-        "poses",
-        "resection",
-        "moving",
-        "adjustment",
-        "far_views",
-    )
+    assert again.resumed == STAGES[:-2]
     assert again.place["units"] == "metres"
     assert again.place["origin"] is None
     assert again.place["how"][0].startswith("z up by gravity")

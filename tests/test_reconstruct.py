@@ -21,7 +21,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import Encode, make_frames
-from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
+from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, STAGES, Truth
 
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
@@ -42,10 +42,6 @@ from colmap_av1.options import (
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.unchanged import file_state
 
-STAGES = (
-    *("tracks", "matches", "poses", "resection", "moving", "adjustment", "far_views"),
-    *("place", "model"),
-)
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 

@@ -336,17 +336,8 @@ def test_two_videos_and_photos_are_one_model(
 
     resumed = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
     assert resumed.resumed == (
-        *(
-            "tracks_walk_in",
-            "tracks_back",
-            "matches",
-            "poses",
-            "moving",
-            "adjustment",
-            "far_views",
-            "place",
-        ),
-        "model",
+        *("tracks_walk_in", "tracks_back", "matches", "poses", "moving"),
+        *("adjustment", "far_views", "place", "model"),
     )
 
 
