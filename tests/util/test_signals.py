@@ -12,10 +12,15 @@ import pytest
 
 from colmap_av1.util.signals import ending_in_order
 
-# Shells let what they start in the background ignore interrupts, and it is passed on.
-HEEDING = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); "
-HEEDING += "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
-IGNORING = HEEDING.replace("SIG_DFL", "SIG_IGN")
+# Shells let what they start in the background ignore interrupts, and nohup that the terminal hangs
+# up; both are passed on.
+SETTING = (
+    "import os, signal, sys\n"
+    "for number in {numbers}: signal.signal(number, signal.{action})\n"
+    "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+)
+HEEDING = SETTING.format(numbers="(signal.SIGINT, signal.SIGHUP)", action="SIG_DFL")
+IGNORING = SETTING.format(numbers="(signal.SIGINT, signal.SIGTERM)", action="SIG_IGN")
 # As pip writes it.
 SCRIPT = (
     "import sys\nfrom colmap_av1.cli import main\nif __name__ == '__main__':\n    sys.exit(main())"
@@ -57,7 +62,7 @@ def test_signal_after_pycolmap_has_set_its_own_handler(tmp_path: Path, number: i
 
 
 def test_signal_that_pycolmap_must_not_heed_either(tmp_path: Path) -> None:
-    words = [IGNORING.replace("SIGINT", "SIGTERM"), "-m", "colmap_av1", "info", "--video", "none"]
+    words = [IGNORING, "-m", "colmap_av1", "info", "--video", "none"]
     status, said = end_while_importing(words, signal.SIGTERM, tmp_path, "pycolmap")
     assert (status, said) == (2, "colmap-av1: error: none: no such file: give the path of a video")
 
