@@ -118,13 +118,24 @@ def main() -> int:
     parser.add_argument(
         "--ours", action="store_true", help="measure `reconstruct` alone; rows of SIFT stay"
     )
+    parser.add_argument(
+        "--without_mapper",
+        action="store_true",
+        help="end SIFT with its matches, where the mapper takes hours",
+    )
     add_results(parser, "phone_to_folder")
     arguments = parser.parse_args()
     console = Console(stderr=True)
     for name in arguments.clips:
         folder = arguments.cache.resolve() / name
         try:
-            rows = measure(clip_of(name, folder), folder, console, ours_alone=arguments.ours)
+            clip = clip_of(name, folder)
+            console.print(f"{name}: reconstruct", markup=False)
+            rows, names = measure_ours(clip, folder / "reconstruct")
+            if not arguments.ours:
+                console.print(f"{name}: SIFT on {len(names)} images", markup=False)
+                mapped = not arguments.without_mapper
+                rows += measure_sift(clip, folder / "sift", names, mapped=mapped)
         except ColmapAv1Error as error:
             console.print(f"error: {name}: {error}", markup=False)
             continue
@@ -153,32 +164,32 @@ def clip_of(name: str, folder: Path) -> Clip:
     )
 
 
-def measure(clip: Clip, folder: Path, console: Console, *, ours_alone: bool) -> list[Row]:
-    """Both ways on a clip: a row for each step, and one for each way as a whole."""
-    console.print(f"{clip.name}: reconstruct", markup=False)
-    converted, made, output = folder_of(clip, folder / "reconstruct")
-    ours = [row_of(clip, "conversion", converted)] if converted is not None else []
-    ours.append(row_of(clip, "reconstruct from AV1", made))
-    # What has no pose is not written; SIFT is given what is.
-    names = sorted(path.name for path in (output / "images").iterdir())
+def measure_ours(clip: Clip, folder: Path) -> tuple[list[Row], list[str]]:
+    """Rows of the steps, the whole and the stages of `reconstruct`, and names of its images."""
+    converted, made, output = folder_of(clip, folder)
+    rows = [row_of(clip, "conversion", converted)] if converted is not None else []
+    rows.append(row_of(clip, "reconstruct from AV1", made))
     report = json.loads((output / "report.json").read_text())
     figures = figures_of(clip, output / "sparse" / "0", output / "images", report["num_images"])
-    ours.append(replace(sum_of("reconstruct", ours), **figures))
-    ours += [
+    rows.append(replace(sum_of("reconstruct", rows), **figures))
+    rows += [
         Row(clip.name, f"{render.STAGE}{stage}", cpu_s, report["seconds"][stage], None)
         for stage, cpu_s in report["cpu_seconds"].items()
     ]
-    if ours_alone:
-        return ours
-    console.print(f"{clip.name}: SIFT on {len(names)} images", markup=False)
-    steps, model, images = sift_of(clip, folder / "sift", names)
-    sift = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
-    total = sum_of("SIFT sequential", sift)
+    # What has no pose is not written; SIFT is given what is.
+    return rows, sorted(path.name for path in (output / "images").iterdir())
+
+
+def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) -> list[Row]:
+    """Rows of the steps of SIFT on the same images, and of all of them."""
+    steps, model, images = sift_of(clip, folder, names, mapped=mapped)
+    rows = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
+    total = replace(sum_of("SIFT sequential", rows), images=len(names))
     if model is not None:
-        straight = undistorted(model, images, folder / "sift" / "undistorted")
+        straight = undistorted(model, images, folder / "undistorted")
         figures = figures_of(clip, model, None, len(names)) | ruler.far_views(*straight)
         total = replace(total, **figures)
-    return [*ours, *sift, total]
+    return [*rows, total]
 
 
 def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any], Path]:
@@ -222,9 +233,9 @@ def run_reconstruct(video: Path, output: Path, options: ReconstructOptions) -> N
 
 
 def sift_of(
-    clip: Clip, folder: Path, names: list[str]
+    clip: Clip, folder: Path, names: list[str], *, mapped: bool
 ) -> tuple[dict[str, dict[str, Any]], Path | None, Path]:
-    """What SIFT's steps took, its model and its images."""
+    """What SIFT's steps took, its model, if it is mapped, and its images."""
     images, database = folder / "frames" / "images", folder / "features" / "database.db"
     frames = [int(Path(name).stem.rpartition("_")[2]) for name in names]
     opened = read_video(clip.video)
@@ -254,11 +265,13 @@ def sift_of(
     written = run_stage_in(images.parent, given, write, products=[images], timed=True).facts
     given = [*given, clip.camera, pycolmap.__version__]
     matching = run_stage_in(database.parent, given, match, products=[database], timed=True).facts
+    steps = {"frames": written, **matching}
+    if not mapped:
+        return steps, None, images
     known = clip.camera.camera_params is not None
     settings = MapOptions(refine_intrinsics=not known, forward_motion=clip.forward_motion)
-    mapped = measure_mapper(database, images, folder / "model", settings)
-    steps = {"frames": written, **matching, "mapper": taken(mapped)}
-    return steps, mapped.model, images
+    run = measure_mapper(database, images, folder / "model", settings)
+    return {**steps, "mapper": taken(run)}, run.model, images
 
 
 def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -> None:

@@ -247,17 +247,26 @@ FROM_FILE, FROM_STREAM, SIFT_FROM_FILE = "reconstruct", "reconstruct from AV1", 
 
 
 def phone_to_folder(rows: list[Row]) -> str:
-    """Both ways from a file to a model, as wholes."""
+    """Both ways from a file to a model, as wholes; SIFT's is less than that if not mapped."""
     by_way = {(row["clip"], row["way"]): row for row in rows}
     ways = {SIFT_FROM_FILE: "SIFT", FROM_FILE: "`reconstruct`"}
+
+    def is_matched_only(row: Row) -> bool:
+        return row["way"] == SIFT_FROM_FILE and not row["registered"]
+
+    def way(row: Row) -> str:
+        return "SIFT, not mapped" if is_matched_only(row) else ways[row["way"]]
+
+    def compared(row: Row, sift: Row, name: str, spelling: str) -> str:
+        times = f"{float(sift[name]) / float(row[name]):.1f}x less"
+        return f"{number(row, name, spelling)}, {'over ' * is_matched_only(sift)}{times}"
 
     def less(heading: str, name: str, spelling: str) -> Column:
         def cell(row: Row) -> str:
             sift = by_way.get((row["clip"], SIFT_FROM_FILE))
             if row["way"] != FROM_FILE or sift is None or not row.get(name):
                 return number(row, name, spelling)
-            times = float(sift[name]) / float(row[name])
-            return f"{number(row, name, spelling)}, {times:.1f}x less"
+            return compared(row, sift, name, spelling)
 
         return Column(heading, cell)
 
@@ -268,15 +277,14 @@ def phone_to_folder(rows: list[Row]) -> str:
         sift, ours = (by_way.get((row["clip"], way)) for way in (SIFT_FROM_FILE, FROM_STREAM))
         if row["way"] != FROM_FILE or sift is None or ours is None:
             return ""
-        times = float(sift["cpu_s"]) / float(ours["cpu_s"])
-        return f"{number(ours, 'cpu_s', '.0f')}, {times:.1f}x less"
+        return compared(ours, sift, "cpu_s", ".0f")
 
     def far_views(row: Row) -> str:
         return f"{number(row, 'far_views', '.2f')} / {number(row, 'far_views_90', '.2f')}"
 
     columns = [
         Column("clip", lambda row: f"`{row['clip']}`" if is_first(row) else ""),
-        Column("model", lambda row: ways[row["way"]]),
+        Column("model", way),
         Column("images", lambda row: f"{row['registered'] or '-'} of {row['images'] or '-'}"),
         figure("points", "points", ",.0f"),
         figure("reprojection error", "error_px", ".3f", " px"),
