@@ -61,6 +61,7 @@ def map_poses(
     num_images: int,
     progress: Progress,
     start_tracks: int | None = None,
+    tolerance: float | None = None,
 ) -> tuple[int, ...]:
     """Map a database in a process of its own, see `run_mapper`.
 
@@ -74,6 +75,8 @@ def map_poses(
         progress: called in the stage "poses" with the number of images placed so far.
         start_tracks: tracks of each image that the global mapper starts from, the longest ones; the
             others are triangulated and adjusted on what it finds. None: all.
+        tolerance: share of the error that a step of adjusting all images must lower it by, or be
+            the last. None: what COLMAP sets.
 
     Returns:
         Images with a pose in each model, the most first; empty where none came out.
@@ -83,7 +86,7 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
-    settings["start_tracks"] = start_tracks
+    settings |= {"start_tracks": start_tracks, "tolerance": tolerance}
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
@@ -141,6 +144,7 @@ def _mapping_settings(
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
         "start_tracks": None,
+        "tolerance": None,
     }
 
 

@@ -46,9 +46,12 @@ from colmap_av1.util.stages import Kept, run_stage
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
 # Tracks of an image that the global mapper starts from, the longest ones: from all of them it takes
-# two to four times as long, to the same poses. What links videos, or images where motion does not,
-# is short, and all of it is needed; what sees a place again makes long tracks longer.
-_START_TRACKS = 200
+# four times as long and more, to the same poses, as all are triangulated and adjusted on these.
+# What links videos, or images where motion does not, is short, and all of it is needed; what sees a
+# place again makes long tracks longer.
+_START_TRACKS = 100
+# Share of the error by which the mapper's steps lower it at least, where an adjustment follows.
+_TOLERANCE = 1e-4
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
 # end of a video, say, the mapper may leave images that are off by more with all they see.
@@ -86,6 +89,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     links = matched.facts["links"]
     hangs = links["num_between"] or links["broken_gaps"] or links["doubtful_gaps"]
     start_tracks = None if hangs else _START_TRACKS
+    tolerance = _TOLERANCE if mapping.adjust else None
     how = MapOptions(
         mapper=mapper,
         forward_motion=forward and mapper == "incremental",
@@ -108,6 +112,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
                 num_images=len(keyed.images.names),
                 progress=progress,
                 start_tracks=start_tracks,
+                tolerance=tolerance,
             )
         if max(sizes, default=0) < LEAST_IMAGES:
             raise ModelError(_why_no_start(matched.facts, mapper))
@@ -124,7 +129,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, how, start_tracks, pycolmap.__version__],
+        [matched.digest, how, start_tracks, tolerance, pycolmap.__version__],
         into=run.stages,
         products=["poses"],
         make=make,

@@ -60,6 +60,8 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         how.ba_refine_extra_params = refine
         how.mapper.abs_pose_refine_focal_length = refine
         how.mapper.abs_pose_refine_extra_params = refine
+        if settings["tolerance"] is not None:
+            how.ba_global_function_tolerance = settings["tolerance"]
         if settings["init_max_forward_motion"] is not None:
             how.mapper.init_max_forward_motion = settings["init_max_forward_motion"]
         callbacks = {"initial_image_pair_callback": placed, "next_image_callback": placed}
@@ -68,6 +70,9 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         how = pycolmap.GlobalPipelineOptions(**common)
         how.mapper.bundle_adjustment.refine_focal_length = refine
         how.mapper.bundle_adjustment.refine_extra_params = refine
+        if settings["tolerance"] is not None:
+            solver = how.mapper.bundle_adjustment.ceres.solver_options
+            solver.function_tolerance = settings["tolerance"]
         if settings["start_tracks"] is not None:
             how.mapper.track_required_tracks_per_view = settings["start_tracks"]
         models = pycolmap.global_mapping(database, each, each, options=how)
