@@ -47,10 +47,10 @@ from colmap_av1.util.stages import Kept, run_stage
 _FEW_TRACKS = 100
 # Tracks of an image that the global mapper starts from, the longest ones: from all of them it takes
 # four times as long and more, to the same poses, as all are triangulated and adjusted on these.
-# What links videos, or images where motion does not, is short, and all of it is needed; what sees a
-# place again makes long tracks longer.
+# Where an adjustment follows, the mapper's steps end that lower the error by less than this share.
+# Neither where models hang on what links videos, or images where motion does not: it is short, and
+# all of it is needed. What sees a place again makes long tracks longer.
 _START_TRACKS = 100
-# Share of the error by which the mapper's steps lower it at least, where an adjustment follows.
 _TOLERANCE = 1e-4
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
@@ -89,7 +89,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     links = matched.facts["links"]
     hangs = links["num_between"] or links["broken_gaps"] or links["doubtful_gaps"]
     start_tracks = None if hangs else _START_TRACKS
-    tolerance = _TOLERANCE if mapping.adjust else None
+    tolerance = _TOLERANCE if mapping.adjust and not hangs else None
     how = MapOptions(
         mapper=mapper,
         forward_motion=forward and mapper == "incremental",
