@@ -45,11 +45,9 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
-# Tracks of an image that the global mapper starts from, the longest ones: from all of them it takes
-# four times as long and more, to the same poses, as all are triangulated and adjusted on these.
-# Where an adjustment follows, the mapper's steps end that lower the error by less than this share.
-# Neither where models hang on what links videos, or images where motion does not: it is short, and
-# all of it is needed. What sees a place again makes long tracks longer.
+# Tracks of an image that the global mapper starts from, the longest ones, and share of the error
+# that steps lower or end, where an adjustment follows: a fourth of the time, to the same poses.
+# What links videos, or images where motion does not, is short, though, and all of it is needed.
 _START_TRACKS = 100
 _TOLERANCE = 1e-4
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
