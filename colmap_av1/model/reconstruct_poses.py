@@ -46,8 +46,8 @@ from colmap_av1.util.stages import Kept, run_stage
 # Of an image, below which a mapper that finds no start may lack them.
 _FEW_TRACKS = 100
 # Tracks of an image that the global mapper starts from, the longest ones, and share of the error
-# that steps lower or end, where an adjustment follows: a fourth of the time, to the same poses.
-# What links videos, or images where motion does not, is short, though, and all of it is needed.
+# that steps lower or end, where an adjustment follows: half the time of 200, to the same poses. But
+# what links videos or images is short, and all of it needed; revisits make long tracks longer.
 _START_TRACKS = 100
 _TOLERANCE = 1e-4
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
