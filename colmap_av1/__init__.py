@@ -8,8 +8,7 @@ if start.is_program():
 # isort: split
 from colmap_av1.batch.page import write_page
 from colmap_av1.batch.run import BatchReport, run_batch
-from colmap_av1.database.check import CheckReport, check
-from colmap_av1.database.hloc import HlocMatches, export_hloc, read_hloc
+from colmap_av1.check.database import CheckReport, check
 from colmap_av1.densify import DensifyReport, densify
 from colmap_av1.errors import (
     BitstreamError,
@@ -25,9 +24,9 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
+from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
 from colmap_av1.map import MapReport, map_database
 from colmap_av1.match import MatchReport, match
-from colmap_av1.model.reconstruct_models import FurtherModel
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import StreamReport, inspect
 from colmap_av1.motion.motion_file import export_motion
@@ -59,6 +58,7 @@ from colmap_av1.options import (
     ViewOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
+from colmap_av1.splats.reconstruct_models import FurtherModel
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.video.encode import EncodeReport, encode
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.check.model_figures import model_figures
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend
@@ -24,8 +25,7 @@ from colmap_av1.evaluate.metrics.sequence import read_poses
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
-from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.figures import model_figures
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
 from colmap_av1.util.arguments import checks_arguments

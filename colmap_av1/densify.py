@@ -13,12 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError, cannot_write
-from colmap_av1.images.choosing import ChosenImages, choose_images
-from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
-from colmap_av1.images.of_videos import VideoImages, images_of_videos
-from colmap_av1.images.photos import Photo
-from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
-from colmap_av1.model.colmap_model import (
+from colmap_av1.geometry.colmap_model import (
     MODEL_FILES,
     ModelImage,
     ModelPoints,
@@ -26,14 +21,8 @@ from colmap_av1.model.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.model.coverage import PosedCamera, coverage, coverage_of_model, views_of
-from colmap_av1.model.splats.gaussians import (
-    check_gaussians_path,
-    initial_gaussians,
-    write_gaussians,
-)
-from colmap_av1.model.splats.swept_cloud import Look, swept_cloud
-from colmap_av1.model.track_points import (
+from colmap_av1.geometry.coverage import PosedCamera, coverage, coverage_of_model, views_of
+from colmap_av1.geometry.track_points import (
     LEAST_AGREEING,
     Colours,
     chaining_for_points,
@@ -42,8 +31,19 @@ from colmap_av1.model.track_points import (
     to_model_points,
     triangulate_tracks,
 )
-from colmap_av1.model.triangulate import TriangulatedPoints
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
+from colmap_av1.images.of_videos import VideoImages, images_of_videos
+from colmap_av1.images.photos import Photo
+from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.options import DensifyOptions, MatchOptions
+from colmap_av1.splats.gaussians import (
+    check_gaussians_path,
+    initial_gaussians,
+    write_gaussians,
+)
+from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import (
     Tracks,
     keep_frames,

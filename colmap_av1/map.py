@@ -12,27 +12,27 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.check import check
+from colmap_av1.check.crossings import model_crossings
+from colmap_av1.check.database import check
+from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
+from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
-from colmap_av1.model.agreement.crossings import model_crossings
-from colmap_av1.model.agreement.far_views import FarViews, model_far_views
-from colmap_av1.model.agreement.joints import model_joints
-from colmap_av1.model.colmap_model import MODEL_FILES, posed_images, read_model
-from colmap_av1.model.figures import ModelFigures, model_figures
-from colmap_av1.model.mapper import is_mapper_log, map_poses
-from colmap_av1.model.placing.placement import (
+from colmap_av1.options import MapOptions, PlaceOptions
+from colmap_av1.poses.long_range import FarViews, model_far_views
+from colmap_av1.poses.mapper import is_mapper_log, map_poses
+from colmap_av1.poses.placing.placement import (
     Placement,
     Surroundings,
     find_placement,
     write_place,
 )
-from colmap_av1.model.placing.up import some_spread, vertical_lines
-from colmap_av1.options import MapOptions, PlaceOptions
+from colmap_av1.poses.placing.up import some_spread, vertical_lines
+from colmap_av1.poses.seams import model_joints
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_files, check_folder

@@ -15,7 +15,7 @@ from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_o
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError
-from colmap_av1.images.camera import check_pixel_aspect
+from colmap_av1.geometry.cameras import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions

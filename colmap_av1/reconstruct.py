@@ -12,21 +12,21 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.geometry.track_points import LEAST_AGREEING
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.model.reconstruct_models import FurtherModel, further_models, written_model
-from colmap_av1.model.reconstruct_posed import mended_poses
-from colmap_av1.model.reconstruct_tracks import (
+from colmap_av1.options import MatchOptions, ReconstructOptions
+from colmap_av1.poses.reconstruct_posed import mended_poses
+from colmap_av1.poses.reconstruct_tracks import (
     Run,
     read_tracks,
     stage_of_video,
     track_stage,
 )
-from colmap_av1.model.splats.gaussians import check_gaussians_path, write_model_gaussians
-from colmap_av1.model.track_points import LEAST_AGREEING
-from colmap_av1.options import MatchOptions, ReconstructOptions
+from colmap_av1.splats.gaussians import check_gaussians_path, write_model_gaussians
+from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread

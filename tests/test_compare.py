@@ -18,11 +18,11 @@ from conftest import PROJECT
 from colmap_av1 import compare as compare_module
 from colmap_av1.cli import main
 from colmap_av1.compare import compare
-from colmap_av1.database.hloc import export_hloc
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
 from colmap_av1.evaluate.frontends.learned import pairs_of
 from colmap_av1.evaluate.report.results import Column
 from colmap_av1.evaluate.training.trainers import match_renders
+from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
 
 pytest.importorskip("matplotlib")

@@ -11,7 +11,7 @@ from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.model.colmap_model import ModelImage, no_points, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, no_points, write_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
 from colmap_av1.video.decoding import decode_frames
 

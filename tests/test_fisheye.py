@@ -27,7 +27,7 @@ from colmap_av1 import (
     match,
     reconstruct,
 )
-from colmap_av1.model.colmap_model import camera_centres, posed_images, read_model
+from colmap_av1.geometry.colmap_model import camera_centres, posed_images, read_model
 
 WIDTH, HEIGHT, FOCAL, NUM_FRAMES = 320, 240, 155.0, 20
 MODEL = "OPENCV_FISHEYE"

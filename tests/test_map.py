@@ -27,7 +27,7 @@ from colmap_av1 import (
 )
 from colmap_av1.cli import main
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import Mapper
 from colmap_av1.reconstruct import ReconstructReport
 

@@ -16,7 +16,7 @@ from telemetry import gps5, grav, with_gpmf
 
 from colmap_av1 import MapOptions, OptionError, PlaceOptions, map_database, reconstruct
 from colmap_av1.database.reading import read_pose_priors
-from colmap_av1.model.colmap_model import camera_centres, posed_images, read_model
+from colmap_av1.geometry.colmap_model import camera_centres, posed_images, read_model
 from colmap_av1.reconstruct import ReconstructReport
 
 ORIGIN = (59.33, 18.07, 20.0)

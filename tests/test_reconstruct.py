@@ -26,8 +26,8 @@ from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, STAGES, Truth
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.coverage import evenly_spread
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.coverage import evenly_spread
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -273,7 +273,7 @@ def test_long_videos_have_fewer_images_than_frames(
     the motion is read twice.
     """
     if not at_once:
-        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._MOST_HELD", 0)
+        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._MOST_HELD", 0)
 
     def stop(stage: str, *_: object) -> None:
         if stage == "pairs":
@@ -310,12 +310,12 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
 
     tracks = []
     for name, held in (("once", 1 << 40), ("twice", 0)):
-        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._MOST_HELD", held)
+        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._MOST_HELD", held)
         monkeypatch.setattr(
-            "colmap_av1.model.reconstruct_tracks.spread_images",
+            "colmap_av1.poses.reconstruct_tracks.spread_images",
             lambda *_: np.arange(0, 60, 5, dtype=np.int32),
         )
-        monkeypatch.setattr("colmap_av1.model.reconstruct_tracks._CANDIDATES", 6)
+        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._CANDIDATES", 6)
         options = ReconstructOptions(max_images=10)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
@@ -434,7 +434,7 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
 
     with monkeypatch.context() as patch:
         patch.setattr(
-            importlib.import_module("colmap_av1.model.reconstruct_model"), "write_model", full
+            importlib.import_module("colmap_av1.splats.reconstruct_model"), "write_model", full
         )
         with pytest.raises(ModelError, match="No space left on device: the stages before are kept"):
             reconstruct(SCENE, made.output, options=other)
@@ -475,7 +475,7 @@ def test_model_of_two_images_is_none(
         return (2,)
 
     shutil.copytree(made.output, tmp_path / "out")
-    stages = importlib.import_module("colmap_av1.model.reconstruct_poses")
+    stages = importlib.import_module("colmap_av1.poses.reconstruct_poses")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(
@@ -535,7 +535,7 @@ def test_pictures_that_contradict_the_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
 ) -> None:
     """Places seen again are linked then, unless there must be no links."""
-    monkeypatch.setattr("colmap_av1.model.agreement.far_views._FAR_APART", 0.0)
+    monkeypatch.setattr("colmap_av1.poses.long_range._FAR_APART", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
     found = reconstruct(SCENE, tmp_path / "out", options=options)
     assert found.links["looked_again"] == (links == "auto")
@@ -550,7 +550,7 @@ def test_images_that_are_left_out_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As if those with less than the usual number of points were hidden.
-    monkeypatch.setattr("colmap_av1.model.mapper.FEW_SEEN", (10_000, 0.95))
+    monkeypatch.setattr("colmap_av1.poses.mapper.FEW_SEEN", (10_000, 0.95))
     found = reconstruct(SCENE, tmp_path / "out", options=OPTIONS)
     written = {path.name for path in (tmp_path / "out" / "images").iterdir()}
     assert found.num_registered == len(written) < NUM_IMAGES

@@ -13,12 +13,12 @@ import h5py
 import numpy as np
 import pytest
 
-from colmap_av1.database.hloc import read_hloc
 from colmap_av1.errors import ColmapAv1Error, HlocError, ImageError, ModelError, OptionError
+from colmap_av1.geometry.colmap_model import are_whole, read_model
 from colmap_av1.images.choosing import check_frame_list
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import frames_of_images, natural_order
-from colmap_av1.model.colmap_model import are_whole, read_model
+from colmap_av1.interop.hloc import read_hloc
 from colmap_av1.options import ImageOptions
 
 resource = pytest.importorskip("resource")

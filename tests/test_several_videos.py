@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from colmap_av1.check.database import check
 from colmap_av1.cli import main
-from colmap_av1.database.check import check
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.densify import densify
 from colmap_av1.errors import (
@@ -33,7 +33,6 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import labels_of
 from colmap_av1.images.takes import count_through
 from colmap_av1.match import match
-from colmap_av1.model.mapper import map_poses
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -41,6 +40,7 @@ from colmap_av1.options import (
     MatchOptions,
     ReconstructOptions,
 )
+from colmap_av1.poses.mapper import map_poses
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.tracks import Tracks, tracks_in_a_row
 from colmap_av1.video.decoding import decode_frames
@@ -378,7 +378,7 @@ def test_another_model_of_the_same_images_is_no_further_one(
         shutil.copytree(output / "0", output / "1")
         return size, size
 
-    monkeypatch.setattr("colmap_av1.model.reconstruct_poses.map_poses", twice)
+    monkeypatch.setattr("colmap_av1.poses.reconstruct_poses.map_poses", twice)
     made = reconstruct(halves[0], tmp_path / "out", options=ReconstructOptions(match=QUICK))
     assert made.other_models == ()
     assert made.warnings == ()

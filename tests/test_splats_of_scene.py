@@ -14,8 +14,8 @@ from dense_scene import OPTIONS, SCENE, STAGES, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.evaluate.metrics.clouds import point_cloud
-from colmap_av1.model.colmap_model import ModelImage, camera_centres, no_points, write_model
-from colmap_av1.model.coverage import coverage_of_model
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, no_points, write_model
+from colmap_av1.geometry.coverage import coverage_of_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames

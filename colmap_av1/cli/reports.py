@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_av1.batch.run import BatchReport
-from colmap_av1.database.check import CheckReport
+from colmap_av1.check.database import CheckReport
+from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
 from colmap_av1.matching.links import gap_in_video
 from colmap_av1.matching.shutter.of_video import VideoReadOut
-from colmap_av1.model.agreement.far_views import FarViews
-from colmap_av1.model.figures import ModelFigures
 from colmap_av1.motion.info import StreamReport
+from colmap_av1.poses.long_range import FarViews
 from colmap_av1.reconstruct import ReconstructReport
 
 if TYPE_CHECKING:  # the comparison is slow to import

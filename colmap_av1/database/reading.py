@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.file import is_new, open_database, open_unaltered
 from colmap_av1.database.layout import MAX_NUM_IMAGES, columns
 from colmap_av1.errors import DatabaseError
-from colmap_av1.images.camera import camera_fault
+from colmap_av1.geometry.cameras import camera_fault
 
 # A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
 # or a 2x2 affine shape.

@@ -1,5 +1,6 @@
 """Comparison of tracks, models and front-ends: one module for each family of metrics."""
 
+from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage, prepare_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend, FrontendRun
 from colmap_av1.evaluate.frontends.mapping import (
@@ -25,7 +26,6 @@ from colmap_av1.evaluate.training.splatting import (
     split_images,
     train_gaussians,
 )
-from colmap_av1.model.figures import ModelFigures, model_figures
 
 __all__ = [
     "FRONTENDS",

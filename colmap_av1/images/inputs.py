@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError
+from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.masks import Mask, Masks, VideoMasks, read_masks
+from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import MatchOptions

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
+from colmap_av1.geometry.masks import Mask, counted_at, make_mask
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
@@ -25,61 +25,10 @@ from colmap_av1.util.cpus import threads_or_cpus
 _SUFFIX = ".png"
 # Share of a frame's pixels below which no motion is carried over it.
 _LEAST_SHARE = 0.05
-# Masks have few edges: more effort makes them hardly smaller.
-_COMPRESSION = 1
 _LAYOUTS = (
     "give one PNG for all frames, or a folder with a PNG for every frame or with IMAGE.png for "
     "every image"
 )
-
-
-@dataclass(frozen=True)
-class Mask:
-    """Which pixels of a picture count.
-
-    Attributes:
-        size: (width, height) in pixels.
-        packed: a bit a pixel, row by row, compressed: a long video's masks are many.
-        share: of the pixels, those that count.
-    """
-
-    size: tuple[int, int]
-    packed: bytes
-    share: float
-
-    @property
-    def kept(self) -> NDArray[np.bool_]:
-        """Bool [height, width] the pixels that count."""
-        width, height = self.size
-        bits = np.frombuffer(zlib.decompress(self.packed), np.uint8)
-        return np.unpackbits(bits, count=width * height).reshape(height, width).view(np.bool_)
-
-    def keeps(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.bool_]:
-        """Whether positions in a picture lie on pixels that count.
-
-        Args:
-            xy: [n, 2] pixels, the first one's centre at (0.5, 0.5).
-            size: (width, height) of the picture, which may be another than the mask's.
-        """
-        return _on(self.kept, xy, size)
-
-
-def make_mask(kept: NDArray[np.bool_]) -> Mask:
-    """The mask of bool [height, width]: the pixels that count."""
-    height, width = kept.shape
-    packed = zlib.compress(np.packbits(kept).tobytes(), _COMPRESSION)
-    return Mask((width, height), packed, float(kept.mean()))
-
-
-def joined_masks(a: Mask | None, b: Mask | None) -> Mask | None:
-    """The mask of what counts by both, of the size of the first; None: all does."""
-    if a is None or b is None:
-        return a if b is None else b
-    other = b.kept
-    if b.size != a.size:
-        resized = cv2.resize(other.astype(np.uint8), a.size, interpolation=cv2.INTER_NEAREST)
-        other = resized > 0
-    return make_mask(a.kept & other)
 
 
 @dataclass(frozen=True)
@@ -357,8 +306,8 @@ def mask_tracks(
         own = order[first:last]
         passing, between = unseen.at(frame)
         own_size = size if scaled else (pixels.shape[1], pixels.shape[0])
-        kept[own] = _on(pixels, tracks.xy[own], own_size)
-        begins[passing] |= ~_on(pixels, between, own_size)
+        kept[own] = counted_at(pixels, tracks.xy[own], own_size)
+        begins[passing] |= ~counted_at(pixels, between, own_size)
     if kept.all() and not begins.any():
         return tracks
     return keep_long_tracks(split_tracks(tracks, kept, begins), min_length)
@@ -386,15 +335,3 @@ class _Unseen:
         start, end = tracks.frame[after - 1], tracks.frame[after]
         share = ((frame - start) / (end - start)).astype(np.float32)[:, None]
         return after, tracks.xy[after - 1] * (1 - share) + tracks.xy[after] * share
-
-
-def _on(
-    kept: NDArray[np.bool_], xy: NDArray[np.floating], size: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Whether positions lie on pixels that count, see `Mask.keeps`."""
-    # By columns: NumPy's loops over rows of two take several times as long.
-    column, row = (
-        np.clip((along * (own / other)).astype(np.int64), 0, own - 1)
-        for along, own, other in zip((xy[:, 0], xy[:, 1]), kept.shape[::-1], size, strict=True)
-    )
-    return np.asarray(kept[row, column])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.options.images import ImageOptions, check_extension, check_image_pattern
+from colmap_av1.util.texts import check_name
 
 _MOST_DIGITS = 255
 WRITE_PARAMETERS = {
@@ -167,18 +168,3 @@ def image_file(root: Path, name: str) -> Path:
     """
     check_name(name)
     return root / name
-
-
-def check_name(name: str) -> None:
-    """Check that an image's name, its path within the image folder, is that of a file in it.
-
-    Raises:
-        ImageError: it leads out of the folder, or is none that a file can have.
-    """
-    parts = PurePosixPath(name)
-    if parts.is_absolute() or ".." in parts.parts:
-        raise ImageError(
-            f"image {name!r} lies outside the image folder: give names within the folder"
-        )
-    if not parts.parts or "\0" in name:
-        raise ImageError(f"image {name!r} has a name that no file can have: name it otherwise")

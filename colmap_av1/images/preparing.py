@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
 from colmap_av1.images.files import (
     blur_warning,

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
-from colmap_av1.images.masks import Mask
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.video.display import Display

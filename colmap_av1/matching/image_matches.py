@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import (
+from colmap_av1.geometry.cameras import (
     check_pixel_aspect,
     is_fisheye,
     is_nearly_pinhole,

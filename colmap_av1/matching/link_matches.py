@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.masks import Mask
+from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.takes import Pictures, Takes
 from colmap_av1.matching.features.sift import (
     FeatureExtractor,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import codecs
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+from colmap_av1.errors import ImageError
 
 # No list of frames, images or poses comes near it.
 _LARGEST = 1 << 28
@@ -34,3 +36,18 @@ def read_lines(path: str | os.PathLike[str]) -> list[str]:
         raise OSError(None, "is too large")
     content = path.read_bytes()
     return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig").splitlines()
+
+
+def check_name(name: str) -> None:
+    """Check that an image's name, its path within the image folder, is that of a file in it.
+
+    Raises:
+        ImageError: it leads out of the folder, or is none that a file can have.
+    """
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise ImageError(
+            f"image {name!r} lies outside the image folder: give names within the folder"
+        )
+    if not parts.parts or "\0" in name:
+        raise ImageError(f"image {name!r} has a name that no file can have: name it otherwise")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.view.pictures import Image
 from colmap_av1.view.video import SHIFT, fixed_point
 

@@ -28,7 +28,7 @@ from colmap_av1.evaluate import (
     run_frontend,
 )
 from colmap_av1.evaluate.metrics.sequence import Sequence
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 

@@ -26,7 +26,7 @@ from results import Value, add_results, read_rows, save
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
 from colmap_av1.evaluate.metrics.clouds import depth_differences, point_cloud
-from colmap_av1.model.colmap_model import ModelImage, no_points, read_model, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
 
 

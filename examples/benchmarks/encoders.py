@@ -38,7 +38,7 @@ from colmap_av1 import (
 )
 from colmap_av1.evaluate import epipolar_errors, model_poses, pose_errors, run_measured
 from colmap_av1.evaluate.metrics.sequence import Sequence, read_sequence
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.encode import encode

@@ -57,7 +57,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
 )
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import TriangulateOptions
 
 # All points of accurate depth, as other programs count theirs.

@@ -50,7 +50,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
 )
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.video.decoding import decode_frames
 

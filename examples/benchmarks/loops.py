@@ -36,7 +36,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
 )
-from colmap_av1.model.colmap_model import camera_centres, read_model
+from colmap_av1.geometry.colmap_model import camera_centres, read_model
 
 SCRIPT = load_render_scene()
 NUM_FRAMES = {"rounds": 600, "fronts": 400}

@@ -28,7 +28,7 @@ from results import Value, add_results, read_rows, save
 from colmap_av1 import CameraOptions, MaskOptions, MatchOptions, ReconstructOptions, reconstruct
 from colmap_av1.evaluate import run_measured
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 
 Floats = NDArray[np.float64]
 # As of the option, `drop` making the model of `mask`; or `keep`, with exact masks given.

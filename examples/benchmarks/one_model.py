@@ -30,7 +30,7 @@ from rich.console import Console
 from colmap_av1 import ColmapAv1Error, ReconstructOptions, ReconstructReport, reconstruct
 from colmap_av1.evaluate import pose_errors, read_sequence, run_measured
 from colmap_av1.evaluate.metrics.sequence import frame_number
-from colmap_av1.model.colmap_model import posed_images, read_model
+from colmap_av1.geometry.colmap_model import posed_images, read_model
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ from colmap_av1.evaluate import (
     run_measured,
 )
 from colmap_av1.evaluate.frontends.frontend import list_images
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.coded_size import with_downscale

@@ -27,7 +27,7 @@ from clips import load_render_scene
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
 
-from colmap_av1.model.colmap_model import camera_centres, posed_images, read_model
+from colmap_av1.geometry.colmap_model import camera_centres, posed_images, read_model
 
 Floats = NDArray[np.float64]
 

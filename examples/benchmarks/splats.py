@@ -35,9 +35,9 @@ from results import Value, add_results, read_rows, save
 from rich.console import Console
 
 from colmap_av1 import DensifyOptions, ImageOptions, MatchOptions, densify
-from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
-from colmap_av1.model.splats.gaussians import write_model_gaussians
-from colmap_av1.model.undistort import on_pinholes, pinhole_camera, undistortion
+from colmap_av1.geometry.colmap_model import model_points, posed_images, read_model, write_model
+from colmap_av1.geometry.undistortion import on_pinholes, pinhole_camera, undistortion
+from colmap_av1.splats.gaussians import write_model_gaussians
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 

@@ -37,7 +37,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     run_measured,
 )
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 
 SIFT = "SIFT, pycolmap's incremental mapper"
 PRINTED = "match, the command that it prints"

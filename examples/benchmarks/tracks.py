@@ -69,7 +69,7 @@ from colmap_av1.evaluate import (
     run_frontend,
     track_statistics,
 )
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 

@@ -14,11 +14,11 @@ import pytest
 from conftest import PROJECT, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
-from colmap_av1.database.hloc import read_hloc
 from colmap_av1.database.reading import read_images
 from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.images.files import image_size, read_image
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.interop.hloc import read_hloc
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.encode import stream_of
 

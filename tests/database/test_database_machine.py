@@ -21,13 +21,13 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from colmap_av1.database.check import check
+from colmap_av1.check.database import check
 from colmap_av1.database.file import copy_database
-from colmap_av1.database.hloc import export_hloc
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error
 from colmap_av1.evaluate import database_tracks
+from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.view import view_database

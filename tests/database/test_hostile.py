@@ -25,14 +25,14 @@ from existing_database import (
     sift_keypoints,
 )
 
+from colmap_av1.check.database import check
 from colmap_av1.cli import main
-from colmap_av1.database.check import check
 from colmap_av1.database.file import copy_database
-from colmap_av1.database.hloc import export_hloc
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error, DatabaseError
 from colmap_av1.evaluate import database_tracks
+from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.view import view_database
 
 PAIR = 2147483647 * 3 + 4

@@ -21,7 +21,7 @@ from colmap_av1.evaluate.training.splatting import (
     train_gaussians,
     write_scene,
 )
-from colmap_av1.model.colmap_model import ModelImage, ModelPoints, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
 
 # A Python with torch, gsplat and pytorch-msssim; they are too large for every machine.
 TORCH_PYTHON = os.environ.get("COLMAP_AV1_TORCH_PYTHON")

@@ -11,10 +11,10 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from colmap_av1.database.check import check
-from colmap_av1.database.hloc import read_hloc
+from colmap_av1.check.database import check
 from colmap_av1.errors import ColmapAv1Error
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.interop.hloc import read_hloc
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from colmap_av1.cli import main
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import ColmapAv1Error, ImageError
-from colmap_av1.images.masks import Mask, make_mask, mask_tracks, read_masks
+from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.images.masks import mask_tracks, read_masks
 from colmap_av1.match import match
 from colmap_av1.options import DensityOptions, ImageOptions, LinkOptions, MaskOptions, MatchOptions
 from colmap_av1.tracks.tracks import Tracks

@@ -9,7 +9,7 @@ from synthetic_scene import CAMERA_PARAMS, make_scene
 from walking_camera import FOCAL, HEIGHT, NUM_FRAMES, WIDTH, seen_by, walk
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.matching.image_matches import (
     PairedImages,

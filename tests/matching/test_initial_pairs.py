@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import bar_false_starts
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS

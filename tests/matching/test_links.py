@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from synthetic_scene import alignment_error
 
-from colmap_av1.database.check import check
+from colmap_av1.check.database import check
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.evaluate import model_poses
+from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import match
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import FeatureExtractor, Features, match_features
@@ -29,7 +30,6 @@ from colmap_av1.matching.link_matches import Links
 from colmap_av1.matching.link_merging import links_as_tracks
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.weak_gaps import weak_frames, weak_gaps
-from colmap_av1.model.colmap_model import camera_centres
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,

@@ -13,7 +13,7 @@ from conftest import SHARED
 from numpy.typing import NDArray
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, Scene, make_scene
 
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching import verify
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry

@@ -6,16 +6,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from colmap_av1.check.crossings import model_crossings
+from colmap_av1.check.database import check
+from colmap_av1.check.model_figures import model_figures
 from colmap_av1.cli.commands.shared import add_command, add_images, add_quiet, print_result
 from colmap_av1.cli.reports import check_rows, model_rows
 from colmap_av1.cli.terminal import progress_bars
-from colmap_av1.database.check import check
 from colmap_av1.errors import OptionError
-from colmap_av1.model.agreement.crossings import model_crossings
-from colmap_av1.model.agreement.far_views import model_far_views
-from colmap_av1.model.agreement.joints import model_joints
-from colmap_av1.model.colmap_model import read_model
-from colmap_av1.model.figures import model_figures
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.poses.long_range import model_far_views
+from colmap_av1.poses.seams import model_joints
 
 _FAILED_CHECK = 1
 

@@ -16,7 +16,7 @@ from colmap_av1.cli.commands.shared import (
 )
 from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.terminal import progress_bars
-from colmap_av1.database.hloc import export_hloc
+from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.options import ExportOptions
 
 

@@ -3,7 +3,7 @@
 
 #include "bindings/av1.h"
 #include "bindings/frame_motion.h"
-#include "bindings/model.h"
+#include "bindings/geometry.h"
 #include "bindings/tracks.h"
 
 NB_MODULE(_core, m) {
@@ -11,5 +11,5 @@ NB_MODULE(_core, m) {
   colmap_av1::bind_av1(m);
   colmap_av1::bind_frame_motion(m);
   colmap_av1::bind_tracks(m);
-  colmap_av1::bind_model(m);
+  colmap_av1::bind_geometry(m);
 }

@@ -12,12 +12,12 @@
 #include <vector>
 
 #include "fuzz/input.h"
-#include "model/patch_search.h"
-#include "model/patches.h"
-#include "model/points.h"
-#include "model/projection.h"
-#include "model/surfaces.h"
-#include "model/triangulate.h"
+#include "geometry/patch_search.h"
+#include "geometry/patches.h"
+#include "geometry/points.h"
+#include "geometry/projection.h"
+#include "geometry/surfaces.h"
+#include "geometry/triangulate.h"
 
 namespace {
 

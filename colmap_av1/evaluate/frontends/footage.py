@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.files import existing_images, write_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen

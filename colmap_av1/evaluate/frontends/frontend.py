@@ -11,7 +11,7 @@ import pycolmap
 
 from colmap_av1.evaluate.frontends.footage import Footage
 from colmap_av1.evaluate.frontends.measure import run_measured
-from colmap_av1.images.camera import make_camera
+from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.util.digests import digest_of, file_digest
 from colmap_av1.util.stages import WHOLE_PACKAGE, run_stage_in
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_av1.database.hloc import HlocMatches, read_hloc
 from colmap_av1.errors import HlocError
 from colmap_av1.evaluate.frontends.footage import Footage
 from colmap_av1.evaluate.frontends.frontend import (
@@ -17,6 +16,7 @@ from colmap_av1.evaluate.frontends.frontend import (
     images_digest,
     list_images,
 )
+from colmap_av1.interop.hloc import HlocMatches, read_hloc
 from colmap_av1.util.digests import digest_if_there
 from colmap_av1.util.progress import Clock
 

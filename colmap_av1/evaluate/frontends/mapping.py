@@ -13,9 +13,9 @@ from colmap_av1.densify import densify
 from colmap_av1.evaluate.frontends.footage import Footage, frame_list
 from colmap_av1.evaluate.frontends.frontend import OF_OTHERS
 from colmap_av1.evaluate.frontends.measure import run_measured
-from colmap_av1.model.colmap_model import posed_images, read_model
-from colmap_av1.model.mapper import run_mapper
+from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MapOptions
+from colmap_av1.poses.mapper import run_mapper
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.sequence import frame_number
-from colmap_av1.model.colmap_model import camera_centres, posed_images
+from colmap_av1.geometry.colmap_model import camera_centres, posed_images
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
-from colmap_av1.model.colmap_model import camera_centres
+from colmap_av1.geometry.colmap_model import camera_centres
 
 _Image = NDArray[np.uint8]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.evaluate.metrics.clouds import CloudDistances
 from colmap_av1.evaluate.metrics.poses import PoseErrors
 from colmap_av1.evaluate.training.trainers import Training
-from colmap_av1.model.figures import ModelFigures
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import EvaluationError, ModelError, OptionError
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
-from colmap_av1.images.camera import is_undistorted
-from colmap_av1.model.colmap_model import read_model
+from colmap_av1.geometry.cameras import is_undistorted
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.processes import bound
 
 _PROGRAM = Path(__file__).with_name("train_gaussians.py")

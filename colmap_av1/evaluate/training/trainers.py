@@ -21,9 +21,9 @@ from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
-from colmap_av1.model.colmap_model import model_points, posed_images, read_model, write_model
-from colmap_av1.model.splats.gaussians import write_model_gaussians
+from colmap_av1.geometry.colmap_model import model_points, posed_images, read_model, write_model
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
+from colmap_av1.splats.gaussians import write_model_gaussians
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
 from colmap_av1.util.stages import run_stage_in

@@ -10,7 +10,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.images.masks import Mask
+from colmap_av1.geometry.masks import Mask
 from colmap_av1.video.coded_size import smaller_grey
 
 # Without the doubled picture SIFT takes a tenth of its time and keeps the features that views from

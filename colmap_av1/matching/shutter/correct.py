@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from colmap_av1.images.camera import is_nearly_pinhole, is_square
+from colmap_av1.geometry.cameras import is_nearly_pinhole, is_square
 from colmap_av1.matching.shutter.estimate import estimate_read_out
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.options.camera import DEFAULT_MODEL, camera_of_model, parse_camera_params

@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import dataclass
 
-from colmap_av1.images.camera import is_square
+from colmap_av1.geometry.cameras import is_square
 from colmap_av1.matching.shutter.correct import rows_down
 from colmap_av1.matching.shutter.estimate import estimate_read_out
 from colmap_av1.options import MatchOptions, ReadOptions

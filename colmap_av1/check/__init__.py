@@ -1,0 +1,1 @@
+"""Diagnosis of COLMAP databases and models."""

@@ -1,0 +1,151 @@
+"""Whether the poses on either side of each gap between images fit what was matched across it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.database.file import open_unaltered
+from colmap_av1.database.reading import (
+    image_ids_from_pair_id,
+    keypoints_from_row,
+    matches_from_row,
+)
+from colmap_av1.errors import DatabaseError
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.matching.mapper_limits import MIN_INLIERS
+from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
+from colmap_av1.poses.seams import images_in_time
+
+_Floats = NDArray[np.float64]
+
+# A verified match fits the poses to so many pixels, as COLMAP verifies it.
+_MAX_ERROR = 4.0
+# Share of the matches across a gap that have to fit: models that are straight have 87 % and more
+# everywhere, one that a mapper had joined wrongly 55 %.
+_LEAST_FITTING = 0.75
+# Matches that say anything.
+_FEWEST = 30
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Verified matches across the gaps between neighbouring images of the same camera and folder.
+
+    Attributes:
+        pairs: names of the images before and after each gap, in the order of their names.
+        num_matches: int64 [n] matches of an image before it, or that one, with one after it.
+        num_fitting: int64 [n] those of them that fit the relative poses of their images.
+    """
+
+    pairs: tuple[tuple[str, str], ...]
+    num_matches: NDArray[np.int64]
+    num_fitting: NDArray[np.int64]
+
+    @property
+    def share(self) -> _Floats:
+        """Share of the matches that fit; 1 where there are too few to say anything."""
+        share = self.num_fitting / np.maximum(self.num_matches, 1)
+        return np.where(self.num_matches >= _FEWEST, share, 1.0)
+
+    @property
+    def wrong(self) -> list[int]:
+        """Gaps, by index, whose matches contradict the poses."""
+        return [int(i) for i in np.flatnonzero(self.share < _LEAST_FITTING)]
+
+    @property
+    def warning(self) -> str | None:
+        """What the user should know of a model whose parts are joined wrongly."""
+        if not self.wrong:
+            return None
+        # All that does not fit crosses the gap that is at fault, and those beside it where no image
+        # between has matches.
+        unfit = self.num_matches - self.num_fitting
+        most = max(int(unfit[i]) for i in self.wrong)
+        where = [i for i in self.wrong if unfit[i] == most]
+        first, second = self.pairs[where[0]][0], self.pairs[where[-1]][1]
+        more = len(self.wrong) - len(where)
+        others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
+        return (
+            f"only {self.share[where[0]]:.0%} of the matches across '{first}' and '{second}' fit "
+            f"the poses, usually {np.median(self.share):.0%} do{others}: what is before and what "
+            "follows is joined wrongly there; try the other --mapper or reconstruct, film it more "
+            "slowly, or map the parts on either side apart"
+        )
+
+
+def model_crossings(reconstruction: Any, database: Path) -> Crossings:
+    """Hold the verified matches of a database against the poses of a model of it.
+
+    Args:
+        reconstruction: pycolmap.Reconstruction; images are those of the database by their names.
+        database: COLMAP database, which stays as it is.
+
+    Raises:
+        DatabaseError: the database cannot be read, or is damaged.
+    """
+    images, gaps = images_in_time(reconstruction)
+    matches, fitting = (np.zeros(len(images) + 1, np.int64) for _ in range(2))
+    for i, j, fits in _fitting(images, reconstruction.cameras, database):
+        for change, count in ((matches, len(fits)), (fitting, int(np.count_nonzero(fits)))):
+            change[i] += count
+            change[j] -= count
+    return Crossings(
+        tuple((images[k].name, images[k + 1].name) for k in gaps),
+        np.cumsum(matches)[gaps],
+        np.cumsum(fitting)[gaps],
+    )
+
+
+def _fitting(
+    images: list[ModelImage], cameras: Any, database: Path
+) -> Iterator[tuple[int, int, NDArray[np.bool_]]]:
+    """Each matched pair of images, by their place, i < j, and which of its matches fit the poses.
+
+    Matches are taken for those of the images' cameras in the model.
+    """
+    place = {image.name: k for k, image in enumerate(images)}
+    with open_unaltered(database) as connection:
+        of_id = {
+            image_id: place[name]
+            for image_id, name in connection.execute("SELECT image_id, name FROM images")
+            if name in place
+        }
+        rays: dict[int, _Floats] = {}
+        for image_id, *row in connection.execute(
+            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
+        ):
+            if image_id in of_id:
+                xy = keypoints_from_row(database, image_id, *row)[:, :2].astype(np.float64)
+                camera = cameras[images[of_id[image_id]].camera_id]
+                rays[image_id] = np.asarray(camera.cam_from_img(xy)).T
+        for pair_id, *row in connection.execute(
+            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows >= ?",
+            (MIN_INLIERS,),
+        ):
+            a, b = image_ids_from_pair_id(pair_id)
+            if a not in rays or b not in rays:
+                continue
+            matches = matches_from_row(database, pair_id, *row)
+            if (matches >= [rays[a].shape[1], rays[b].shape[1]]).any():
+                raise DatabaseError(
+                    f"{database}: images {a} and {b} match keypoints that are not there: "
+                    "'colmap-av1 check' says what else is wrong"
+                )
+            views = [images[of_id[k]] for k in (a, b)]
+            focal = np.mean([cameras[view.camera_id].mean_focal_length() for view in views])
+            xa, xb = rays[a][:, matches[:, 0]], rays[b][:, matches[:, 1]]
+            error = float(focal) * _errors(views[0].cam_from_world, views[1].cam_from_world, xa, xb)
+            i, j = sorted((of_id[a], of_id[b]))
+            yield i, j, error[np.isfinite(error)] <= _MAX_ERROR
+
+
+def _errors(a: _Floats, b: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
+    """Sampson distance of matched rays [2, n] by the poses of two images, float64 [n]."""
+    algebraic, squared = epipolar_terms(essential_of_poses(a, b), xa, xb)
+    return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-24)))

@@ -1,0 +1,173 @@
+"""A check of what COLMAP's mappers will make of a database, without altering it."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from colmap_av1.check.contents import (
+    Parallax,
+    images_with_rows,
+    layout_of,
+    pairs_with_rows,
+    parallax_of,
+)
+from colmap_av1.check.finding import Finding
+from colmap_av1.check.findings import (
+    frame_findings,
+    gap_findings,
+    image_findings,
+    keypoint_findings,
+    motion_findings,
+    orphan_findings,
+    pair_findings,
+)
+from colmap_av1.check.findings_values import value_findings
+from colmap_av1.database.file import is_new, open_unaltered
+from colmap_av1.database.reading import cameras_of
+from colmap_av1.errors import DatabaseError
+from colmap_av1.images.names import video_of
+from colmap_av1.matching.two_view_geometry import config_name
+from colmap_av1.matching.weak_gaps import ThinGap, thin_gaps
+from colmap_av1.util.arguments import checks_arguments
+from colmap_av1.util.graphs import connected_components
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a database holds, and what the mappers will make of it.
+
+    Attributes:
+        database: the database file.
+        user_version: the number by which COLMAP distinguishes layouts.
+        layout: versions of COLMAP whose layout it is.
+        readers: versions of COLMAP that open it.
+        num_images: images listed.
+        num_cameras: cameras listed.
+        num_priors: cameras with a focal length known beforehand.
+        image_sizes: number of images by (width, height) in pixels.
+        num_keypoints: keypoints of all images.
+        num_matched_keypoints: those that are inliers of a pair that mappers use.
+        keypoint_columns: number of images by the columns of their keypoints: 2: x, y; 4: scale
+            and orientation too; 6: an affine shape too.
+        num_described_images: images with descriptors.
+        num_pairs: pairs with inliers.
+        num_used_pairs: those that the mappers use.
+        num_empty_pairs: pairs that matchers tried in vain.
+        num_inliers: inliers of all pairs that mappers use.
+        configs: number of pairs with inliers by COLMAP's name of their geometry.
+        num_connected_images: images of the largest group that used pairs connect.
+        parallax: of the widest pairs; None where no pair is used.
+        thin_gaps: gaps between images of a video that few matches cross.
+        findings: what stands out, most severe first.
+    """
+
+    database: Path
+    user_version: int
+    layout: str
+    readers: str
+    num_images: int
+    num_cameras: int
+    num_priors: int
+    image_sizes: dict[tuple[int, int], int]
+    num_keypoints: int
+    num_matched_keypoints: int
+    keypoint_columns: dict[int, int]
+    num_described_images: int
+    num_pairs: int
+    num_used_pairs: int
+    num_empty_pairs: int
+    num_inliers: int
+    configs: dict[str, int]
+    num_connected_images: int
+    parallax: Parallax | None
+    thin_gaps: tuple[ThinGap, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def mappable(self) -> bool:
+        """Whether nothing was found that stops the mappers."""
+        return all(finding.severity != "error" for finding in self.findings)
+
+    @property
+    def damaged(self) -> bool:
+        """Whether it holds what no program writes, though mappers may work around it."""
+        return any(finding.damage for finding in self.findings)
+
+
+@checks_arguments
+def check(database: str | os.PathLike[str]) -> CheckReport:
+    """Read a COLMAP database of any version and say what the mappers will make of it.
+
+    The file is opened so that neither it nor anything beside it changes: it is not migrated,
+    and no log is made. The thresholds are the defaults of COLMAP's mappers.
+
+    Args:
+        database: path of the file.
+
+    Raises:
+        DatabaseError: the file is missing, locked, unreadable, or not a COLMAP database.
+    """
+    path = Path(database)
+    if is_new(path):
+        what = "is an empty file" if path.exists() else "no such file"
+        raise DatabaseError(f"{path}: {what}: give the path of a COLMAP database")
+    with open_unaltered(path) as connection:
+        return _check(connection, path)
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
+    cameras = cameras_of(connection, path)
+    images = images_with_rows(connection, path)
+    pairs = pairs_with_rows(connection, path, images)
+    used = pairs.used
+    layout, readers = layout_of(connection)
+    group = 0
+    if used.any():
+        connected = connected_components(len(images.ids), pairs.index[used])
+        group = int(np.bincount(connected).max())
+    parallax = parallax_of(connection, path, images, pairs, cameras)
+    configs = [config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
+    sizes = [
+        (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
+    ]
+    videos = list(map(video_of, images.camera_ids, images.names))
+    thin = thin_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
+    findings = [
+        *image_findings(images, cameras),
+        *value_findings(images, pairs, cameras),
+        *frame_findings(connection, images),
+        *keypoint_findings(images, pairs),
+        *pair_findings(pairs, images),
+        *motion_findings(pairs, parallax, group, len(images.ids)),
+        *gap_findings(thin),
+        *orphan_findings(connection, pairs),
+    ]
+    order = ("error", "warning", "note")
+    return CheckReport(
+        database=path,
+        user_version=connection.execute("PRAGMA user_version").fetchone()[0],
+        layout=layout,
+        readers=readers,
+        num_images=len(images.ids),
+        num_cameras=len(cameras),
+        num_priors=sum(bool(camera.has_prior_focal_length) for camera in cameras.values()),
+        image_sizes={size: sizes.count(size) for size in sorted(set(sizes))},
+        num_keypoints=sum(map(len, images.keypoints)),
+        num_matched_keypoints=sum(int(np.count_nonzero(m)) for m in pairs.matched),
+        keypoint_columns={n: images.columns.count(n) for n in sorted(set(images.columns) - {0})},
+        num_described_images=sum(n > 0 for n in images.num_descriptors),
+        num_pairs=int(np.count_nonzero(pairs.num_inliers > 0)),
+        num_used_pairs=int(np.count_nonzero(used)),
+        num_empty_pairs=int(np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))),
+        num_inliers=int(pairs.num_inliers[used].sum()),
+        configs={name: configs.count(name) for name in sorted(set(configs))},
+        num_connected_images=group,
+        parallax=parallax,
+        thin_gaps=thin,
+        findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
+    )

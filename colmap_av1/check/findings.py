@@ -1,0 +1,232 @@
+"""Findings in a database that matter for mapping it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pycolmap
+
+from colmap_av1.check.contents import Images, Pairs, Parallax
+from colmap_av1.check.finding import Finding, some
+from colmap_av1.database.layout import columns
+from colmap_av1.matching.mapper_limits import (
+    INITIAL_LEAST_ANGLE,
+    INITIAL_MIN_ANGLE,
+    INITIAL_MIN_INLIERS,
+    MIN_INLIERS,
+)
+from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
+from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
+
+# Share of keypoints without a match that is worth a line.
+_NOTED_SHARE = 0.01
+
+
+def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
+    """Images without a camera, duplicate names, unknown focal lengths."""
+    if len(images.ids) == 0:
+        yield Finding("error", "lists no images")
+        return
+    lost = [n for n, c in zip(images.names, images.camera_ids, strict=True) if c not in cameras]
+    if lost:
+        yield Finding("error", f"{some(lost, 'image')} without a camera: the mappers stop")
+    unknown = sum(not camera.has_prior_focal_length for camera in cameras.values())
+    if unknown:
+        yield Finding(
+            "note",
+            f"{unknown} of {len(cameras)} cameras have no focal length known beforehand: the "
+            "mappers start from a guess and refine it",
+        )
+    sizes = {(c.width, c.height) for i, c in cameras.items() if i in set(images.camera_ids)}
+    if len(sizes) > 1:
+        yield Finding("note", f"images have {len(sizes)} sizes")
+    if images.names != sorted(images.names):
+        yield Finding("note", "image ids do not follow the order of names: match by name, not id")
+
+
+def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[Finding]:
+    """Images without a frame in layouts that have frames."""
+    if not (columns(connection, "frames") and columns(connection, "frame_data")):
+        return
+    rigs = dict(
+        connection.execute("SELECT rig_id, ref_sensor_id FROM rigs WHERE ref_sensor_type = 0")
+    )
+    framed = {
+        row[0] for row in connection.execute("SELECT data_id FROM frame_data WHERE sensor_type = 0")
+    }
+    if framed or connection.execute("SELECT 1 FROM frames LIMIT 1").fetchone():
+        bare = [
+            name
+            for image_id, name in zip(images.ids, images.names, strict=True)
+            if int(image_id) not in framed
+        ]
+        if bare:
+            yield Finding(
+                "error",
+                f"{some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
+                "3.12 on stop; 'colmap-av1 match' completes the frames",
+            )
+    elif rigs and any(rigs.get(camera_id) != camera_id for camera_id in images.camera_ids):
+        yield Finding("error", "has rigs but no frames: mappers from COLMAP 3.12 on stop")
+
+
+def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
+    """Images without keypoints, keypoints without matches."""
+    counts = [len(k) for k in images.keypoints]
+    if counts and not any(counts):
+        yield Finding("error", "no image has keypoints: extract and match features first")
+        return
+    in_pair = np.zeros(len(counts), dtype=np.bool_)
+    in_pair[pairs.index[pairs.num_inliers >= MIN_INLIERS].ravel()] = True
+    bare = [n for n, c, p in zip(images.names, counts, in_pair, strict=True) if p and not c]
+    if bare:
+        yield Finding(
+            "error", f"{some(bare, 'image')} with matches but without keypoints: most mappers stop"
+        )
+    elif pairs.num_astray:
+        yield Finding(
+            "warning",
+            f"{pairs.num_astray} pairs match keypoints that are not there: mappers leave such "
+            "matches out, and the others may be of other keypoints too",
+            damage=True,
+        )
+    empty = [n for n, c in zip(images.names, counts, strict=True) if not c]
+    if empty and not bare:
+        yield Finding("warning", f"{some(empty, 'image')} without keypoints")
+    uneven = [
+        name
+        for name, count, described in zip(images.names, counts, images.num_descriptors, strict=True)
+        if described not in (-1, count)
+    ]
+    if uneven:
+        yield Finding(
+            "warning",
+            f"{some(uneven, 'image')} with another number of descriptors than of keypoints: "
+            "guided matching and vocabulary trees stop, mappers ignore it",
+        )
+    total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)
+    if total - matched > _NOTED_SHARE * total:
+        yield Finding("note", f"{(total - matched) / total:.1%} of the keypoints have no match")
+
+
+def pair_findings(pairs: Pairs, images: Images) -> Iterator[Finding]:
+    """Pairs that the mappers leave out, and why."""
+    used = pairs.used
+    unverified = np.count_nonzero((pairs.num_matches >= MIN_INLIERS) & (pairs.num_inliers < 0))
+    if unverified:
+        yield Finding(
+            "warning",
+            f"{unverified} pairs have matches that were never verified: mappers leave them out; "
+            "run a matcher of COLMAP, which verifies them",
+        )
+    if any(map(len, images.keypoints)) and not used.any():
+        yield Finding("error", f"no pair has {MIN_INLIERS} verified matches: mappers find nothing")
+    few = np.count_nonzero((pairs.num_inliers > 0) & (pairs.num_inliers < MIN_INLIERS))
+    if few:
+        yield Finding(
+            "note", f"{few} pairs have fewer than {MIN_INLIERS} inliers: mappers leave them out"
+        )
+    for config, why in (
+        (TwoViewConfig.UNDEFINED, "their geometry was never estimated: mappers from COLMAP 4.2 on"),
+        (TwoViewConfig.DEGENERATE, "their geometry is degenerate: mappers from COLMAP 4.2 on"),
+        (TwoViewConfig.WATERMARK, "they match a watermark: mappers"),
+    ):
+        count = np.count_nonzero((pairs.num_inliers >= MIN_INLIERS) & (pairs.config == config))
+        if count:
+            yield Finding(
+                "note" if config == TwoViewConfig.WATERMARK else "warning",
+                f"{count} pairs have inliers, but {why} leave them out",
+            )
+    multiple = np.count_nonzero(used & (pairs.config == TwoViewConfig.MULTIPLE))
+    if multiple:
+        yield Finding(
+            "note", f"{multiple} pairs have several geometries: the global mapper leaves them out"
+        )
+    unpaired = np.count_nonzero(used & (pairs.num_matches < 0))
+    if unpaired:
+        yield Finding(
+            "warning",
+            f"{unpaired} verified pairs have no row in 'matches': standalone GLOMAP leaves them "
+            "out, and matchers of COLMAP match them again",
+        )
+    empty = np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))
+    if empty:
+        yield Finding(
+            "note",
+            f"{empty} pairs were matched without result: matchers skip them, writers replace them",
+        )
+
+
+def motion_findings(
+    pairs: Pairs, parallax: Parallax | None, group: int, num_images: int
+) -> Iterator[Finding]:
+    """Connection, parallax and forward motion: whether a mapper finds an initial pair."""
+    used = pairs.used
+    if parallax is None:
+        return
+    if group < num_images:
+        yield Finding(
+            "warning",
+            f"pairs connect at most {group} of {num_images} images: the others stay out of the "
+            "model, or go to another one",
+        )
+    if pairs.num_inliers[used].max() < INITIAL_MIN_INLIERS:
+        yield Finding(
+            "warning",
+            f"no pair has {INITIAL_MIN_INLIERS} inliers: the incremental mapper starts with "
+            "none unless --Mapper.init_min_num_inliers is lower",
+        )
+    flat = np.isin(pairs.config[used], FLAT_CONFIGS)
+    if np.mean(flat) > 0.5:
+        yield Finding(
+            "warning",
+            f"{np.mean(flat):.0%} of the pairs see a plane or a camera that only rotates: there is "
+            "little depth to find",
+        )
+    if parallax.angle is None:
+        yield Finding("note", "parallax is unknown: the widest pairs have no model stored")
+    elif parallax.angle < INITIAL_LEAST_ANGLE:
+        yield Finding(
+            "warning",
+            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no start, "
+            "use the global one",
+        )
+    elif parallax.angle < INITIAL_MIN_ANGLE:
+        yield Finding(
+            "note",
+            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts "
+            "only after lowering its limit",
+        )
+    if parallax.focal_known and parallax.forward_share > 0.5:
+        yield Finding(
+            "warning",
+            "the camera moves along its axis: the incremental mapper starts only with "
+            "--Mapper.init_max_forward_motion 1, and the focal length cannot be found",
+        )
+
+
+def gap_findings(gaps: Sequence[ThinGap]) -> Iterator[Finding]:
+    """Gaps between images of a video that few matches cross, in one finding."""
+    text = thin_gap_warning(gaps)
+    if text is not None:
+        yield Finding("warning", text)
+
+
+def orphan_findings(connection: sqlite3.Connection, pairs: Pairs) -> Iterator[Finding]:
+    """Rows of images that are not listed."""
+    if pairs.num_foreign:
+        yield Finding(
+            "error",
+            f"{pairs.num_foreign} pairs are of images that are not listed: mappers from COLMAP "
+            "3.12 on stop",
+        )
+    for table in ("keypoints", "descriptors"):
+        if not columns(connection, table):
+            continue
+        (count,) = connection.execute(
+            f"SELECT COUNT(*) FROM {table} WHERE image_id NOT IN (SELECT image_id FROM images)"
+        ).fetchone()
+        if count:
+            yield Finding("note", f"{count} rows of '{table}' belong to no image")

@@ -1,0 +1,57 @@
+"""Figures of a COLMAP model: images, points, errors, focal length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.coverage import coverage_of_model
+
+
+@dataclass(frozen=True)
+class ModelFigures:
+    """Figures of a model.
+
+    Attributes:
+        num_registered: images with a pose.
+        num_points: 3D points.
+        mean_track_length: images that see a point, on average.
+        coverage: share of the images' cells of 16x16 pixels that visible points project into.
+        mean_error: mean of the points' reprojection errors in pixels, as COLMAP states it.
+        median_error: their median.
+        focal_length: in pixels, on average over the cameras.
+    """
+
+    num_registered: int
+    num_points: int
+    mean_track_length: float
+    coverage: float
+    mean_error: float
+    median_error: float
+    focal_length: float
+
+
+def model_figures(model: Any) -> ModelFigures:
+    """Figures of a pycolmap.Reconstruction, or of the model in a folder.
+
+    Raises:
+        ModelError: the folder holds no readable model with poses.
+    """
+    if isinstance(model, Path):
+        model = read_model(model)
+    errors = np.array([p.error for p in model.points3D.values()], dtype=np.float64)
+    known = errors[errors >= 0]
+    focal_lengths = [camera.mean_focal_length() for camera in model.cameras.values()]
+    return ModelFigures(
+        num_registered=model.num_reg_images(),
+        num_points=len(errors),
+        mean_track_length=model.compute_mean_track_length(),
+        coverage=coverage_of_model(model),
+        mean_error=float(known.mean()) if len(known) else float("nan"),
+        median_error=float(np.median(known)) if len(known) else float("nan"),
+        focal_length=float(np.mean(focal_lengths)),
+    )

@@ -1,0 +1,115 @@
+#include "geometry/projection.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <stdexcept>
+
+#include "geometry/geometry.h"
+
+namespace colmap_av1::model {
+namespace {
+
+// Points worked on at a time.
+constexpr std::size_t kChunk = 1024;
+
+template <typename T, std::size_t size>
+void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& to) {
+  to.insert(to.end(), from.begin(), from.begin() + static_cast<std::ptrdiff_t>(count));
+}
+
+// Goes through points a chunk at a time. `write` is given a place in the chunk and a point in the
+// camera, writes what is wanted of it there, and says whether it is seen; `take` then takes over
+// what the first places hold. Every point is written, and stays where the next one does not
+// overwrite it: which ones are seen is too random for a processor to foretell.
+template <typename Write, typename Take>
+void for_seen(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
+              std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
+  const std::size_t total = xyz.size() / 3;
+  std::array<std::int64_t, kChunk> index;
+  for (std::size_t first = 0; first < total; first += kChunk) {
+    std::size_t count = 0;
+    for (std::size_t i = first; i < std::min(first + kChunk, total); ++i) {
+      index[count] = static_cast<std::int64_t>(i);
+      count += write(count, to_camera(cam_from_world.data(), xyz.data() + 3 * i)) ? 1 : 0;
+    }
+    append(index, count, seen);
+    take(count);
+  }
+}
+
+}  // namespace
+
+PointsInView points_in_view(std::span<const double, 12> cam_from_world, const RayBounds& bounds,
+                            std::span<const double> xyz) {
+  PointsInView found;
+  std::array<double, 3 * kChunk> local;
+  for_seen(
+      cam_from_world, xyz, found.index,
+      [&](std::size_t place, const Vector& at) {
+        std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
+        const auto [x, y, z] = at;
+        return (z > 0) & (x >= bounds.low_x * z) & (x <= bounds.high_x * z) &
+               (y >= bounds.low_y * z) & (y <= bounds.high_y * z);
+      },
+      [&](std::size_t count) { append(local, 3 * count, found.xyz); });
+  return found;
+}
+
+PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, const Pinhole& camera,
+                                  std::span<const double> xyz) {
+  PointsInPicture found;
+  std::array<double, 3 * kChunk> local;
+  std::array<double, 2 * kChunk> pixels;
+  std::array<double, kChunk> depth;
+  const double last_x = std::max(0.0, std::nextafter(camera.width, 0.0));
+  const double last_y = std::max(0.0, std::nextafter(camera.height, 0.0));
+  for_seen(
+      cam_from_world, xyz, found.index,
+      [&](std::size_t place, const Vector& at) {
+        std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
+        // As pixels times depth: most points are not seen, and a division takes as long as all else.
+        const auto [u, v, z] = at;
+        const double x = camera.focal_x * u + camera.centre_x * z;
+        const double y = camera.focal_y * v + camera.centre_y * z;
+        return (z > 0) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z);
+      },
+      [&](std::size_t count) {
+        for (std::size_t i = 0; i < count; ++i) {
+          const double z = local[3 * i + 2];
+          const double x = camera.focal_x * (local[3 * i] / z) + camera.centre_x;
+          const double y = camera.focal_y * (local[3 * i + 1] / z) + camera.centre_y;
+          // Rounded, what lies at the edge must not lie beyond.
+          pixels[2 * i] = std::clamp(x, 0.0, last_x);
+          pixels[2 * i + 1] = std::clamp(y, 0.0, last_y);
+          depth[i] = z;
+        }
+        append(pixels, 2 * count, found.xy);
+        append(depth, count, found.depth);
+      });
+  return found;
+}
+
+std::vector<double> nearest_in_cells(std::span<const double> xy, std::span<const double> depth,
+                                     int cell, std::int64_t columns, std::int64_t rows) {
+  if (xy.size() != 2 * depth.size() || cell < 1 || columns < 1 || rows < 1) {
+    throw std::invalid_argument("xy, depth and cells do not fit each other");
+  }
+  std::vector<double> nearest(static_cast<std::size_t>(columns * rows),
+                              std::numeric_limits<double>::infinity());
+  // Of what lies before the first cell, and what is no number, the first one.
+  const auto place = [cell](double at, std::int64_t cells) {
+    const double last = static_cast<double>(cells - 1);
+    return at > 0 ? static_cast<std::int64_t>(std::min(at / cell, last)) : 0;
+  };
+  for (std::size_t i = 0; i < depth.size(); ++i) {
+    const std::int64_t at = place(xy[2 * i + 1], rows) * columns + place(xy[2 * i], columns);
+    double& least = nearest[static_cast<std::size_t>(at)];
+    least = std::min(least, depth[i]);
+  }
+  return nearest;
+}
+
+}  // namespace colmap_av1::model

@@ -1,0 +1,1 @@
+"""Cameras, COLMAP models on disk, triangulation, resection, undistortion, alignment."""

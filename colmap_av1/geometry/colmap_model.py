@@ -1,0 +1,395 @@
+"""COLMAP models on disk: read by pycolmap, written point by point without it."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, ModelError
+from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.util.files import may_read
+from colmap_av1.util.texts import check_name
+
+_FILES = ("cameras", "images", "points3D")
+# Files of folders of models, as `map` and `densify` write them.
+MODEL_FILES = re.compile(
+    r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log|place\.json"
+)
+
+# Records of COLMAP's binary files, little-endian and packed.
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])
+_POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_CAMERA_HEAD = 24
+_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
+# What stands between the counts of these files, in bytes.
+_COUNT = struct.Struct("<Q")
+_SHORT_COUNT = struct.Struct("<I")
+_SMALLEST_CAMERA = _CAMERA_HEAD + 3 * 8  # of SIMPLE_PINHOLE
+_IMAGE_HEAD, _POINT_HEAD = 64, 43
+_RIG_HEAD, _SENSOR, _POSE = 8, 8, 56
+_FRAME_HEAD, _DATA_ID = 8 + _POSE, 16
+# Points written at a time; bounds memory.
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """An image of a model.
+
+    Attributes:
+        image_id: its id.
+        name: path relative to the image folder.
+        camera_id: id of its camera.
+        cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    cam_from_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """Points of a model and where its images see them, in compressed sparse row form.
+
+    Attributes:
+        xyz: float64 [num_points, 3].
+        rgb: uint8 [num_points, 3].
+        error: float64 [num_points] mean reprojection error in pixels.
+        offsets: int64 [num_points + 1] observations of each point.
+        image: int64 [num_observations] index of the image.
+        xy: float64 [num_observations, 2] pixels, the first pixel's centre at (0.5, 0.5).
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    error: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    image: NDArray[np.int64]
+    xy: NDArray[np.float64]
+
+
+def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
+    """All points of several sets, which the same images see."""
+    counts = np.concatenate([np.diff(part.offsets) for part in parts])
+    return ModelPoints(
+        xyz=np.concatenate([part.xyz for part in parts]),
+        rgb=np.concatenate([part.rgb for part in parts]),
+        error=np.concatenate([part.error for part in parts]),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        image=np.concatenate([part.image for part in parts]),
+        xy=np.concatenate([part.xy for part in parts]),
+    )
+
+
+def take_rows(
+    offsets: NDArray[np.int64], rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Some rows of data in compressed sparse row form.
+
+    Args:
+        offsets: int64 [num_rows + 1] where the elements of each row begin.
+        rows: int64 [n] those wanted, in this order.
+
+    Returns:
+        int64 [n + 1] their offsets, and int64 [offsets[-1]] the indices of their elements.
+    """
+    lengths = np.diff(offsets)[rows]
+    taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
+
+
+def no_points() -> ModelPoints:
+    """The points of a model of poses alone: none."""
+    return ModelPoints(
+        *(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0)),
+        *(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 2))),
+    )
+
+
+def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
+    rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
+    return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
+
+
+def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
+    """The images of a pycolmap.Reconstruction that have a pose, by name."""
+    return {
+        image.name: ModelImage(
+            int(image.image_id),
+            image.name,
+            int(image.camera_id),
+            np.asarray(image.cam_from_world().matrix()),
+        )
+        for image in reconstruction.images.values()
+        if image.has_pose
+    }
+
+
+def model_points(reconstruction: Any, images: Sequence[ModelImage]) -> ModelPoints:
+    """All points of a pycolmap.Reconstruction, by their ids, with the observations of some images.
+
+    Args:
+        reconstruction: the model.
+        images: those whose observations are kept, in the order of the points' images.
+    """
+    index = {image.image_id: k for k, image in enumerate(images)}
+    xy = {
+        i: np.array([p.xy for p in reconstruction.images[i].points2D], dtype=np.float64)
+        for i in index
+    }
+    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
+    own = [[e for e in p.track.elements if int(e.image_id) in index] for p in points]
+    seen = [element for elements in own for element in elements]
+    return ModelPoints(
+        xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+        error=np.array([p.error for p in points], dtype=np.float64),
+        offsets=np.cumsum([0, *map(len, own)], dtype=np.int64),
+        image=np.array([index[int(e.image_id)] for e in seen], dtype=np.int64),
+        xy=np.array([xy[int(e.image_id)][e.point2D_idx] for e in seen], dtype=np.float64).reshape(
+            -1, 2
+        ),
+    )
+
+
+def write_model(
+    folder: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
+) -> None:
+    """Write cameras.bin, images.bin and points3D.bin, as all versions of COLMAP read them.
+
+    Args:
+        folder: an existing folder.
+        cameras: pycolmap.Camera by id.
+        images: the images.
+        points: the points; their ids count from 1.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    with (folder / "cameras.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(cameras)))
+        for camera_id, camera in sorted(cameras.items()):
+            size = int(camera.width), int(camera.height)
+            file.write(struct.pack("<IiQQ", camera_id, int(camera.model.value), *size))
+            file.write(np.asarray(camera.params, dtype="<f8").tobytes())
+
+    lengths = np.diff(points.offsets)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    by_image = np.argsort(points.image, kind="stable")
+    bounds = np.searchsorted(points.image[by_image], np.arange(len(images) + 1))
+    place = np.empty(len(points.image), dtype=np.int64)
+    place[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
+    with (folder / "images.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(images)))
+        for image, start, stop in zip(images, bounds[:-1], bounds[1:], strict=True):
+            x, y, z, w = pycolmap.Rotation3d(image.cam_from_world[:, :3]).quat
+            pose = (w, x, y, z, *image.cam_from_world[:, 3])
+            file.write(struct.pack("<I7dI", image.image_id, *pose, image.camera_id))
+            file.write(image.name.encode() + b"\0")
+            seen = by_image[start:stop]
+            rows = np.empty(len(seen), dtype=_OBSERVATION)
+            rows["xy"], rows["point3D_id"] = points.xy[seen], owner[seen] + 1
+            file.write(struct.pack("<Q", len(rows)))
+            file.write(rows.tobytes())
+
+    elements = np.empty(len(points.image), dtype=_ELEMENT)
+    elements["image_id"] = np.array([i.image_id for i in images], dtype=np.uint32)[points.image]
+    elements["point2D_idx"] = place
+    with (folder / "points3D.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(lengths)))
+        for first in range(0, len(lengths), _CHUNK):
+            last = min(first + _CHUNK, len(lengths))
+            file.write(_point_records(points, elements, first, last))
+
+
+def _point_records(points: ModelPoints, elements: NDArray[Any], first: int, last: int) -> bytes:
+    """The records of the points from `first` to before `last`, each with its track."""
+    offsets = points.offsets[first : last + 1]
+    lengths = np.diff(offsets)
+    heads = np.empty(last - first, dtype=_POINT)
+    heads["id"] = np.arange(first, last) + 1
+    heads["xyz"], heads["rgb"] = points.xyz[first:last], points.rgb[first:last]
+    heads["error"], heads["length"] = points.error[first:last], lengths
+    size, each = _POINT.itemsize, _ELEMENT.itemsize
+    starts = np.arange(last - first) * size + (offsets[:-1] - offsets[0]) * each
+    is_head = np.zeros(len(heads) * size + int(lengths.sum()) * each, dtype=np.bool_)
+    is_head[(starts[:, None] + np.arange(size)).ravel()] = True
+    records = np.empty(len(is_head), dtype=np.uint8)
+    records[is_head] = heads.view(np.uint8).ravel()
+    records[~is_head] = elements[offsets[0] : offsets[-1]].view(np.uint8).ravel()
+    return records.tobytes()
+
+
+def read_model(model: str | os.PathLike[str]) -> Any:
+    """Read a COLMAP model.
+
+    Args:
+        model: folder with cameras, images and points3D, all .bin or all .txt.
+
+    Returns:
+        The pycolmap.Reconstruction.
+
+    Raises:
+        ModelError: the folder holds no model, a damaged one, or one without poses.
+    """
+    path = Path(model)
+    if not any(
+        all((path / f"{name}{suffix}").is_file() for name in _FILES) for suffix in (".bin", ".txt")
+    ):
+        found = sorted(path.glob("**/cameras.bin"))
+        inside = next((p for p in found if ".stages" not in p.parts), None)
+        hint = f": did you mean {inside.parent}?" if inside else ": give a folder a mapper wrote"
+        raise ModelError(f"{path}: holds no COLMAP model (cameras, images, points3D){hint}")
+    for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):
+        if not may_read(file):
+            raise ModelError(f"{file}: no permission to read it: change that")
+    is_binary = (path / "cameras.bin").is_file()
+    unreadable = ModelError(
+        f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
+        "update pycolmap"
+    )
+    try:
+        # pycolmap ends the process at some of what such files can declare.
+        if is_binary and not are_whole(path):
+            raise unreadable
+        reconstruction = pycolmap.Reconstruction(path)
+    except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
+        raise unreadable from error
+    cameras = path / "cameras.bin"
+    sizes = [_CAMERA_HEAD + 8 * len(c.params) for c in reconstruction.cameras.values()]
+    # pycolmap does not notice where this file ends early.
+    if cameras.is_file() and cameras.stat().st_size < 8 + sum(sizes):
+        raise unreadable
+    if reconstruction.num_reg_images() == 0:
+        raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
+    _check_values(path, reconstruction)
+    return reconstruction
+
+
+def _check_values(path: Path, reconstruction: Any) -> None:
+    """Refuse what pycolmap reads without a look: names, poses and cameras."""
+    map_again = "map again, or give another model"
+    for image_id, image in reconstruction.images.items():
+        try:
+            check_name(image.name)
+        except UnicodeDecodeError:
+            raise ModelError(f"{path}: image {image_id} has a name not in UTF-8: rename it") from (
+                None
+            )
+        except ImageError as error:
+            raise ModelError(f"{path}: {error}") from error
+        if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
+            raise ModelError(
+                f"{path}: image {image.name!r} has a pose that is not of numbers: {map_again}"
+            )
+    for camera_id, camera in reconstruction.cameras.items():
+        fault = camera_fault(camera)
+        if fault:
+            raise ModelError(f"{path}: camera {camera_id} has {fault}: {map_again}")
+
+
+def are_whole(model: Path) -> bool:
+    """Whether every count in a model's binary files is of records that are there.
+
+    Args:
+        model: folder with cameras.bin, images.bin and points3D.bin; rigs.bin and frames.bin of
+            COLMAP 3.12 and later are looked at where they are.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    files: dict[str, Callable[[mmap.mmap], bool]] = {
+        "cameras.bin": _cameras,
+        "images.bin": _images,
+        "points3D.bin": _points,
+        "rigs.bin": _rigs,
+        "frames.bin": _frames,
+    }
+    return all(
+        _is_whole(model / name, holds) for name, holds in files.items() if (model / name).exists()
+    )
+
+
+def _is_whole(path: Path, holds: Callable[[mmap.mmap], bool]) -> bool:
+    with path.open("rb") as file:
+        if path.stat().st_size < _COUNT.size:
+            return False
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            try:
+                return holds(data)
+            except struct.error:  # a count lies behind the end
+                return False
+
+
+def _cameras(data: mmap.mmap) -> bool:
+    # Their lengths depend on their models, which pycolmap checks.
+    (count,) = _COUNT.unpack_from(data)
+    return bool(_COUNT.size + count * _SMALLEST_CAMERA <= len(data))
+
+
+def _images(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        end_of_name = data.find(b"\0", position + _IMAGE_HEAD)
+        if end_of_name < 0:
+            return False
+        (num_points,) = _COUNT.unpack_from(data, end_of_name + 1)
+        position = end_of_name + 1 + _COUNT.size + num_points * _OBSERVATION.itemsize
+        if position > len(data):
+            return False
+    return True
+
+
+def _points(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position, end, each = _COUNT.size, len(data), _ELEMENT.itemsize
+    unpack = _COUNT.unpack_from  # there may be millions
+    for _ in range(count):
+        (length,) = unpack(data, position + _POINT_HEAD)
+        position += _POINT_HEAD + _COUNT.size + length * each
+        if position > end:
+            return False
+    return True
+
+
+def _rigs(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        (num_sensors,) = _SHORT_COUNT.unpack_from(data, position + _RIG_HEAD - _SHORT_COUNT.size)
+        position += _RIG_HEAD + (_SENSOR if num_sensors else 0)
+        if position + (num_sensors - 1) * (_SENSOR + 1) > len(data):
+            return False
+        for _ in range(num_sensors - 1):
+            has_pose = data[position + _SENSOR : position + _SENSOR + 1] != b"\0"
+            position += _SENSOR + 1 + (_POSE if has_pose else 0)
+        if position > len(data):
+            return False
+    return True
+
+
+def _frames(data: mmap.mmap) -> bool:
+    (count,) = _COUNT.unpack_from(data)
+    position = _COUNT.size
+    for _ in range(count):
+        (num_ids,) = _SHORT_COUNT.unpack_from(data, position + _FRAME_HEAD)
+        position += _FRAME_HEAD + _SHORT_COUNT.size + num_ids * _DATA_ID
+        if position > len(data):
+            return False
+    return True

@@ -1,0 +1,203 @@
+"""Coverage: how much of its images a cloud of points fills."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.geometry.colmap_model import ModelImage, posed_images
+from colmap_av1.geometry.masks import Mask
+
+_Floats = NDArray[np.float64]
+
+# Width in pixels of the cells that are filled or empty.
+CELL = 16
+# A point is seen through a gap in what is before it where all but one of the cells around have
+# points that are nearer by this factor.
+_NEARER = 1.25
+_AROUND = 8
+# Images that are looked at, evenly spread; bounds the time of long videos.
+_MOST_IMAGES = 64
+# Points of the picture's edge that tell which rays a camera sees.
+_EDGE_POINTS = 33
+
+
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera where an image was taken.
+
+    Attributes:
+        camera: its pycolmap.Camera.
+        cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
+        mask: which pixels of the image count; None: all.
+    """
+
+    camera: Any
+    cam_from_world: _Floats
+    mask: Mask | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image in pixels."""
+        return int(self.camera.width), int(self.camera.height)
+
+    @property
+    def centre(self) -> _Floats:
+        """Float64 [3] place of the camera in the world."""
+        return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
+
+    @property
+    def counting_cells(self) -> NDArray[np.bool_]:
+        """Bool [rows, columns] the cells of the image that have pixels which count."""
+        width, height = self.size
+        rows, columns = -(-height // CELL), -(-width // CELL)
+        if self.mask is None:
+            return np.ones((rows, columns), dtype=np.bool_)
+        own = [(np.arange(n) + 0.5) * m / n for n, m in zip(self.size, self.mask.size, strict=True)]
+        kept = np.zeros((rows * CELL, columns * CELL), dtype=np.bool_)
+        kept[:height, :width] = self.mask.kept[np.ix_(own[1].astype(int), own[0].astype(int))]
+        return np.asarray(kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
+
+    @functools.cached_property
+    def _seen_rays(self) -> tuple[_Floats, _Floats]:
+        return _seen_rays(self.camera)
+
+    def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
+        """Whether pixels [n, 2] of the image count."""
+        return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
+
+    def rays(self, xy: _Floats) -> _Floats:
+        """Float64 [n, 3] the rays in the camera of pixels [n, 2], 1 deep."""
+        rays = np.asarray(self.camera.cam_from_img(xy)).reshape(-1, 2)
+        return np.column_stack([rays, np.ones(len(rays))])
+
+    def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
+        """The points that lie in the picture.
+
+        Args:
+            xyz: float64 [n, 3] in the world.
+
+        Returns:
+            int64 [m] their indices, ascending; float64 [m, 2] pixels, the first one's centre at
+            (0.5, 0.5); and float64 [m] depths along the camera's axis.
+        """
+        xyz = np.ascontiguousarray(xyz, np.float64)
+        pose = np.ascontiguousarray(self.cam_from_world, np.float64)
+        width, height = self.size
+        if self.camera.model_name == "PINHOLE":
+            return _core.points_in_picture(
+                pose, np.asarray(self.camera.params), float(width), float(height), xyz
+            )
+        # Beyond what a camera sees its distortion may fold back into the picture.
+        index, own = _core.points_in_view(pose, *self._seen_rays, xyz)
+        xy = np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
+        x, y = xy[:, 0], xy[:, 1]
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return index[inside], xy[inside], own[inside, 2]
+
+
+def views_of(
+    images: Sequence[ModelImage], cameras: Mapping[int, Any], masks: Sequence[Mask | None]
+) -> list[PosedCamera]:
+    """The cameras where images were taken, by the cameras' ids, and what of them counts."""
+    return [
+        PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
+        for image, mask in zip(images, masks, strict=True)
+    ]
+
+
+def evenly_spread(count: int, most: int) -> list[int]:
+    """Indices from 0 to before `count`, evenly spread, `most` at most."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
+
+
+def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
+    """Share of the images' cells of 16x16 pixels that a visible point projects into.
+
+    A point that is seen through a gap in the surface before it does not count, nor do cells that
+    masks leave out. Of long videos 64 images, evenly spread, are looked at.
+
+    Args:
+        views: the images.
+        xyz: float64 [n, 3] the points.
+
+    Returns:
+        From 0 to 1; 0 without images.
+    """
+    filled = total = 0
+    for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
+        depth = without_gaps(nearest_depth(view, xyz))
+        cells = view.counting_cells
+        filled += int(np.isfinite(depth[cells]).sum())
+        total += int(cells.sum())
+    return filled / max(total, 1)
+
+
+def coverage_of_model(reconstruction: Any) -> float:
+    """`coverage` of a pycolmap.Reconstruction's points in its images."""
+    images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
+    cameras = reconstruction.cameras
+    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+    xyz = np.array([p.xyz for p in reconstruction.points3D.values()], np.float64)
+    return coverage(views, xyz.reshape(-1, 3))
+
+
+def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
+    """Depth of the nearest point in each cell of an image, seen through a gap or not.
+
+    Args:
+        view: the image.
+        xyz: float64 [n, 3] the points.
+
+    Returns:
+        float64 [rows, columns]; inf where there is none.
+    """
+    _, xy, depth = view.project(xyz)
+    return nearest_in_cells(view.size, xy, depth)
+
+
+def nearest_in_cells(size: tuple[int, int], xy: _Floats, depth: _Floats) -> _Floats:
+    """Least of the depths [n] at pixels [n, 2] in each cell of a (width, height), see above."""
+    columns, rows = (-(-length // CELL) for length in size)
+    # What is seen at the very edge is of the last cell.
+    return _core.nearest_in_cells(xy, depth, cell=CELL, columns=columns, rows=rows)
+
+
+def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_side: int) -> _Floats:
+    """Centres in pixels [n, 2] of the squares that cells are divided into, cell by cell."""
+    places = (np.arange(per_side) + 0.5) * (CELL / per_side)
+    x = columns[:, None] * CELL + np.tile(places, per_side)
+    y = rows[:, None] * CELL + np.repeat(places, per_side)
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def without_gaps(grid: _Floats) -> _Floats:
+    """Nearest depths without those that lie well behind nearly all around them: inf there."""
+    rows, columns = grid.shape
+    padded = np.pad(grid, 1, constant_values=np.inf)
+    limit = grid / _NEARER
+    nearer = np.zeros(grid.shape, np.int64)
+    for row in range(3):
+        for column in range(3):
+            nearer += padded[row : row + rows, column : column + columns] < limit
+    return np.where(nearer >= _AROUND - 1, np.inf, grid)
+
+
+def _seen_rays(camera: Any) -> tuple[_Floats, _Floats]:
+    """Least and largest (x / z, y / z) that a picture's edge shows, a little widened."""
+    width, height = float(camera.width), float(camera.height)
+    along = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    none, all_ = np.zeros_like(along), np.ones_like(along)
+    edge = [(along, none), (along, all_), (none, along), (all_, along)]
+    xy = np.concatenate([np.column_stack([x * width, y * height]) for x, y in edge])
+    rays = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    margin = 0.01 * (high - low)
+    return low - margin, high + margin

@@ -1,0 +1,277 @@
+"""Points for trainers of Gaussian splats: every track gets one, far ones at an honest distance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.geometry.colmap_model import camera_centres, take_rows
+from colmap_av1.geometry.triangulation import (
+    ERROR_TO_SIGMA,
+    SIGMA_FLOOR,
+    Observations,
+    TriangulatedPoints,
+    Views,
+    triangulate,
+)
+from colmap_av1.options import TriangulateOptions
+
+_Floats = NDArray[np.float64]
+_Ints = NDArray[np.int64]
+
+# Uncertainty of a distance, as a share of it, up to which it tells how deep the scene is.
+_KNOWN = 0.3
+# The far field is at this many times nearly all known distances, or this many times the extent of
+# the camera's path where that is farther.
+_NEARLY_ALL = 0.999
+_FAR = 2.0
+_FAR_EXTENTS = 10.0
+# Its distance where neither points nor a path tell one.
+_ANY_FAR = 100.0
+# A point hangs before its surroundings where it is nearer than this share of their distance in most
+# of its images, and fewer points than these are as near, within a factor.
+_BEFORE = 0.5
+_AS_NEAR = 1.3
+_SUPPORT = 4
+# Width in pixels of the squares of an image that surroundings are, and points that they take.
+_AROUND = 48.0
+_FEWEST_AROUND = 8
+# Least angle in radians that is divided by.
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points and their observations in compressed sparse row form, as in TriangulatedPoints."""
+
+    xyz: _Floats
+    error: _Floats
+    offsets: _Ints
+    observation: _Ints
+
+    @property
+    def owner(self) -> _Ints:
+        """Point of each observation."""
+        return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
+
+    @property
+    def middle(self) -> _Ints:
+        """The observation in the middle of each point's."""
+        return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
+
+    def take(self, rows: _Ints) -> _Points:
+        """Some of the points, in the order of `rows`."""
+        offsets, seen = take_rows(self.offsets, rows)
+        return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The tracks, and how the views see them."""
+
+    observations: Observations
+    views: Views
+    centres: _Floats
+
+    def rays(self, rows: _Ints) -> _Floats:
+        """Unit vectors in the world towards some observations, float64 [n, 3]."""
+        rays = np.column_stack([self.observations.rays[rows], np.ones(len(rows))])
+        rotation = self.views.cam_from_world[self.observations.view[rows], :, :3]
+        rays = np.einsum("nji,nj->ni", rotation, rays)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def origins(self, rows: _Ints) -> _Floats:
+        """Float64 [n, 3] centres of the views of some observations."""
+        return self.centres[self.observations.view[rows]]
+
+    def of_points(self, points: _Points) -> dict[str, Any]:
+        """What the core is given of points and the views that see them."""
+        return {
+            "cam_from_world": np.ascontiguousarray(self.views.cam_from_world),
+            "focal": np.ascontiguousarray(self.views.focal),
+            "view": self.observations.view,
+            "rays": self.observations.rays,
+            "xyz": points.xyz,
+            "offsets": points.offsets,
+            "observation": points.observation,
+        }
+
+    def errors(self, points: _Points) -> _Floats:
+        """Reprojection errors in pixels of the observations of points, inf behind the camera."""
+        return _core.reprojection_errors(**self.of_points(points))
+
+
+def splat_points(
+    observations: Observations,
+    views: Views,
+    options: TriangulateOptions,
+    *,
+    num_threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> TriangulatedPoints:
+    """Points of all tracks that agree with the poses, however little parallax they have.
+
+    What is far away fills most of many images, and its exact distance matters little: a point stays
+    on the ray of the middle one of its images, and within the uncertainty of its distance it is
+    drawn to the scene's far field. Tracks whose rays meet nowhere, being parallel, get a point
+    there. Points that hang before all that is around them in their images are left out.
+
+    Args:
+        observations: the tracks.
+        views: poses and focal lengths.
+        options: of these `max_reprojection_error` and `min_observations` apply.
+        num_threads: threads; None: one per CPU. The result does not depend on it.
+        progress: called with the number of tracks done so far.
+
+    Returns:
+        The points, in the order of the tracks.
+
+    Raises:
+        OptionError: an option has a value that cannot work.
+    """
+    anywhere = replace(
+        options, points="survey", max_points=None, min_angle=0.0, max_depth_error=None
+    )
+    found = triangulate(observations, views, anywhere, num_threads=num_threads, progress=progress)
+    seen = _Seen(observations, views, camera_centres(views.cam_from_world))
+    points = _Points(found.xyz, found.error, found.offsets, found.observation)
+    unsure = distance_uncertainty(
+        *(points.xyz, points.error, points.offsets),
+        centres=seen.centres,
+        view=observations.view[points.observation],
+        focal=views.focal.mean(axis=1),
+    )
+    far = _far_distance(points, unsure, seen)
+    points = _at_honest_distance(points, unsure, far, seen)
+    far_away = _points_far_away(points, far, seen, options)
+    points = _in_order(points, far_away)
+    points = points.take(np.flatnonzero(~_hanging(points, seen)))
+    num_agreeing = found.num_agreeing + len(far_away.xyz)
+    return replace(found, num_agreeing=num_agreeing, **vars(points))
+
+
+def distance_uncertainty(
+    xyz: _Floats,
+    error: _Floats,
+    offsets: _Ints,
+    *,
+    centres: _Floats,
+    view: _Ints,
+    focal: _Floats,
+) -> _Floats:
+    """Expected error of each point's distance from the cameras, as a share of it.
+
+    Args:
+        xyz: float64 [n, 3] the points.
+        error: float64 [n] their mean reprojection errors in pixels.
+        offsets: int64 [n + 1] the observations of each, one at least.
+        centres: float64 [num_views, 3] places of the cameras.
+        view: int64 [num_observations] view of each observation.
+        focal: float64 [num_views] focal lengths in pixels.
+    """
+    angle = _core.widest_angles(
+        centres=np.ascontiguousarray(centres), xyz=xyz, offsets=offsets, view=view
+    )
+    middle = view[(offsets[:-1] + offsets[1:]) // 2]
+    sigma = np.hypot(SIGMA_FLOOR, ERROR_TO_SIGMA * error)
+    return np.asarray(sigma / (focal[middle] * np.maximum(angle, _TINY)))
+
+
+def _distance(points: _Points, seen: _Seen) -> _Floats:
+    """Distance of each point from the view in the middle of its observations."""
+    return np.asarray(np.linalg.norm(points.xyz - seen.origins(points.middle), axis=1))
+
+
+def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
+    """Where the far field of the scene is taken to be."""
+    extent = float(np.linalg.norm(seen.centres - seen.centres.mean(axis=0), axis=1).max())
+    known = _distance(points, seen)[unsure < _KNOWN]
+    deepest = float(np.quantile(known, _NEARLY_ALL)) if len(known) else 0.0
+    return max(_FAR * deepest, _FAR_EXTENTS * extent) or _ANY_FAR
+
+
+def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _Seen) -> _Points:
+    """The points moved along their middle ray, within what is known of their distance.
+
+    The inverse of the distance is drawn to that of the far field, with the scene's usual one as its
+    spread beforehand; what lies beyond the far field comes as near to it as its uncertainty lets.
+    """
+    if len(points.xyz) == 0:
+        return points
+    distance = _distance(points, seen)
+    usual = float(np.median(distance))
+    pull = (unsure * usual / distance) ** 2
+    drawn = (1.0 + pull) / (1.0 / distance + pull / far)
+    within = np.maximum(far, distance / (1.0 + unsure))
+    moved = np.where(distance > far, np.minimum(distance, within), np.minimum(drawn, far))
+    # A thousandth is no matter; where it stays a point keeps its best place.
+    rows = np.flatnonzero(np.abs(moved / distance - 1.0) > 1e-3)
+    middle = points.middle[rows]
+    xyz = points.xyz.copy()
+    xyz[rows] = seen.origins(middle) + seen.rays(middle) * moved[rows, None]
+    return _with_errors(replace(points, xyz=xyz), seen)
+
+
+def _with_errors(points: _Points, seen: _Seen) -> _Points:
+    """The points with the mean errors that they have where they are; without blind ones."""
+    if len(points.xyz) == 0:
+        return points
+    mean = np.add.reduceat(seen.errors(points), points.offsets[:-1]) / np.diff(points.offsets)
+    return replace(points, error=mean).take(np.flatnonzero(np.isfinite(mean)))
+
+
+def _points_far_away(
+    points: _Points, far: float, seen: _Seen, options: TriangulateOptions
+) -> _Points:
+    """Points in the far field of the tracks that have none and look like it in enough images."""
+    offsets = seen.observations.offsets
+    track = np.searchsorted(offsets, points.observation[points.offsets[:-1]], side="right") - 1
+    has_point = np.zeros(len(offsets) - 1, np.bool_)
+    has_point[track] = True
+    left = np.flatnonzero(~has_point & (np.diff(offsets) >= options.min_observations))
+    tracks = _Points(
+        np.empty((len(offsets) - 1, 3)),
+        np.empty(len(offsets) - 1),
+        offsets,
+        np.arange(offsets[-1]),
+    ).take(left)
+    if len(left) == 0:
+        return tracks
+    middle = tracks.middle
+    xyz = seen.origins(middle) + seen.rays(middle) * far
+    kept = seen.errors(replace(tracks, xyz=xyz)) <= options.max_reprojection_error
+    owner = tracks.owner[kept]
+    counts = np.bincount(owner, minlength=len(left))
+    far_away = _Points(
+        xyz, np.zeros(len(left)), np.concatenate([[0], np.cumsum(counts)]), tracks.observation[kept]
+    ).take(np.flatnonzero(counts >= options.min_observations))
+    return _with_errors(far_away, seen)
+
+
+def _in_order(one: _Points, two: _Points) -> _Points:
+    """The points of both in the order of their tracks."""
+    both = _Points(
+        np.concatenate([one.xyz, two.xyz]),
+        np.concatenate([one.error, two.error]),
+        np.concatenate([one.offsets, two.offsets[1:] + one.offsets[-1]]),
+        np.concatenate([one.observation, two.observation]),
+    )
+    return both.take(np.argsort(both.observation[both.offsets[:-1]], kind="stable"))
+
+
+def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
+    """Points that hang, nearly alone, before all that is around them in most of their images."""
+    votes = _core.hanging_observations(
+        **seen.of_points(points),
+        before=_BEFORE,
+        as_near=_AS_NEAR,
+        support=_SUPPORT,
+        around=_AROUND,
+        fewest_around=_FEWEST_AROUND,
+    )
+    return np.asarray(votes > 0.5 * np.diff(points.offsets))

@@ -1,0 +1,176 @@
+"""Resection: poses of the images between those that a mapper placed, from the points these see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.digests import seed_of
+
+_Floats = NDArray[np.float64]
+
+# Error in pixels of an inlier, and number of inliers that a pose is believed with: COLMAP's mapper
+# asks for 30, too.
+_MAX_ERROR = 4.0
+_MIN_INLIERS = 30
+# Error in pixels from which on an observation counts less when the pose is refined (Cauchy).
+_LOSS_SCALE = 0.5
+# Most guesses are right to begin with: no more samples than prove it.
+_MIN_SAMPLES = 10
+_MAX_SAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Known points in images without a pose.
+
+    Attributes:
+        rays: float64 [n, 2] undistorted position (x / z, y / z) of each point in its image.
+        xyz: float64 [n, 3] the point.
+        bounds: int64 [num_images + 1]; image i has those from bounds[i] to before bounds[i + 1].
+    """
+
+    rays: _Floats
+    xyz: _Floats
+    bounds: NDArray[np.int64]
+
+
+def sightings_of(
+    points: TriangulatedPoints,
+    seen: Tracks,
+    tracks: Tracks,
+    frames: NDArray[np.int32],
+    camera: Any,
+) -> Sightings:
+    """The points of tracks where other frames see the same tracks.
+
+    Args:
+        points: points of `seen`.
+        seen: the tracks in the frames of known poses, as `keep_frames` leaves them.
+        tracks: the same tracks in all frames.
+        frames: int32 [num_images] frames whose poses are asked for, ascending.
+        camera: their pycolmap.Camera.
+    """
+    number = tracks.track
+    known = np.zeros(tracks.num_frames, dtype=np.bool_)
+    known[seen.frame] = True
+    in_seen = np.unique(number[known[tracks.frame]])
+    # A track that slid from one surface to another has two points: the first one counts.
+    first = points.observation[points.offsets[:-1]]
+    own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)
+    point = np.full(len(tracks.offsets) - 1, -1, dtype=np.int64)
+    point[in_seen[own - 1]] = index
+    place = np.full(tracks.num_frames, -1, dtype=np.int64)
+    place[frames] = np.arange(len(frames))
+    rows = np.flatnonzero((place[tracks.frame] >= 0) & (point[number] >= 0))
+    rows = rows[np.argsort(place[tracks.frame[rows]], kind="stable")]
+    bounds = np.searchsorted(place[tracks.frame[rows]], np.arange(len(frames) + 1))
+    rays = np.asarray(camera.cam_from_img(tracks.xy[rows].astype(np.float64))).reshape(-1, 2)
+    return Sightings(rays, points.xyz[point[number[rows]]], bounds)
+
+
+def resect(
+    sightings: Sightings,
+    guesses: _Floats,
+    focal: float,
+    *,
+    loss_scale: float = _LOSS_SCALE,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[_Floats | None]:
+    """Estimate the pose of each image from the points it sees, by PoseLib.
+
+    Args:
+        sightings: the points in the images.
+        guesses: float64 [num_images, 3, 4] poses that may be right, x_cam = R x_world + t.
+        focal: focal length in pixels, which errors are measured in.
+        loss_scale: error in pixels from which on a point counts less (Cauchy's loss).
+        seed: of the samples.
+        num_threads: threads; None: one per CPU. The result does not depend on it.
+        progress: called with the number of images done so far.
+
+    Returns:
+        For each image float64 [3, 4]; None where too few points agree on a pose.
+    """
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+
+    def work(image: int) -> _Floats | None:
+        own = slice(int(sightings.bounds[image]), int(sightings.bounds[image + 1]))
+        rays, xyz = sightings.rays[own], sightings.xyz[own]
+        own_seed = seed_of(seed, image)
+        return _resect_one(
+            *(rays * focal, xyz, guesses[image], camera), loss_scale=loss_scale, seed=own_seed
+        )
+
+    found: list[_Floats | None] = []
+    with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
+        for pose in executor.map(work, range(len(guesses))):
+            found.append(pose)
+            if progress is not None:
+                progress(len(found))
+    return found
+
+
+def _resect_one(
+    xy: _Floats,
+    xyz: _Floats,
+    guess: _Floats,
+    camera: dict[str, Any],
+    *,
+    loss_scale: float,
+    seed: int,
+) -> _Floats | None:
+    import poselib  # noqa: PLC0415 - after NumPy
+
+    if len(xy) < _MIN_INLIERS:
+        return None
+    ransac = {
+        "max_reproj_error": _MAX_ERROR,
+        "min_iterations": _MIN_SAMPLES,
+        "max_iterations": _MAX_SAMPLES,
+        "seed": seed,
+    }
+    bundle = {"loss_type": "CAUCHY", "loss_scale": loss_scale}
+    start = poselib.CameraPose()
+    start.R, start.t = guess[:, :3], guess[:, 3]
+    pose, info = poselib.estimate_absolute_pose(xy, xyz, camera, ransac, bundle, start)
+    if info["num_inliers"] < _MIN_INLIERS:
+        return None
+    return np.column_stack([np.asarray(pose.R), np.asarray(pose.t)])
+
+
+def interpolate_poses(
+    cam_from_world: _Floats, frames: NDArray[np.int32], wanted: NDArray[np.int32]
+) -> _Floats:
+    """Poses between known ones, as of a camera that moves and turns steadily between them.
+
+    Args:
+        cam_from_world: float64 [n, 3, 4] known poses.
+        frames: int32 [n] their frames, ascending.
+        wanted: int32 [m] frames whose poses are asked for; those before the first and after the
+            last known one get the pose of that.
+
+    Returns:
+        float64 [m, 3, 4].
+    """
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - slow to import
+
+    if len(frames) == 1:
+        return np.repeat(cam_from_world, len(wanted), axis=0)
+    at = np.clip(wanted, frames[0], frames[-1]).astype(np.float64)
+    turns = Slerp(frames.astype(np.float64), Rotation.from_matrix(cam_from_world[:, :, :3]))
+    rotation = turns(at).as_matrix()
+    centres = camera_centres(cam_from_world)
+    centre = np.column_stack([np.interp(at, frames, along) for along in centres.T])
+    translation = -np.einsum("nij,nj->ni", rotation, centre)
+    return np.concatenate([rotation, translation[:, :, None]], axis=2)

@@ -1,0 +1,174 @@
+"""The undistorted pinhole camera of a distorted one, and its pictures."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.cameras import is_undistorted
+from colmap_av1.geometry.masks import Mask, make_mask
+
+_Image = NDArray[np.uint8]
+
+# Zoom of the undistorted camera against the distorted one.
+_ZOOM_RANGE = (0.25, 4.0)
+_BISECTIONS = 40
+# Of the tables in which single pixels are looked up.
+_COLUMNS = 512
+
+
+def pinhole_camera(camera: Any) -> Any:
+    """The undistorted camera of the same size, with the widest view without empty pixels.
+
+    Args:
+        camera: pycolmap.Camera of any perspective model.
+
+    Returns:
+        pycolmap.Camera, PINHOLE, with the id and the principal point of the given one.
+
+    Raises:
+        ModelError: no such camera exists, as with a fisheye lens that sees to the side.
+    """
+    size = {"width": int(camera.width), "height": int(camera.height)}
+    centre = [camera.principal_point_x, camera.principal_point_y]
+    focal = np.array([camera.focal_length_x, camera.focal_length_y])
+    zoom = 1.0
+    if not is_undistorted(camera):
+        width, height = size["width"], size["height"]
+        x, y = np.arange(width + 1.0), np.arange(height + 1.0)
+        edge = np.concatenate(
+            [
+                *(np.column_stack([x, np.full_like(x, at)]) for at in (0, height)),
+                *(np.column_stack([np.full_like(y, at), y]) for at in (0, width)),
+            ]
+        )
+
+        def is_filled(zoom: float) -> bool:
+            on_source = _project(camera, (edge - centre) / (focal * zoom))
+            inside = (on_source >= -0.5) & (on_source <= np.array([width, height]) + 0.5)
+            return bool(inside.all())
+
+        low, high = _ZOOM_RANGE
+        if not is_filled(high):
+            raise ModelError(
+                f"camera {camera.model_name} {list(camera.params)} cannot be undistorted: give "
+                "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE"
+            )
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if is_filled(middle) else (middle, high)
+        zoom = high
+    params = [*(focal * zoom), *centre]
+    camera_id = int(camera.camera_id)
+    return pycolmap.Camera(camera_id=camera_id, model="PINHOLE", params=params, **size)
+
+
+def _project(camera: Any, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of undistorted positions (x / z, y / z)."""
+    return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+
+
+def on_pinholes(
+    rays: NDArray[np.float64], view: NDArray[np.int64], pinholes: Sequence[Any]
+) -> NDArray[np.float64]:
+    """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
+    params = np.array([pinhole.params for pinhole in pinholes])
+    if len(params) and (params == params[0]).all():
+        # Nothing to look up for each ray, which takes most of the time.
+        return np.asarray(rays * params[0, :2] + params[0, 2:])
+    xy = np.empty(rays.shape)
+    for axis in range(2):
+        xy[:, axis] = rays[:, axis] * params[view, axis] + params[view, 2 + axis]
+    return xy
+
+
+def undistorted_masks(
+    masks: Sequence[Mask | None], cameras: Sequence[Any], pinholes: Mapping[int, Any]
+) -> list[Mask | None]:
+    """The masks of images as their undistorted pictures have them, of the size of these.
+
+    Args:
+        masks: the mask of each image; None: it has none.
+        cameras: the camera of each.
+        pinholes: the undistorted camera of each camera, by its id.
+    """
+
+    @functools.cache
+    def change_of(camera_id: int) -> Undistortion | None:
+        return undistortion(of_id[camera_id], pinholes[camera_id], cv2.INTER_NEAREST)
+
+    @functools.cache
+    def undistort(mask: Mask, camera_id: int) -> Mask:
+        pinhole = pinholes[camera_id]
+        size = (int(pinhole.width), int(pinhole.height))
+        kept = mask.kept.astype(np.uint8)
+        if mask.size != size:
+            kept = cv2.resize(kept, size, interpolation=cv2.INTER_NEAREST)
+        change = change_of(camera_id)
+        return make_mask((change(kept) if change is not None else kept) > 0)
+
+    of_id = {int(camera.camera_id): camera for camera in cameras}
+    return [
+        undistort(mask, int(camera.camera_id)) if mask is not None else None
+        for mask, camera in zip(masks, cameras, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """Undistorts pictures of a camera.
+
+    Attributes:
+        source: float32 [height, width, 2] where each pixel of the undistorted picture is in the
+            distorted one, the centre of whose first pixel is (0, 0).
+        interpolation: OpenCV's flag for what lies between pixels.
+    """
+
+    source: NDArray[np.float32]
+    interpolation: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of undistorted pictures."""
+        height, width = self.source.shape[:2]
+        return width, height
+
+    def __call__(self, picture: _Image) -> _Image:
+        """The undistorted picture of a picture, uint8 [height, width, ...]."""
+        return self._looked_up(picture, self.source)
+
+    def pixels(self, picture: _Image, x: NDArray[np.int64], y: NDArray[np.int64]) -> _Image:
+        """Some pixels [n, ...] of the undistorted picture, by their columns and rows [n]."""
+        # As a table: OpenCV takes no row or column as long as that.
+        rows = -(-len(x) // _COLUMNS)
+        source = np.resize(self.source[y, x], (rows, _COLUMNS, 2))
+        found = self._looked_up(picture, source) if rows else picture[:0]
+        return found.reshape(-1, *picture.shape[2:])[: len(x)]
+
+    def _looked_up(self, picture: _Image, source: NDArray[np.float32]) -> _Image:
+        edge = cv2.BORDER_REPLICATE
+        found = cv2.remap(picture, source, None, self.interpolation, borderMode=edge)
+        return np.asarray(found, np.uint8)
+
+
+def undistortion(
+    camera: Any, pinhole: Any, interpolation: int = cv2.INTER_CUBIC
+) -> Undistortion | None:
+    """What undistorts the pictures of a camera; None without distortion."""
+    if is_undistorted(camera):
+        return None
+    fx, fy, cx, cy = pinhole.params
+    width, height = int(pinhole.width), int(pinhole.height)
+    y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
+    source = _project(camera, np.column_stack([(x - cx) / fx, (y - cy) / fy]))
+    # OpenCV counts from the centre of the first pixel.
+    at = (source - 0.5).reshape(height, width, 2).astype(np.float32)
+    return Undistortion(at, interpolation)

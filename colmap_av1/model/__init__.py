@@ -1,1 +1,0 @@
-"""Poses by COLMAP's mappers, points triangulated on them, models for trainers."""

@@ -1,1 +1,0 @@
-"""Whether a model holds together: what joins neighbours, and views from far apart in time."""

@@ -1,1 +1,0 @@
-"""What moves by itself: tracks that contradict the camera, and the regions they make up."""

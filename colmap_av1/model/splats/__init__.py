@@ -1,1 +1,0 @@
-"""Points and Gaussians that trainers of Gaussian splats start well from."""

@@ -1,0 +1,1 @@
+"""The joint estimate of all poses: key images, mapper, resection, adjustment."""

@@ -1,0 +1,1 @@
+"""Corners of the pictures, found again in every image that sees them."""

@@ -1,0 +1,171 @@
+"""Corners in the images that have a pose, for the adjustment of these."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.coverage import views_of
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.resection import resect, sightings_of
+from colmap_av1.geometry.track_points import seen_in
+from colmap_av1.poses.corners.grey_pictures import GreyPictures
+from colmap_av1.poses.corners.seen_again import found_again
+from colmap_av1.poses.reconstruct_poses import FROM_PICTURES, PosedImages, triangulate_in
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.tracks.corners import CornerDensity, follow_corners
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
+from colmap_av1.tracks.video_tracks import decodable_frames
+from colmap_av1.util.progress import progress_in
+
+# Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
+# more than a shutter's read-out bends a picture, so that no part of it decides alone.
+_LOSS_SCALE = 2.0
+# Of pictures in which what masks leave out changes: what passes cuts what it hides to half the
+# length, and short tracks hold fewer images together.
+_CUT_SHORT = CornerDensity(most=1500, spacing=8)
+# Error beyond which a corner is lost, wherever it is.
+_LOST = 8.0
+
+
+def corners_in_images(
+    run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+) -> tuple[Tracks, PosedImages]:
+    """Look for corners of all videos' pictures, and place images anew that contradict them.
+
+    Args:
+        run: what every stage is given.
+        moving: by the names of images, masks that leave out what moves.
+        tracks: tracks of what stands still, which say where to look for corners.
+        placed: the images that have a pose.
+
+    Returns:
+        The corners as tracks, and the images.
+    """
+    masks = placed.masks_with(moving)
+    with GreyPictures(run.stages) as pictures:
+        followed = _followed(run, masks, tracks, placed, pictures)
+        placed = place_anew(run, followed, placed)
+        return _seen_again(run, masks, followed, placed, pictures), placed
+
+
+def _followed(
+    run: Run,
+    masks: list[Mask | None],
+    tracks: Tracks,
+    placed: PosedImages,
+    pictures: GreyPictures,
+) -> Tracks:
+    """Corners followed through each video's images, whose pictures are kept."""
+    image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
+    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
+    for video in range(len(run.sources)):
+        own = np.flatnonzero(placed.take == video)
+        if len(own) == 0:
+            continue
+        first = int(placed.first_frame[video])
+        mask_of = {int(placed.frames[i]) - first: masks[i] for i in own}
+        guide = keep_observations(tracks, np.isin(tracks.frame, placed.frames[own]))
+        num_frames = max(mask_of) + 1
+        guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
+        decoded = decodable_frames(
+            *(run.sources[video].pictures, num_frames, run.options.match),
+            wanted=mask_of,
+            use="corners are followed",
+            kept=run.sources[video].kept,
+        )
+        report = progress_in(run.progress, "refinement", len(own))
+        density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()
+
+        def keep(frame: int, grey: NDArray[np.uint8], first: int = first) -> None:
+            pictures.keep(image_of[first + frame], grey)
+
+        corners = follow_corners(
+            *(guide, decoded, partial(_keeps, mask_of), report), density=density, keep=keep
+        )
+        found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
+    return found
+
+
+def _seen_again(
+    run: Run,
+    masks: list[Mask | None],
+    corners: Tracks,
+    placed: PosedImages,
+    pictures: GreyPictures,
+) -> Tracks:
+    """Corners where all images show them, see `found_again`."""
+    seen, view = seen_in(corners, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    views = views_of(placed.images, placed.cameras, masks)
+    report = progress_in(run.progress, "refinement", len(views))
+    return found_again(
+        *(seen, view, points),
+        views=views,
+        frames=placed.frames,
+        pictures=pictures,
+        progress=report,
+    )
+
+
+def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
+    """Place images anew by the points of the corners, where these then fit better.
+
+    Motion that is wrong together places an image where its own tracks fit, so that what the
+    picture shows is taken for errors, and left out of any adjustment that starts from there.
+
+    Args:
+        run: what every stage is given.
+        corners: corners as tracks.
+        placed: the images that have a pose.
+    """
+    seen, view = seen_in(corners, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    if len(points.xyz) == 0:
+        return placed
+    images = list(placed.images)
+    how = run.options.match.run
+    for camera_id, camera in sorted(placed.cameras.items()):
+        own = [i for i, image in enumerate(images) if image.camera_id == camera_id]
+        sightings = sightings_of(points, seen, seen, placed.frames[own], camera)
+        guesses = np.array([images[i].cam_from_world for i in own])
+        focal = float(camera.mean_focal_length())
+        found = resect(
+            *(sightings, guesses, focal),
+            loss_scale=_LOSS_SCALE,
+            seed=how.seed,
+            num_threads=how.num_threads,
+        )
+        bounds = zip(sightings.bounds[:-1].tolist(), sightings.bounds[1:].tolist(), strict=True)
+        for i, pose, (first, last) in zip(own, found, bounds, strict=True):
+            shown = sightings.rays[first:last] * focal, sightings.xyz[first:last], focal
+            if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
+                images[i] = replace(images[i], cam_from_world=pose)
+    return replace(placed, images=images)
+
+
+def _error(
+    xy: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    focal: float,
+    cam_from_world: NDArray[np.float64],
+) -> float:
+    """Mean distance in pixels of points from where they are seen, of lost ones that of these."""
+    in_camera = xyz @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    off = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] * focal - xy, axis=1)
+    return float(np.where(in_camera[:, 2] > 0, np.minimum(off, _LOST), _LOST).mean())
+
+
+def _keeps(
+    mask_of: Mapping[int, Mask | None],
+    frame: int,
+    xy: NDArray[np.float32],
+    size: tuple[int, int],
+) -> NDArray[np.bool_]:
+    """Which positions in the picture of a frame its mask keeps; None: all."""
+    mask = mask_of[frame]
+    return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)

@@ -1,0 +1,1 @@
+"""What moves in the scene on its own, and leaving it out."""

@@ -1,0 +1,155 @@
+"""Tracks beside what moves, corrected on the pictures and taken up again where it has passed.
+
+What passes in front cuts the tracks behind it short, and an encoder that follows it drags along
+what stands still beside it: however many such tracks there are, poses that come from them are
+worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.coverage import PosedCamera, views_of
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.images.takes import Takes
+from colmap_av1.options import RefineOptions
+from colmap_av1.poses.reconstruct_poses import FOR_POSES, PosedImages
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.tracks.refine import refine_tracks
+from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
+from colmap_av1.tracks.video_tracks import decodable_frames
+from colmap_av1.util.progress import no_progress, progress_in
+
+# Images after the last that sees a point in which it is looked for: from farther away it looks
+# different.
+_REACH = 15
+# Width in pixels of the edge of a picture in which nothing is looked for.
+_MARGIN = 4
+# Expected error in pixels of where poses that are to be adjusted put a point.
+_PREDICTED_SIGMA = 1.0
+_LK = RefineOptions(refine="lk")
+
+
+def has_moving_masks(takes: Takes) -> bool:
+    """Whether what masks leave out of a video changes from image to image."""
+    videos = (takes.images_of(video) for video in range(len(takes.videos)))
+    return any(len({takes.masks[image] for image in images}) > 1 for images in videos)
+
+
+def follow_behind(
+    run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+) -> Tracks:
+    """Correct tracks on the pictures, and find their points in more of these.
+
+    A point is looked for where the poses put it in images that do not see it yet, from the first
+    that does to shortly after the last, but not on what moves. It is seen where the picture looks
+    like one that shows it, and followed from there: what lies where it is looked for in vain would
+    agree with the poses whatever these are.
+
+    Args:
+        run: what every stage is given.
+        moving: by the names of images, masks that leave out what moves.
+        tracks: tracks of what stands still; few, as each is looked for in many pictures.
+        placed: the images that have a pose.
+
+    Returns:
+        The tracks in these images, one for each point, without what disagrees with it.
+    """
+    masks = placed.masks_with(moving)
+    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
+    for video in range(len(run.sources)):
+        own = np.flatnonzero(placed.take == video)
+        frames = placed.frames[own]
+        seen, view = seen_in(tracks, frames)
+        if len(view) == 0:
+            continue
+        images = [placed.images[i] for i in own]
+        views = views_of(images, placed.cameras, [masks[i] for i in own])
+        points = triangulate_tracks(
+            *(seen, view, [v.camera for v in views], [v.cam_from_world for v in views], None),
+            options=FOR_POSES,
+            num_threads=run.options.match.run.num_threads,
+            progress=no_progress,
+        )
+        expected, is_expected = expect_in_views(seen, view, points, views, frames)
+        first_frame = int(placed.first_frame[video])
+        corrected = _on_pictures(run, video, expected, is_expected, first_frame)
+        found = join_tracks(found, keep_observations(corrected, corrected.confirmed | ~is_expected))
+    return found
+
+
+def _on_pictures(
+    run: Run, video: int, tracks: Tracks, expected: NDArray[np.bool_], first_frame: int
+) -> Tracks:
+    """Tracks of a video, of frames that are counted through, corrected on its pictures."""
+    frame = tracks.frame - np.int32(first_frame)
+    wanted = frozenset(np.unique(frame).tolist())
+    source = run.sources[video]
+    width, height = source.pictures.picture_size
+    num_frames = max(wanted) + 1
+    own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
+    decoded = decodable_frames(
+        source.pictures, num_frames, run.options.match, wanted=wanted, kept=source.kept
+    )
+    report = progress_in(run.progress, "refinement", len(wanted))
+    found = refine_tracks(own, decoded, _LK, report, expected=expected)
+    return replace(tracks, xy=found.xy, sigma=found.sigma, confirmed=found.confirmed)
+
+
+def expect_in_views(
+    tracks: Tracks,
+    view: NDArray[np.int64],
+    points: TriangulatedPoints,
+    views: Sequence[PosedCamera],
+    frames: NDArray[np.int32],
+) -> tuple[Tracks, NDArray[np.bool_]]:
+    """Points as tracks, with where they should be in views between and after those that see them.
+
+    Args:
+        tracks: the tracks that the points come from.
+        view: int64 [num_observations] view of each of their observations.
+        points: their points.
+        views: images of one video, in the order of time, and which of their pixels count.
+        frames: int32 [num_views] their frames.
+
+    Returns:
+        A track for each point, and bool [num_observations] which of their observations are such
+        expectations.
+    """
+    num_points = len(points.xyz)
+    point = np.repeat(np.arange(num_points), np.diff(points.offsets))
+    seen_by = view[points.observation]
+    first, last = seen_by[points.offsets[:-1]], seen_by[points.offsets[1:] - 1]
+    is_seen = np.zeros((len(views), num_points), np.bool_)
+    is_seen[seen_by, point] = True
+    points_in, xy_in = [point], [tracks.xy[points.observation]]
+    for number, camera in enumerate(views):
+        index, xy, _ = camera.project(points.xyz)
+        near = (first[index] < number) & (last[index] >= number - _REACH)
+        inside = ((xy >= _MARGIN) & (xy <= np.array(camera.size) - _MARGIN)).all(axis=1)
+        new = near & inside & ~is_seen[number, index]
+        new[new] = camera.keeps(xy[new])
+        points_in.append(index[new])
+        xy_in.append(xy[new].astype(np.float32))
+    counts = [len(own) for own in points_in]
+    owner = np.concatenate(points_in)
+    at = np.concatenate([seen_by, np.repeat(np.arange(len(views)), counts[1:])])
+    order = np.lexsort((at, owner))
+    is_predicted = (np.arange(len(owner)) >= counts[0])[order]
+    sigma = np.full(len(owner), _PREDICTED_SIGMA, np.float32)
+    sigma[: counts[0]] = tracks.sigma[points.observation]
+    expected = replace(
+        tracks,
+        offsets=np.searchsorted(owner[order], np.arange(num_points + 1)).astype(np.int64),
+        frame=frames[at[order]],
+        xy=np.concatenate(xy_in)[order],
+        sigma=sigma[order],
+        confirmed=np.zeros(len(owner), np.bool_),
+    )
+    return expected, is_predicted

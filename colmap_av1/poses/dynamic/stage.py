@@ -1,0 +1,137 @@
+"""The stage of `reconstruct` that finds what moves by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.coverage import views_of
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.track_points import chaining_for_points, seen_in, triangulate_tracks
+from colmap_av1.images.masks import mask_tracks
+from colmap_av1.images.takes import Takes
+from colmap_av1.options import DensityOptions, TriangulateOptions
+from colmap_av1.poses.dynamic.contradictions import place_tracks
+from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
+from colmap_av1.poses.reconstruct_poses import PosedImages, read_posed_images
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames, least_length
+from colmap_av1.util.progress import no_progress
+from colmap_av1.util.stages import Kept, run_stage
+
+_FILE = "moving.npz"
+# Width in pixels of the cells, one track of each is looked at; of larger pictures more.
+_CELL = 8
+_USUAL_WIDTH = 960
+# Images that see a track which is looked at, and of a video at least.
+_FEWEST_IMAGES = 4
+
+
+def moving_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
+    """Find the regions of each image that move by themselves."""
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, takes)
+        found: dict[str, Mask] = {}
+        with run.clock.measure("moving"):
+            for video in range(len(takes.videos)):
+                own = np.flatnonzero(placed.take == video)
+                if len(own) >= _FEWEST_IMAGES:
+                    found |= _moving_in_video(run, tracks, placed, own)
+                run.progress("moving", video + 1, len(takes.videos))
+        _write(partial / _FILE, found)
+        left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
+        return {"moving": left_out, "poses": posed.facts["poses"]}
+
+    return run_stage(
+        run.stages,
+        "moving",
+        [posed.digest],
+        into=run.stages,
+        products=[_FILE],
+        make=make,
+    )
+
+
+def read_moving(stages: Path) -> dict[str, Mask]:
+    """Masks that leave out what moves, by the images' names; images without any have none."""
+    with np.load(stages / _FILE) as file:
+        packed = np.split(file["packed"], file["ends"][:-1]) if len(file["names"]) else []
+        return {
+            str(name): Mask((int(size[0]), int(size[1])), part.tobytes(), float(share))
+            for name, size, share, part in zip(
+                file["names"], file["sizes"], file["shares"], packed, strict=True
+            )
+        }
+
+
+def without_moving(tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], run: Run) -> Tracks:
+    """The tracks of all takes where nothing moves by itself, see `mask_tracks`."""
+    images = takes.images
+    by_frame = {
+        frame: moving[name]
+        for frame, name in zip(images.frames.tolist(), images.names, strict=True)
+        if name in moving
+    }
+    if not by_frame:
+        return tracks
+    options = chaining_for_points(run.options.match, run.options.triangulate)
+    return mask_tracks(tracks, by_frame, least_length(options.tracks), scaled=False)
+
+
+def _write(path: Path, masks: Mapping[str, Mask]) -> None:
+    parts = [np.frombuffer(mask.packed, np.uint8) for mask in masks.values()]
+    with path.open("wb") as file:
+        np.savez(
+            file,
+            names=np.array(list(masks)),
+            sizes=np.array([mask.size for mask in masks.values()]).reshape(-1, 2),
+            shares=np.array([mask.share for mask in masks.values()]),
+            ends=np.cumsum([len(part) for part in parts], dtype=np.int64),
+            packed=np.concatenate([np.empty(0, np.uint8), *parts]),
+        )
+
+
+def _moving_in_video(
+    run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
+) -> dict[str, Mask]:
+    """Masks of what moves in the images of a video, by their names."""
+    images = [placed.images[i] for i in own]
+    views = views_of(images, placed.cameras, [None] * len(own))
+    size = views[0].size
+    cell = _CELL * max(1, round(max(size) / _USUAL_WIDTH))
+    spread = DensityOptions(
+        preset="sparse",
+        max_tracks_per_image=0,
+        spacing=float(cell),
+        min_images=_FEWEST_IMAGES,
+        max_sigma=0.0,
+        wide_tracks=0,
+    )
+    seen, image = seen_in(
+        select_tracks(keep_frames(tracks, placed.frames[own]), spread), placed.frames[own]
+    )
+    if len(image) == 0:
+        return {}
+    # What drifts a little has a point all the same, and so has what moves slowly.
+    how = TriangulateOptions(
+        max_reprojection_error=float(cell), min_angle=0.0, max_depth_error=None, points="survey"
+    )
+    points = triangulate_tracks(
+        *(seen, image, [view.camera for view in views]),
+        *([view.cam_from_world for view in views], None),
+        options=how,
+        num_threads=run.options.match.run.num_threads,
+        progress=no_progress,
+    )
+    cells = moving_cells(place_tracks(seen, image, points, views, cell=cell), views)
+    return {
+        own_image.name: mask_of_cells(moving, cell, size)
+        for own_image, moving in zip(images, cells, strict=True)
+        if moving.any()
+    }

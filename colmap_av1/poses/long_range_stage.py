@@ -1,0 +1,83 @@
+"""The stage of `reconstruct` that holds what pictures far apart in time show against the poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.track_points import seen_in
+from colmap_av1.images.takes import Takes
+from colmap_av1.poses.long_range import FarViewCheck, FarViews
+from colmap_av1.poses.reconstruct_poses import (
+    FOR_POSES,
+    PosedImages,
+    read_posed_images,
+    triangulate_in,
+)
+from colmap_av1.poses.reconstruct_tracks import Run, pose_tracks
+from colmap_av1.tracks.tracks import Tracks, every_nth_track
+from colmap_av1.util.stages import Kept, run_stage
+
+# Tracks at most whose points tell which images see the same; short ones are left out.
+_NUM_TRACKS = 10_000
+
+
+def far_view_stage(
+    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], posed: Kept, *, linked: bool
+) -> Kept:
+    """Compare a few pictures that lie far apart in time, and by the poses show the same.
+
+    Args:
+        run: what every stage is given.
+        tracks: the tracks of all takes.
+        takes: the images.
+        moving: by the names of images, masks that leave out what moves.
+        posed: the stage that holds the poses.
+        linked: pictures of places seen again have been matched.
+    """
+
+    def make(_: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, takes)
+        far = _compared(run, tracks, takes, moving, placed)
+        return {
+            "far_views": far.median,
+            "far_views_largest": far.largest,
+            "far_views_warning": far.warning(linked=linked),
+            "apart": far.are_apart,
+        }
+
+    return run_stage(
+        run.stages, "far_views", [posed.digest, linked], into=run.stages, products=[], make=make
+    )
+
+
+def _compared(
+    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], placed: PosedImages
+) -> FarViews:
+    with run.clock.measure("far views"):
+        points_of = _points_by_image(run, tracks, placed)
+        check = FarViewCheck(placed.images, placed.cameras, points_of.__getitem__)
+        masks = placed.masks_with(moving)
+        places = np.searchsorted(takes.images.frames, placed.frames[check.wanted]).tolist()
+        index_of = dict(zip(places, check.wanted, strict=True))
+        for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
+            index = index_of[place]
+            check.add(index, picture, masks[index])
+            run.progress("far views", done, len(places))
+        return check.result()
+
+
+def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDArray[np.float64]]:
+    """Float64 [n, 3] positions of some points that each image sees."""
+    some = every_nth_track(tracks, max(1, (len(tracks.offsets) - 1) // _NUM_TRACKS))
+    seen, view = seen_in(pose_tracks(run, some), placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=FOR_POSES)
+    xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
+    order = np.argsort(view[points.observation], kind="stable")
+    bounds = np.searchsorted(view[points.observation][order], np.arange(1, len(placed.images)))
+    return np.split(xyz[order], bounds)

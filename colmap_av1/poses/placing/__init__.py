@@ -1,0 +1,1 @@
+"""Where a model lies in the world: scale, up, origin."""

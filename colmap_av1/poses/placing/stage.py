@@ -1,0 +1,100 @@
+"""The stage of `reconstruct` that places the model in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.database.reading import PosePrior
+from colmap_av1.geometry.colmap_model import ModelImage, no_points, write_model
+from colmap_av1.geometry.undistortion import pinhole_camera
+from colmap_av1.images.positions import ImagePositions
+from colmap_av1.images.takes import Takes
+from colmap_av1.poses.placing.placement import (
+    PLACE_FILE,
+    Surroundings,
+    find_placement,
+    write_place,
+)
+from colmap_av1.poses.placing.up import some_spread, vertical_lines
+from colmap_av1.poses.reconstruct_poses import PosedImages, read_posed_images
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.util.stages import Kept, run_stage
+
+
+def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) -> Kept:
+    """Place the posed images where positions, gravity and a known distance say.
+
+    Args:
+        run: the run.
+        takes: the images.
+        posed: the stage with the poses.
+        positions: what is known of where the images of `takes` were taken.
+    """
+    options, seed = run.options.place, run.options.match.run.seed
+    folder = f"{run.stages.name}/in_place"
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, takes)
+        with run.clock.measure("place"):
+            # Marks are in pictures as the model's folder holds them.
+            pinholes = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
+            known = _surroundings(run, takes, placed, positions)
+            found = find_placement(placed.images, pinholes, known, options, seed)
+        write_place(partial, found)
+        (partial / folder).mkdir(parents=True)
+        poses = posed.facts["poses"]
+        if found.is_moved:
+            images = _moved_images(placed.images, found.similarity.apply_to_poses)
+            write_model(partial / folder, placed.cameras, images, no_points())
+            poses = "in_place"
+        return {"poses": poses, "place": found.facts, "place_warnings": list(found.warnings)}
+
+    return run_stage(
+        run.stages,
+        "place",
+        [posed.digest, options, positions.digest, seed],
+        into=run.output,
+        products=[PLACE_FILE, folder],
+        make=make,
+    )
+
+
+def _moved_images(images: Sequence[ModelImage], move: Any) -> list[ModelImage]:
+    """The images with their poses moved, all at once."""
+    poses = move(np.array([image.cam_from_world for image in images]))
+    return [replace(image, cam_from_world=pose) for image, pose in zip(images, poses, strict=True)]
+
+
+def _surroundings(
+    run: Run, takes: Takes, placed: PosedImages, positions: ImagePositions
+) -> Surroundings:
+    index = {name: i for i, name in enumerate(takes.images.names)}
+    own = [index[image.name] for image in placed.images]
+    places = positions.places
+    priors = {
+        takes.images.names[i]: PosePrior(places[i], is_cartesian=False)
+        for i in own
+        if np.isfinite(places[i]).all()
+    }
+
+    def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        images = dict(some_spread([*zip(own, placed.images, strict=True)]))
+        return [
+            vertical_lines(
+                picture,
+                placed.cameras[images[i].camera_id],
+                images[i].cam_from_world,
+                up,
+            )
+            for i, picture in run.pictures(takes)(sorted(images))
+        ]
+
+    gravity = positions.gravity[own]
+    has_gravity = bool(np.isfinite(gravity).any())
+    return Surroundings(priors, gravity if has_gravity else None, lines, positions.place)

@@ -1,0 +1,189 @@
+"""The stages of `reconstruct` that end in poses, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.images.takes import Takes
+from colmap_av1.poses.corners.in_images import corners_in_images
+from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
+from colmap_av1.poses.dynamic.stage import moving_stage, read_moving, without_moving
+from colmap_av1.poses.long_range_stage import far_view_stage
+from colmap_av1.poses.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
+from colmap_av1.poses.reconstruct_stages import match_stage, read_links
+from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks
+from colmap_av1.tracks.tracks import Tracks, cut_tracks, tracks_in_a_row
+from colmap_av1.util.stages import Kept, run_stage
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The stages that end in poses, and the tracks that agree with these.
+
+    Attributes:
+        stages: what each of them kept, by its name, in order.
+        tracks: the tracks of all videos, cut where motion is not believed.
+        links: links as tracks.
+        moving: by the names of images, masks that leave out what moves by itself.
+        in_place: tracks lie where the pictures show them; what a shutter's read-out has moved does
+            not.
+        far_views: the stage that held views from far apart against the poses; None: none did.
+    """
+
+    stages: dict[str, Kept]
+    tracks: Tracks
+    links: Tracks
+    moving: dict[str, Mask]
+    in_place: bool
+    far_views: Kept | None = None
+
+    @property
+    def last(self) -> Kept:
+        """The stage that holds the poses."""
+        return next(reversed(self.stages.values()))
+
+
+def mended_poses(
+    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
+) -> Posed:
+    """Estimate poses; where they do not hold together, again with links.
+
+    These take the place of motion where few points join what lies on either side of two images, and
+    connect places seen again where pictures far apart in time contradict the poses.
+    """
+    first: list[Posed] = []
+
+    def make(_: Path) -> dict[str, Any]:
+        posed = _pose_stages(run, videos, takes, tracked, doubted=())
+        first.append(posed)
+        return {
+            "doubted": _unlinked_joints(run, takes, posed.stages),
+            "apart": _are_unlinked_and_apart(run, posed),
+        }
+
+    options = run.options
+    found = run_stage(
+        run.stages,
+        "joints",
+        [
+            [t.digest for t in tracked],
+            takes.videos,
+            run.photo_digests,
+            options.match,
+            options.mapping,
+        ],
+        into=run.stages,
+        products=[],
+        make=make,
+    ).facts
+    if first and not found["doubted"] and not found["apart"]:
+        return first[0]
+    again = _with_all_links(run) if found["apart"] else run
+    return _pose_stages(again, videos, takes, tracked, doubted=found["doubted"])
+
+
+def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
+    """Whether views far apart contradict the poses, and links of such have not been looked for."""
+    assert posed.far_views is not None
+    looked = run.options.match.links.links != "auto" or _looked_again(posed.stages)
+    return bool(posed.far_views.facts["apart"]) and not looked
+
+
+def _looked_again(stages: dict[str, Kept]) -> bool:
+    """Whether places seen again have been looked for."""
+    return bool(stages["matches"].facts["links"]["looked_again"])
+
+
+def _with_all_links(run: Run) -> Run:
+    """The run with links between places seen again in any video."""
+    match = run.options.match
+    match = replace(match, links=replace(match.links, links="sift"))
+    return replace(run, options=replace(run.options, match=match))
+
+
+def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
+    """Frames after joints that hold little, and that no pictures have been matched across."""
+    if "adjustment" not in stages or run.options.match.links.links == "none":
+        return []
+    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    looked_at = stages["matches"].facts["links"]["weak_gaps"]
+    joints = [
+        (frame_of[first], frame_of[second])
+        for first, second in stages["adjustment"].facts["doubtful_joints"]
+    ]
+    return [
+        after
+        for before, after in joints
+        if not any(first <= before and after <= second for first, second in looked_at)
+    ]
+
+
+def _pose_stages(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept],
+    *,
+    doubted: Sequence[int],
+) -> Posed:
+    """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
+    matched = match_stage(run, videos, takes, tracked, doubted)
+    keyed = takes.some(matched.facts["key_images"])
+    stages = {"matches": matched, "poses": pose_stage(run, matched, takes, keyed)}
+    # Where no read-out is found nothing has been moved, whether one was looked for or not.
+    in_place = not any(stage.facts["read_out"] for stage in tracked)
+    believed = believed_tracks(run, videos, takes)
+    posed = refined_poses(run, stages, believed, takes, keyed, in_place=in_place)
+    linked = _looked_again(stages)
+    far_views = far_view_stage(run, posed.tracks, takes, posed.moving, posed.last, linked=linked)
+    return replace(posed, far_views=far_views)
+
+
+def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:
+    """The tracks of all videos, cut where motion is not believed, and the links."""
+    links, broken = read_links(run.stages)
+    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
+    return cut_tracks(tracks, broken.tolist()), links
+
+
+def refined_poses(
+    run: Run,
+    stages: dict[str, Kept],
+    believed: tuple[Tracks, Tracks],
+    takes: Takes,
+    keyed: Takes,
+    *,
+    in_place: bool,
+) -> Posed:
+    """Place what lies between the key images that a mapper placed, and adjust.
+
+    Args:
+        run: what every stage is given.
+        stages: those up to the mapper, which the further ones join.
+        believed: the tracks and links, see `believed_tracks`.
+        takes: the images.
+        keyed: those of them that were mapped.
+        in_place: see `Posed`.
+    """
+    (tracks, links), posed = believed, stages["poses"]
+    if len(keyed.take) < len(takes.take):
+        stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
+    moving: dict[str, Mask] = {}
+    if run.options.moving != "keep":
+        stages["moving"] = moving_stage(run, tracks, takes, posed)
+        moving = read_moving(run.stages)
+    tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
+    if run.options.mapping.adjust:
+        follows = in_place and (bool(moving) or has_moving_masks(takes))
+        stages["adjustment"] = adjustment_stage(
+            *(run, tracks, links, takes, posed),
+            moved=stages["moving"] if moving else None,
+            follow=partial(follow_behind, run, moving) if follows else None,
+            corners=partial(corners_in_images, run, moving) if in_place else None,
+        )
+    return Posed(stages, tracks, links, moving, in_place)

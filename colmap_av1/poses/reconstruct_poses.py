@@ -1,0 +1,450 @@
+"""The stages of `reconstruct` that estimate poses: COLMAP's mapper, then bundle adjustment."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import (
+    ModelImage,
+    ModelPoints,
+    joined_points,
+    no_points,
+    posed_images,
+    read_model,
+    write_model,
+)
+from colmap_av1.geometry.masks import Mask, joined_masks
+from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
+from colmap_av1.geometry.track_points import seen_in, to_model_points, triangulate_tracks
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.images.takes import Takes
+from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
+from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
+from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
+from colmap_av1.poses.seams import model_joints
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import (
+    Tracks,
+    every_nth_track,
+    join_tracks,
+    keep_frames,
+    keep_tracks_of,
+    shorter_tracks,
+)
+from colmap_av1.util.progress import Progress, no_progress, progress_in
+from colmap_av1.util.stages import Kept, run_stage
+
+# Of an image, below which a mapper that finds no start may lack them.
+_FEW_TRACKS = 100
+# Tracks of an image that the global mapper starts from, the longest ones, and share of the error
+# that steps lower or end, where an adjustment follows: half the time of 200, to the same poses. But
+# what links videos or images is short, and all of it needed; revisits make long tracks longer.
+_START_TRACKS = 100
+_TOLERANCE = 1e-4
+# Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
+# of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
+# end of a video, say, the mapper may leave images that are off by more with all they see.
+_ADJUSTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
+)
+_LOSS_SCALES = (1.0, 0.25)
+# Beside corners, one in so many of them: each is less exact, and all may be off one way. They
+# drift, by three times as much over twenty images as over three, and bend what corners hold
+# straight: so they are cut to pieces of so many images.
+_BESIDE = 2
+_MOST_BESIDE = 8
+# Tracks that images between key images are placed by, and views of these that make their points.
+_RESECTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
+)
+_FEWEST_VIEWS = 3
+# Poses follow from rays, however uncertain the points are that these meet in.
+FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
+# Beside corners, which say where an image is, motion that is off by more tells nothing. A corner is
+# where the picture shows it, and where a shutter bends this, all of it is to count; a link, too:
+# where poses do not hold together it is as far off as they are.
+_BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
+FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
+
+
+def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
+    """Estimate the poses of the key images, some of all, by COLMAP's mapper."""
+    options, clock, progress = run.options, run.clock, run.progress
+    mapping = options.mapping
+    forward = bool(matched.facts["forward_motion"])
+    mapper = mapping.mapper
+    if mapper == "auto":
+        mapper = "incremental" if matched.facts["guessed"] else "global"
+    links = matched.facts["links"]
+    hangs = links["num_between"] or links["broken_gaps"] or links["doubtful_gaps"]
+    start_tracks = None if hangs else _START_TRACKS
+    tolerance = _TOLERANCE if mapping.adjust and not hangs else None
+    how = MapOptions(
+        mapper=mapper,
+        forward_motion=forward and mapper == "incremental",
+        refine_intrinsics=_refines_intrinsics(options),
+        seed=options.match.run.seed,
+        num_threads=mapping.mapper_threads,
+    )
+
+    def make(partial: Path) -> dict[str, Any]:
+        with clock.measure("poses"):
+            # pycolmap brings a database to its own layout.
+            copy = partial / "mapped.db"
+            shutil.copyfile(run.output / "database.db", copy)
+            sizes = map_poses(
+                copy,
+                partial / "poses",
+                how,
+                image_path=None,
+                log=run.stages / "mapper.log",
+                num_images=len(keyed.images.names),
+                progress=progress,
+                start_tracks=start_tracks,
+                tolerance=tolerance,
+            )
+        if max(sizes, default=0) < LEAST_IMAGES:
+            raise ModelError(_why_no_start(matched.facts, mapper))
+        found = [k for k, size in enumerate(sizes) if size >= LEAST_IMAGES]
+        first, *others = _largest_first([partial / "poses" / str(k) for k in found], takes, keyed)
+        return {
+            "num_registered": sizes[int(first.name)],
+            "other_models": [f"poses/{model.name}" for model in others],
+            "mapper": mapper,
+            "poses": f"poses/{first.name}",
+            "registered": _registered(first, keyed),
+        }
+
+    return run_stage(
+        run.stages,
+        "poses",
+        [matched.digest, how, start_tracks, tolerance, pycolmap.__version__],
+        into=run.stages,
+        products=["poses"],
+        make=make,
+    )
+
+
+def _largest_first(models: list[Path], takes: Takes, keyed: Takes) -> list[Path]:
+    """The folders of models by how many images, key images or between these, they stand for."""
+    if len(models) < 2:
+        return models
+    key = keyed.images.frames
+    nearest = np.searchsorted((key[1:] + key[:-1]) / 2, takes.images.frames)
+    stands_for = np.bincount(nearest, minlength=len(key))
+    posed = [posed_images(read_model(model)) for model in models]
+    size = [
+        sum(
+            int(count)
+            for name, count in zip(keyed.images.names, stands_for, strict=True)
+            if name in images
+        )
+        for images in posed
+    ]
+    return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
+
+
+def _registered(model: Path, takes: Takes) -> dict[str, int]:
+    """Images with a pose of each of several videos, by its name."""
+    if len(takes.videos) == 1:
+        return {}
+    posed = posed_images(read_model(model))
+    return {
+        name: sum(image in posed for image in takes.of_video(video).names)
+        for video, name in enumerate(takes.videos)
+    }
+
+
+def _refines_intrinsics(options: ReconstructOptions) -> bool:
+    if options.mapping.refine_intrinsics is not None:
+        return options.mapping.refine_intrinsics
+    return options.match.camera.camera_params is None
+
+
+def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
+    """Why a mapper found no initial pair, and what to try."""
+    no_start = f"COLMAP's {mapper} mapper finds no initial pair"
+    other = "incremental" if mapper == "global" else "global"
+    most_agree = facts["num_verified_pairs"] >= facts["num_pairs"] / 2
+    if most_agree and facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
+        return (
+            f"{no_start}: too little parallax, in {facts['num_flat_pairs']} of "
+            f"{facts['num_verified_pairs']} pairs the camera only rotates or the scene is flat: "
+            "film while moving sideways, or give a longer part of the video"
+        )
+    if not most_agree or facts["keypoints_per_image"] < _FEW_TRACKS:
+        return (
+            f"{no_start}: too few tracks, {facts['keypoints_per_image']:.0f} an image and "
+            f"{facts['num_verified_pairs']} of {facts['num_pairs']} pairs that agree with a rigid "
+            "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
+        )
+    if facts["guessed"]:
+        return (
+            f"{no_start}: the focal length is a guess and may be far off, or the parallax too "
+            "little, as where the camera moves along its axis: "
+            f"give --camera_model and --camera_params, or try --mapper {other}"
+        )
+    return (
+        f"{no_start}: the parallax between images that share tracks is too little, or the "
+        f"intrinsics do not fit: give --camera_model and --camera_params, or try --mapper {other}"
+    )
+
+
+def resection_stage(run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed: Kept) -> Kept:
+    """Place the images between the key images by the points of tracks that they see."""
+
+    def make(partial: Path) -> dict[str, Any]:
+        known = read_posed_images(run, posed, keyed)
+        with run.clock.measure("resection"):
+            placed = _resect(run, tracks, takes, known)
+        folder = partial / "placed"
+        folder.mkdir()
+        write_model(folder, known.cameras, placed, no_points())
+        facts = {"poses": "placed", "num_registered": len(placed)}
+        return facts | {"registered": _registered(folder, takes)}
+
+    return run_stage(
+        run.stages,
+        "resection",
+        [posed.digest, _RESECTED, run.options.match.run.seed],
+        into=run.stages,
+        products=["placed"],
+        make=make,
+    )
+
+
+def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[ModelImage]:
+    """The images that have a pose, and those between them that get one; see `resection_stage`."""
+    run_options = run.options.match.run
+    seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
+    spread = select_tracks(keep_frames(seen_thrice, takes.images.frames), _RESECTED)
+    seen, view = seen_in(spread, known.frames)
+    points = triangulate_in(run, known, seen, view, options=FOR_POSES)
+    check_agreement(len(points.xyz), points.num_tracks)
+    pose_of = {
+        frame: (image.camera_id, image.cam_from_world)
+        for frame, image in zip(known.frames.tolist(), known.images, strict=True)
+    }
+    for video in sorted({int(take) for take in known.take if take < len(takes.videos)}):
+        own = np.flatnonzero(known.take == video)
+        frames = known.frames[own]
+        images = takes.images_of(video)
+        left = np.setdiff1d(takes.images.frames[images.start : images.stop], frames)
+        if len(left) == 0:
+            continue
+        camera_id = known.images[own[0]].camera_id
+        camera = known.cameras[camera_id]
+        guesses = interpolate_poses(
+            np.array([known.images[i].cam_from_world for i in own]), frames, left
+        )
+        found = resect(
+            sightings_of(points, seen, spread, left, camera),
+            guesses,
+            float(camera.mean_focal_length()),
+            seed=run_options.seed,
+            num_threads=run_options.num_threads,
+            progress=progress_in(run.progress, "resection", len(left)),
+        )
+        pose_of |= {
+            frame: (camera_id, pose)
+            for frame, pose in zip(left.tolist(), found, strict=True)
+            if pose is not None
+        }
+    return [
+        ModelImage(i + 1, name, *pose_of[frame])
+        for i, (name, frame) in enumerate(
+            zip(takes.images.names, takes.images.frames.tolist(), strict=True)
+        )
+        if frame in pose_of
+    ]
+
+
+def adjustment_stage(
+    run: Run,
+    tracks: Tracks,
+    links: Tracks,
+    takes: Takes,
+    posed: Kept,
+    *,
+    moved: Kept | None = None,
+    follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
+    corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
+) -> Kept:
+    """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
+
+    Links take part whole: without them places seen again would drift apart once more. Corners of
+    the pictures say where an image is whose motion misleads, as where the camera jerks.
+
+    The mapper's own adjustments have no robust loss, and drop what drifts.
+
+    Args:
+        run: what every stage is given.
+        tracks: the tracks of all takes.
+        links: links as tracks.
+        takes: the images.
+        posed: the stage that left the poses.
+        moved: the stage that found what moves, where tracks and links are without it.
+        follow: corrects the chosen tracks in the images that have a pose.
+        corners: looks for corners of these images' pictures, which take part whole, and corrects
+            poses that these contradict.
+    """
+    options = run.options
+    refine = _refines_intrinsics(options)
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, takes)
+        # The long tracks of all images are several times as large as those chosen: they go at once.
+        spread = select_tracks(keep_frames(pose_tracks(run, tracks), placed.frames), _ADJUSTED)
+        if follow is not None:
+            with run.clock.measure("refinement"):
+                spread = follow(spread, placed)
+        linked = keep_frames(links, placed.frames)
+        sets = [(join_tracks(spread, linked), FOR_POSES)]
+        if corners is not None:
+            with run.clock.measure("refinement"):
+                followed, placed = corners(join_tracks(spread, linked), placed)
+            few = shorter_tracks(every_nth_track(spread, _BESIDE), _MOST_BESIDE)
+            sets = [(few, _BESIDE_CORNERS), (join_tracks(linked, followed), FROM_PICTURES)]
+        with run.clock.measure("adjustment"):
+            folder = partial / "adjusted"
+            folder.mkdir()
+            num_points = _write_black_points(run, folder, placed, sets)
+            check_agreement(num_points, len(spread.offsets) - 1)
+            run.progress("adjustment", 0, 1)
+            adjust_model(
+                folder,
+                refine_intrinsics=refine,
+                loss_scales=_LOSS_SCALES,
+                seed=options.match.run.seed,
+                num_threads=options.mapping.mapper_threads,
+                log=run.stages / "adjustment.log",
+            )
+            run.progress("adjustment", 1, 1)
+        adjusted = without_unseen_images(folder)
+        joints = model_joints(adjusted)
+        return {
+            "poses": "adjusted",
+            "num_registered": adjusted.num_reg_images(),
+            "registered": _registered(folder, takes),
+            "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
+            "joints_warning": joints.warning,
+        }
+
+    how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
+    kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
+    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALES, FEW_SEEN, refine, *how)
+    return run_stage(
+        run.stages,
+        "adjustment",
+        [posed.digest, given, moved.digest if moved is not None else None],
+        into=run.stages,
+        products=["adjusted"],
+        make=make,
+    )
+
+
+def _write_black_points(
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    sets: Sequence[tuple[Tracks, TriangulateOptions]],
+) -> int:
+    """Write a model of the images and of points of sets of tracks; returns how many points."""
+    points = joined_points([_black_points(run, placed, *own) for own in sets])
+    write_model(folder, placed.cameras, placed.images, points)
+    return len(points.xyz)
+
+
+def _black_points(
+    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+) -> ModelPoints:
+    """Points of tracks in the images that have a pose, without colours."""
+    seen, view = seen_in(tracks, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=options)
+    return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The images that have a pose.
+
+    Attributes:
+        images: the images, in the order of their frames.
+        frames: int32 [n] their frames, counted through all takes.
+        take: int32 [n] their takes.
+        first_frame: frame at which each take begins, see `Takes`.
+        cameras: their pycolmap.Cameras, by id.
+        masks: of each, which of its pixels count; None: all.
+    """
+
+    images: list[ModelImage]
+    frames: NDArray[np.int32]
+    take: NDArray[np.int32]
+    first_frame: NDArray[np.int64]
+    cameras: dict[int, Any]
+    masks: tuple[Mask | None, ...]
+
+    @property
+    def camera_of_image(self) -> list[Any]:
+        """The camera of each image."""
+        return [self.cameras[image.camera_id] for image in self.images]
+
+    def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
+        """The mask of each image, joined with another of its name where there is one."""
+        return [
+            joined_masks(mask, others.get(image.name))
+            for mask, image in zip(self.masks, self.images, strict=True)
+        ]
+
+
+def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
+    """The images with the poses that a stage left."""
+    poses = read_model(run.stages / posed.facts["poses"])
+    posed_by_name = posed_images(poses)
+    names = takes.images.names
+    index = [i for i, name in enumerate(names) if name in posed_by_name]
+    found = [posed_by_name[names[i]] for i in index]
+    cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
+    images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
+    own = takes.some(index)
+    return PosedImages(images, own.images.frames, own.take, own.first_frame, cameras, own.masks)
+
+
+def triangulate_in(
+    run: Run,
+    placed: PosedImages,
+    seen: Tracks,
+    view: NDArray[np.int64],
+    *,
+    options: TriangulateOptions,
+    pinholes: Sequence[Any] | None = None,
+    rays: NDArray[np.float64] | None = None,
+    progress: Progress = no_progress,
+) -> TriangulatedPoints:
+    """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
+    return triangulate_tracks(
+        *(seen, view, placed.camera_of_image),
+        *([image.cam_from_world for image in placed.images], pinholes),
+        options=options,
+        num_threads=run.options.match.run.num_threads,
+        progress=progress,
+        rays=rays,
+    )
+
+
+def check_agreement(num_points: int, num_tracks: int) -> None:
+    """Refuse poses that no track agrees with."""
+    if num_points == 0:
+        raise ModelError(
+            f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
+            "give --camera_params"
+        )

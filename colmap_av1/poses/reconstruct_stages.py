@@ -1,0 +1,230 @@
+"""The second stage of `reconstruct`: a database of the images matched along their tracks.
+
+Each stage leaves what the next one, and a later run, resume from.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
+
+from colmap_av1.database.writing import write_matched_images
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.image_matches import (
+    MatchedImages,
+    NewCameras,
+    PairedImages,
+    new_cameras,
+    pair_images,
+    pairs_of_takes,
+    shape_of,
+    verify_images,
+)
+from colmap_av1.matching.links import LinkedImages, link_images
+from colmap_av1.matching.two_view_geometry import TwoViewConfig
+from colmap_av1.matching.weak_gaps import may_link
+from colmap_av1.options import DensityOptions
+from colmap_av1.poses.reconstruct_tracks import (
+    Run,
+    VideoTracks,
+    key_images_of_video,
+    pose_tracks,
+    tracks_of,
+)
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.util.stages import Kept, run_stage
+
+_LINKS = "links.npz"
+
+
+def _write_links(folder: Path, linked: LinkedImages) -> None:
+    folder.mkdir()
+    broken = np.array([before for before, _ in linked.report.broken_gaps], np.int32)
+    with (folder / _LINKS).open("wb") as file:
+        np.savez(file, **vars(linked.tracks), broken=broken)
+
+
+def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
+    """The links as tracks, and the frames before the gaps that no other track crosses."""
+    with np.load(stages / _LINKS) as file:
+        return tracks_of(file), file["broken"]
+
+
+def match_stage(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept],
+    doubted: Sequence[int],
+) -> Kept:
+    """Write the database of the tracks that the poses come from, and of links.
+
+    Args:
+        run: what every stage is given.
+        videos: the tracks of each video.
+        takes: the images.
+        tracked: what `track_stage` kept of each video.
+        doubted: frames, counted through the videos, whose motion is not to be trusted.
+    """
+    options, clock = run.options, run.clock
+    mapping = options.mapping
+    videos = [
+        own.doubted_at([f - first for f in doubted if 0 <= f - first < own.tracks.num_frames])
+        for own, first in zip(videos, takes.first_frame.tolist(), strict=False)
+    ]
+    density = _pose_density(run)
+
+    def make(partial: Path) -> dict[str, Any]:
+        with clock.measure("pairs"):
+            index = _key_images(run, videos, takes)
+        keyed = takes.some(index)
+        paired = _paired_images(run, videos, keyed)
+        made = _cameras(run, videos, takes, index, paired)
+        cameras = made.of_images
+        apart = len(takes.take) / len(keyed.take)
+        linked = _match_images(run, videos, paired, cameras, keyed, images_apart=apart)
+        matched = linked.matched
+        with clock.measure("database"):
+            write_matched_images(
+                *(partial / "database.db", keyed.images.names, cameras, matched),
+                places=run.positions.places[index] if run.positions is not None else None,
+            )
+        _write_links(partial / run.stages.name, linked)
+        of_videos = cameras[: keyed.images_of(len(videos)).start]
+        return {
+            "links": dataclasses.asdict(linked.report),
+            "link_warnings": [*made.warnings, *linked.report.warnings],
+            "key_images": index,
+            "num_key_images": len(index),
+            "num_pose_tracks": len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
+            "guessed": not all(camera.has_prior_focal_length for camera in of_videos),
+            **_pair_facts(matched),
+        }
+
+    match = options.match
+    given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
+    return run_stage(
+        run.stages,
+        "matches",
+        [
+            [t.digest for t in tracked],
+            *(takes.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
+            run.positions.digest if run.positions is not None else None,
+        ],
+        into=run.output,
+        products=["database.db", f"{run.stages.name}/{_LINKS}"],
+        make=make,
+    )
+
+
+def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[int]:
+    """The images that are mapped, by their index: all, where key images are not wanted.
+
+    Photos are key images: no track says where they are.
+    """
+    if not run.options.mapping.key_images:
+        return list(range(len(takes.take)))
+    index: list[int] = []
+    for video, own in enumerate(videos):
+        frames = own.chosen.frames
+        tracks = keep_frames(pose_tracks(run, own.tracks), frames)
+        found = key_images_of_video(run, tracks, own.chosen, own.inter_share)
+        index += (found + takes.images_of(video).start).tolist()
+    return index + list(range(takes.images_of(len(videos)).start, len(takes.take)))
+
+
+def _pose_density(run: Run) -> DensityOptions:
+    """Which tracks the poses come from."""
+    mapping = run.options.mapping
+    return DensityOptions(
+        preset="sparse",
+        max_tracks_per_image=mapping.pose_tracks_per_image,
+        spacing=mapping.pose_spacing,
+    )
+
+
+def _paired_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> PairedImages:
+    """Some images of all takes, matched along a spread selection of tracks for poses."""
+    options, density = run.options.match, _pose_density(run)
+    paired = []
+    for video, own in enumerate(videos):
+        chosen = takes.of_video(video)
+        with run.clock.measure("pairs"):
+            sparse = select_tracks(
+                keep_frames(pose_tracks(run, own.tracks), chosen.frames), density
+            )
+        linked_anyway = may_link(own.inter_share, chosen.frames, sparse, options)
+        paired.append(
+            pair_images(
+                *(run.sources[video].pictures.path, sparse, chosen, options),
+                needed=takes.num_takes == 1 and not linked_anyway,
+                clock=run.clock,
+                progress=run.progress,
+            )
+        )
+    return pairs_of_takes(paired, takes)
+
+
+def _cameras(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    index: Sequence[int],
+    paired: PairedImages,
+) -> NewCameras:
+    """The cameras of the key images, that are some of all images.
+
+    What is estimated comes from all images: a few that lie far apart mislead.
+    """
+    options, photos = run.options.match, run.inputs.photos
+    opened = [source.pictures for source in run.sources]
+    shapes = [shape_of(v, v.picture_size, v.display.pixel_aspect) for v in opened]
+    if options.camera.camera_params is not None or len(index) == len(takes.take):
+        keyed = takes.some(index)
+        return new_cameras(paired, keyed, shapes, photos, options, clock=run.clock)
+    every = _paired_images(run, videos, takes)
+    made = new_cameras(every, takes, shapes, photos, options, clock=run.clock)
+    return replace(made, of_images=[made.of_images[i] for i in index])
+
+
+def _match_images(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    paired: PairedImages,
+    cameras: Sequence[Any],
+    takes: Takes,
+    *,
+    images_apart: float,
+) -> LinkedImages:
+    """The images matched along some tracks of each video and by links."""
+    options, clock, progress = run.options.match, run.clock, run.progress
+    matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
+    shares = [own.inter_share for own in videos]
+    return link_images(
+        *(takes, matched, cameras, np.concatenate([*shares, run.inputs.no_motion])),
+        run.pictures(takes),
+        name=run.inputs.name,
+        images_apart=images_apart,
+        options=options,
+        clock=clock,
+        progress=progress,
+    )
+
+
+def _pair_facts(matched: MatchedImages) -> dict[str, Any]:
+    """Facts of the pairs that explain why a mapper finds no initial pair."""
+    configs = [geometry.config for geometry in matched.geometries]
+    return {
+        "forward_motion": matched.forward_motion,
+        "num_pairs": len(configs),
+        "num_flat_pairs": configs.count(TwoViewConfig.PLANAR_OR_PANORAMIC),
+        "num_verified_pairs": len(configs) - configs.count(TwoViewConfig.DEGENERATE),
+        "keypoints_per_image": sum(len(k.xy) for k in matched.keypoints) / len(matched.keypoints),
+    }

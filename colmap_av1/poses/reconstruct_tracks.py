@@ -1,0 +1,333 @@
+"""The first stage of `reconstruct`: tracks of each video, and which of its frames are images."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.geometry.coverage import evenly_spread
+from colmap_av1.geometry.track_points import chaining_for_points
+from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.inputs import Inputs
+from colmap_av1.images.key_images import key_images, spread_images
+from colmap_av1.images.names import image_names
+from colmap_av1.images.positions import ImagePositions
+from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
+from colmap_av1.matching.link_plan import images_to_link
+from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
+from colmap_av1.options import (
+    MatchOptions,
+    ReconstructOptions,
+    RefineOptions,
+)
+from colmap_av1.tracks.tracks import (
+    Tracks,
+    every_nth_track,
+    in_frames_alone,
+    keep_frames,
+    keep_long_tracks,
+    least_length,
+)
+from colmap_av1.tracks.video_tracks import (
+    TrackedVideo,
+    VideoSource,
+    count_frames,
+    decoded_pictures,
+    refine_in_images,
+    times_of_frames,
+    track_video,
+)
+from colmap_av1.util.digests import digest_if_there, file_digest
+from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.stages import Kept, run_stage
+from colmap_av1.video.unchanged import FileState, check_unchanged
+
+# A mapper may leave a bogus model of two images where it finds no start.
+LEAST_IMAGES = 3
+# Frames that the images of a long video are chosen among, to one of these.
+_CANDIDATES = 2
+# Observations that are held of them at most, and the pixels that one of these may be there for.
+_MOST_HELD = 24_000_000
+_PIXELS_OF_UNIT = 16
+# They are chosen by one in so many tracks, or by those of squares of so many pixels: a quarter of
+# those that poses come from.
+_FEWER = 4
+_SEEDING = 8
+# Of its images, that see a track at least.
+_FEWEST_SEEN = 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """What every stage is given.
+
+    Attributes:
+        inputs: the videos and photos.
+        sources: for each video, where its motion and pictures come from.
+        output: the folder that is made.
+        stages: the folder in it that holds what later runs resume from.
+        options: options of every stage.
+        clock: gets the time of each stage.
+        progress: called in each stage.
+        positions: where the images were taken; None before these are chosen.
+    """
+
+    inputs: Inputs
+    sources: tuple[VideoSource, ...]
+    output: Path
+    stages: Path
+    options: ReconstructOptions
+    clock: Clock
+    progress: Progress
+    positions: ImagePositions | None = None
+
+    @property
+    def files(self) -> tuple[FileState, ...]:
+        """All files as they were at the start."""
+        photos = [photo.state for photo in self.inputs.photos]
+        return (*(file for source in self.sources for file in source.files), *photos)
+
+    @property
+    def photo_digests(self) -> list[list[str]]:
+        """Name and digest of each photo, which stages depend on."""
+        return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
+
+    def pictures(self, takes: Takes) -> Pictures:
+        """What gives the pictures of images, see `pictures_of`."""
+        videos = [ShownVideo(own.pictures, kept=own.kept) for own in self.sources]
+        photos = [photo.path for photo in self.inputs.photos]
+        return pictures_of(takes, videos, photos, self.options.match)
+
+
+@dataclass(frozen=True)
+class VideoTracks:
+    """What `track_stage` keeps of a video.
+
+    Attributes:
+        tracks: its tracks.
+        chosen: the frames that are images.
+        inter_share: see `TrackedVideo`.
+    """
+
+    tracks: Tracks
+    chosen: ChosenImages
+    inter_share: NDArray[np.float32]
+
+    def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
+        """The same, but for frames whose motion is not to be trusted, whatever the stream says."""
+        share = self.inter_share.copy()
+        share[list(frames)] = 0.0
+        return replace(self, inter_share=share)
+
+
+def stage_of_video(run: Run, video: int) -> str:
+    """Name of the stage that makes the tracks of a video."""
+    label = run.inputs.labels[video]
+    return f"tracks_{label}" if label else "tracks"
+
+
+def track_stage(run: Run, video: int) -> Kept:
+    """Chain the motion of a video into tracks and choose the frames that are images."""
+    source, clock = run.sources[video], run.clock
+    options = chaining_for_points(
+        run.options.match, run.options.triangulate, is_downscaled=source.is_downscaled
+    )
+    name, shown = stage_of_video(run, video), source.pictures
+
+    def make(partial: Path) -> dict[str, Any]:
+        tracked, chosen, is_long = _track_and_choose(run, video, options, partial)
+        tracks, read_out = without_shutter(
+            tracked.tracks, shown.display, shown.frame_rate, options, clock
+        )
+        # Of a long video no other frame is of use from here on.
+        tracks = keep_frames(tracks, chosen.frames) if is_long else tracks
+        _check_chosen(run, chosen, tracks.num_frames)
+        _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
+        check_unchanged(*source.files)
+        return {
+            "num_frames": tracks.num_frames,
+            "num_tracks": len(tracks.offsets) - 1,
+            "read_out": read_out,
+            "warnings": list(tracked.warnings),
+        }
+
+    mapping = run.options.mapping
+    choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
+    shutter = shutter_settings(options.camera)
+    given = (options.images, choice, options.read, options.tracks, options.refine, shutter)
+    listed = digest_if_there(options.images.frame_list)
+    masked = run.inputs.masks.digest if run.inputs.masks is not None else None
+    return run_stage(
+        run.stages,
+        name,
+        [[file_digest(file.path) for file in source.files], given, listed, masked],
+        into=run.stages,
+        products=[f"{name}.npz"],
+        make=make,
+    )
+
+
+def _track_and_choose(
+    run: Run, video: int, options: MatchOptions, folder: Path
+) -> tuple[TrackedVideo, ChosenImages, bool]:
+    """Chain the motion of a video into tracks, and choose its images.
+
+    Returns:
+        The tracks, the images, and whether the video is long.
+    """
+    source, clock, progress = run.sources[video], run.clock, run.progress
+    is_long = not options.images.ways and count_frames(source) > run.options.max_images
+    if is_long:
+        tracked, chosen = _track_long(run, video, options)
+    else:
+        tracked = _track(run, video, options, frames=None, clock=clock)
+        with clock.measure("choice"):
+            chosen = choose_images(
+                pose_tracks(run, tracked.tracks),
+                options.images,
+                existing=(),
+                folder=folder,
+                times=lambda: times_of_frames(source, tracked.tracks.num_frames),
+                decode=lambda: decoded_pictures(source, options),
+            )
+    tracked = refine_in_images(
+        tracked, source, chosen.frames, options, clock=clock, progress=progress
+    )
+    masks = run.inputs.masks_of_videos[video]
+    if masks is not None:
+        all_there = not is_long or _has_shutter(options)
+        least = least_length(options.tracks) if all_there else _FEWEST_SEEN
+        left = masks.on_tracks(tracked.tracks, chosen, least)
+        tracked = replace(tracked, tracks=left)
+    return tracked, chosen, is_long
+
+
+def _has_shutter(options: MatchOptions) -> bool:
+    """Whether the shutter is to be corrected, by the motion between all neighbouring frames."""
+    return options.camera.rolling_shutter != "none"
+
+
+def _track(
+    run: Run, video: int, options: MatchOptions, *, frames: NDArray[np.int32] | None, clock: Clock
+) -> TrackedVideo:
+    """The tracks of a video where masks of frames leave them, see `track_video`."""
+    tracked = track_video(
+        run.sources[video],
+        options,
+        one_size=True,
+        frames=frames,
+        clock=clock,
+        progress=run.progress,
+    )
+    masks = run.inputs.masks_of_videos[video]
+    if masks is None:
+        return tracked
+    least = least_length(options.tracks) if frames is None else _FEWEST_SEEN
+    left = masks.on_frames(tracked.tracks, least)
+    return replace(tracked, tracks=left, inter_share=masks.on_motion(tracked.inter_share))
+
+
+def _track_long(run: Run, video: int, options: MatchOptions) -> tuple[TrackedVideo, ChosenImages]:
+    """The tracks of a video with more frames than a trainer wants, in so many images alone.
+
+    These are chosen among frames that lie evenly. Where the tracks of all of these are too much to
+    be held, the motion is read once for the choice alone, by few tracks, and then again; so too
+    where the shutter is to be corrected or tracks are refined, which takes other frames.
+    """
+    source, clock = run.sources[video], run.clock
+    count = count_frames(source)
+    most = min(count, _CANDIDATES * run.options.max_images)
+    candidates = np.array(evenly_spread(count, most), dtype=np.int32)
+    width, height = source.stream.picture_size
+    held = len(candidates) * width * height / _PIXELS_OF_UNIT
+    is_plain = options.refine.refine == "none" and not _has_shutter(options)
+    if is_plain and held <= _MOST_HELD:
+        tracked = _track(run, video, options, frames=candidates, clock=clock)
+        with clock.measure("choice"):
+            few = every_nth_track(tracked.tracks, _FEWER)
+            chosen = _spread_in(run, video, replace(tracked, tracks=few), candidates)
+            tracks = keep_frames(tracked.tracks, chosen.frames)
+            return replace(tracked, tracks=keep_long_tracks(tracks, _FEWEST_SEEN)), chosen
+    with clock.measure("choice"):
+        sketch = replace(
+            run.options.match,
+            tracks=replace(run.options.match.tracks, seeding=_SEEDING),
+            refine=RefineOptions(),
+        )
+        tracked = _track(run, video, sketch, frames=candidates, clock=Clock())
+        chosen = _spread_in(run, video, tracked, candidates)
+    frames = None if _has_shutter(options) else chosen.frames
+    return _track(run, video, options, frames=frames, clock=clock), chosen
+
+
+def _spread_in(
+    run: Run, video: int, tracked: TrackedVideo, candidates: NDArray[np.int32]
+) -> ChosenImages:
+    """As many images as a trainer wants among some frames of a video, its key images with them."""
+    tracks = tracked.tracks
+    candidates = candidates[candidates < tracks.num_frames]
+    names = image_names(run.options.match.images.image_name, candidates.tolist())
+    every = ChosenImages(names, candidates)
+    key = key_images_of_video(run, tracks, every, tracked.inter_share)
+    most = min(run.options.max_images, len(candidates))
+    return every.some(spread_images(in_frames_alone(tracks, candidates), most, key))
+
+
+def key_images_of_video(
+    run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """The key images among some images of a video, by their index."""
+    mapping = run.options.mapping
+    return key_images(
+        tracks,
+        chosen.frames,
+        images_to_link(inter_share, chosen.frames, run.options.match.links),
+        spacing=mapping.pose_spacing,
+        num_cells=mapping.pose_tracks_per_image,
+    )
+
+
+def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
+    """Refuse images of a video that are too few for a model, or have names unfit for trainers."""
+    if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
+        raise ImageError(
+            f"{len(chosen.names)} of {num_frames} frames become images: a model needs "
+            f"{LEAST_IMAGES} or more"
+        )
+    unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
+    if unfit is not None:
+        raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
+
+
+def _write_tracks(path: Path, own: VideoTracks) -> None:
+    with path.open("wb") as file:
+        # Names are kept by np.savez as they are.
+        names, frames = np.array(own.chosen.names), own.chosen.frames
+        np.savez(file, **vars(own.tracks), names=names, frames=frames, inter_share=own.inter_share)
+
+
+def read_tracks(run: Run, video: int) -> VideoTracks:
+    """The tracks, images and shares of inter units that `track_stage` kept of a video."""
+    with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
+        chosen = ChosenImages([str(name) for name in file["names"]], file["frames"])
+        return VideoTracks(tracks_of(file), chosen, file["inter_share"])
+
+
+def tracks_of(file: Any) -> Tracks:
+    """The tracks that a file of `np.savez` holds."""
+    arrays = {field.name: file[field.name] for field in dataclasses.fields(Tracks)}
+    for name in ("num_frames", "width", "height"):
+        arrays[name] = int(arrays[name])
+    return Tracks(**arrays)
+
+
+def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
+    """The tracks that poses are estimated from; short ones are for points only."""
+    return keep_long_tracks(tracks, least_length(run.options.match.tracks))

@@ -1,0 +1,207 @@
+"""How firmly points join the images on either side of each gap between neighbours in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
+from colmap_av1.images.names import natural_order, video_of
+
+# Two views of a point say nothing of how far one of them is from a third.
+_FEWEST_VIEWS = 3
+# A joint is doubtful, and may be looked at again, that has less than this share of the points that
+# the joints of a model usually have; and weak below the other. Jerks that links mend have 15 % and
+# more afterwards, models that were bent there 1 to 5 %.
+_DOUBTFUL = 0.15
+_WEAK = 0.07
+# Images between two that see a point, beyond which these say nothing of the joints between: a place
+# seen again would count for all of the way there and back.
+_REACH = 10
+# So many points hold any joint, however many others have: bent ones had 50 at most.
+_ENOUGH = 100
+# Share of the points of usual joints that images before a joint share with those after it, however
+# far apart, from which on it is not weak: parts of a cut video may see each other elsewhere.
+_ELSEWHERE = 0.5
+# A point has depth where it is seen under this angle in degrees: many times what its error and that
+# of the poses come to.
+_LEAST_ANGLE = 0.2
+# The scale of a model is lost at a joint that less than this share of the usual points carry it
+# across, though so many points have depth on either side. Where a camera stands still and turns by
+# as much as it sees at once none do; other clips, also those that jerk, have 7 % and more.
+_LOST = 0.03
+_DEEP = 100
+
+
+@dataclass(frozen=True)
+class Joints:
+    """What joins neighbouring images of the same camera and folder.
+
+    Attributes:
+        pairs: names of the images before and after each joint, in the order of their names.
+        num_points: int64 [n] points that join them: which images on both sides see, up to ten
+            images apart, and three images at least.
+        num_elsewhere: int64 [n] points that images on both sides see, however far apart.
+        num_scaled: int64 [n] those of the points that carry the scale across: which have depth by
+            the views up to the image before, and by those from it on.
+        num_deep: int64 [n] points that have depth by the views up to the image before, or by those
+            from it on, whichever are fewer.
+    """
+
+    pairs: tuple[tuple[str, str], ...]
+    num_points: NDArray[np.int64]
+    num_elsewhere: NDArray[np.int64]
+    num_scaled: NDArray[np.int64]
+    num_deep: NDArray[np.int64]
+
+    @property
+    def weak(self) -> list[int]:
+        """Joints, by index, that hold far less than the others do: a model may be bent there."""
+        if len(self.num_points) == 0:
+            return []
+        enough = _ELSEWHERE * float(np.median(self.num_points))
+        below = self._below(_WEAK, most=_ENOUGH)
+        return [i for i in below if self.num_elsewhere[i] < enough]
+
+    @property
+    def doubtful(self) -> list[int]:
+        """Joints, by index, that hold much less than the others do, the weak ones among them."""
+        return self._below(_DOUBTFUL)
+
+    @property
+    def unscaled(self) -> list[int]:
+        """Joints, by index, across which nothing carries the scale of the model."""
+        if len(self.num_points) == 0:
+            return []
+        # Much of a clip may be a turn.
+        least = _LOST * float(np.quantile(self.num_scaled, 0.75))
+        return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
+
+    def _below(self, share: float, most: float = math.inf) -> list[int]:
+        if len(self.num_points) == 0:
+            return []
+        least = min(share * float(np.median(self.num_points)), most)
+        return [int(i) for i in np.flatnonzero(self.num_points < least)]
+
+    @property
+    def warning(self) -> str | None:
+        """What the user should know of a model that hardly holds together somewhere."""
+        if not self.weak:
+            return self._about_scale()
+        where = min(self.weak, key=lambda i: (int(self.num_points[i]), i))
+        (first, second), count = self.pairs[where], int(self.num_points[where])
+        more = len(self.weak) - 1
+        others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
+        usual = int(np.median(self.num_points))
+        return (
+            f"only {count} points join '{first}' and what is before it to '{second}' and what "
+            f"follows, usually {usual} do{others}: scale and direction may change there; film it "
+            "more slowly, or reconstruct the parts on either side apart"
+        )
+
+    def _about_scale(self) -> str | None:
+        """What the user should know of a model whose parts have scales of their own."""
+        if not self.unscaled:
+            return None
+        first = last = self.unscaled[0]
+        while last + 1 in self.unscaled:
+            last += 1
+        more = self.unscaled[-1] > last
+        return (
+            f"nothing carries the scale from '{self.pairs[first][0]}' to '{self.pairs[last][1]}'"
+            f"{', and elsewhere' if more else ''}: the camera turns there without moving aside, so "
+            "that what is before and what follows may have scales of their own; film such turns "
+            "while walking, or reconstruct the parts on either side apart"
+        )
+
+
+def model_joints(reconstruction: Any) -> Joints:
+    """What joins neighbouring images in a model.
+
+    Images that are neighbours in the order of their names, as frames of a video are named, have a
+    joint where one camera took both into one folder.
+
+    Args:
+        reconstruction: pycolmap.Reconstruction.
+    """
+    images, joints = images_in_time(reconstruction)
+    views, point, xyz = _seen_points(reconstruction, images)
+    num_images, num_joints = len(images), max(len(images) - 1, 0)
+    order = np.lexsort((views, point))
+    views, point = views[order], point[order]
+    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
+    first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
+    np.minimum.at(first, point, views)
+    np.maximum.at(last, point, views)
+    # The first view that gives a point depth beside its first one, and the last beside its last.
+    deep_from, deep_to = (np.full(len(xyz), fill) for fill in (num_images, -1))
+    centres = camera_centres(np.array([image.cam_from_world for image in images]).reshape(-1, 3, 4))
+    from_first = _angle(centres[views], centres[first[point]], xyz[point]) >= _LEAST_ANGLE
+    from_last = _angle(centres[views], centres[last[point]], xyz[point]) >= _LEAST_ANGLE
+    np.minimum.at(deep_from, point[from_first], views[from_first])
+    np.maximum.at(deep_to, point[from_last], views[from_last])
+
+    def between(start: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many points have each joint from `start` on and before `end`."""
+        some = start < end
+        change = np.bincount(start[some], minlength=num_images + 1)
+        change -= np.bincount(end[some], minlength=num_images + 1)
+        return np.cumsum(change)[:num_joints]
+
+    deep = deep_from < num_images
+    before = between(deep_from[deep], np.full(np.count_nonzero(deep), num_images))
+    after = between(np.zeros(np.count_nonzero(deep), np.int64), deep_to[deep] + 1)
+    return Joints(
+        tuple((images[k].name, images[k + 1].name) for k in joints),
+        num_points=between(views[near], views[near + 1])[joints],
+        num_elsewhere=between(first, last)[joints],
+        num_scaled=between(deep_from, deep_to + 1)[joints],
+        num_deep=np.minimum(before, after)[joints],
+    )
+
+
+def images_in_time(reconstruction: Any) -> tuple[list[ModelImage], list[int]]:
+    """The images of a pycolmap.Reconstruction with a pose, in the natural order of their names.
+
+    Returns:
+        The images, and indices of those whose next one is a neighbour in time, see `video_of`.
+    """
+    posed = posed_images(reconstruction)
+    names = list(posed)
+    images = [posed[names[k]] for k in natural_order(names)]
+    videos = [video_of(image.camera_id, image.name) for image in images]
+    return images, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
+
+
+def _seen_points(
+    reconstruction: Any, images: Sequence[ModelImage]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Places [m] of the images that see a point, number [m] of that point, and positions [n, 3].
+
+    Points that fewer than three images see are left out.
+    """
+    place = {image.image_id: k for k, image in enumerate(images)}
+    views, counts, xyz = list[int](), list[int](), list[NDArray[np.float64]]()
+    for point in reconstruction.points3D.values():
+        own = {place[e.image_id] for e in point.track.elements if e.image_id in place}
+        if len(own) >= _FEWEST_VIEWS:
+            views += own
+            counts.append(len(own))
+            xyz.append(point.xyz)
+    number = np.repeat(np.arange(len(counts)), counts)
+    return np.array(views, np.int64), number, np.array(xyz, np.float64).reshape(-1, 3)
+
+
+def _angle(
+    a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Angle in degrees at which points [n, 3] are seen from two places each."""
+    rays = [(point - c) / np.linalg.norm(point - c, axis=1, keepdims=True) for c in (a, b)]
+    half = np.linalg.norm(rays[0] - rays[1], axis=1) / 2
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(half, 1))))

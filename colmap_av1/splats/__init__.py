@@ -1,0 +1,1 @@
+"""The point cloud for splatting: points, Gaussians, undistorted images."""

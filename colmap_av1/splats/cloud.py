@@ -1,0 +1,256 @@
+"""A cloud that trainers of Gaussian splats start well from: even in the images, without holes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1 import _core
+from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_rows
+from colmap_av1.geometry.coverage import (
+    CELL,
+    PosedCamera,
+    evenly_spread,
+    nearest_depth,
+    squares_of_cells,
+    without_gaps,
+)
+
+_Floats = NDArray[np.float64]
+_Ints = NDArray[np.int64]
+
+# Images, evenly spread, that the cloud is made even in: at least and at most so many, and between
+# these every so many-th; and those at most that it is made whole in.
+_EVEN_IMAGES = (32, 128, 6)
+_WHOLE_IMAGES = 128
+# Widths in pixels of the cells of these that one point each is wanted in, coarse ones first. Points
+# nearer than the last cost a trainer time and keep it from placing its own.
+_SPACINGS = (32, 16, 8)
+# Points whose depths differ by more than a half are of different surfaces; this many steps apart
+# they are no more told apart.
+_STEPS_PER_OCTAVE = 2.0
+_MOST_STEPS = 64
+# Share of a bound on the number that holes do not get.
+_FOR_SURFACES = 0.75
+# Width in pixels of the squares that get a point each where a cell of the coverage is empty.
+_FILLING = 8
+# Points before what an image shows through a gap hide it: looking at all images again finds that.
+_ROUNDS = 2
+# Of the depths at the edge of a hole, those that are nearer than this quantile of them by more than
+# a factor are not what it shows; and how many of the others each of its cells follows.
+_FARTHER = 0.75
+_TOO_NEAR = 2.0
+_NEAREST = 8
+# Distances that are tried for a point which hides others by more than a factor in the key images
+# beside its own: as that of the surroundings, times these, then the largest around.
+_HIDES = 1.25
+_PUSHED = (1.0, 1.5, 3.0)
+_BESIDE = 2
+# COLMAP's word for an error that is not known.
+_UNKNOWN_ERROR = -1.0
+
+
+def splat_cloud(
+    points: ModelPoints, images: Sequence[PosedCamera], max_points: int | None
+) -> ModelPoints:
+    """The points that a trainer needs: evenly spread in the images, holes filled, no more.
+
+    Of the points that come close to each other in an image the one that most images see stays,
+    where they are of one surface. Where an image has none they are added as far away as what is
+    around; these are seen by that image and those beside it. What masks leave out is no hole.
+
+    Args:
+        points: points of tracks.
+        images: the images.
+        max_points: points at most, the finest ones left out first; None: any number.
+
+    Returns:
+        Those of `points` that stay, in their order, then those that are added, in black.
+    """
+    fewest, most, step = _EVEN_IMAGES
+    even = evenly_spread(len(images), min(max(len(images) // step, fewest), most))
+    stage = _stages(points, [images[i] for i in even])
+    keys = evenly_spread(len(images), _WHOLE_IMAGES)
+    # Without an order within a stage its last ones would be of the last part of the video.
+    shuffled = np.random.default_rng(0).permutation(len(stage))
+    order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
+    if max_points is None:
+        kept = take_points(points, np.sort(order))
+        return joined_points([kept, _filling(kept, images, keys)])
+    # Holes come before detail, but not before the surfaces that tell how deep they are.
+    kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
+    filled = _filling(kept, images, keys)
+    filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
+    kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
+    return joined_points([kept, filled])
+
+
+def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
+    """Some of the points, in the order of `rows`."""
+    offsets, seen = take_rows(points.offsets, rows)
+    return ModelPoints(
+        *(points.xyz[rows], points.rgb[rows], points.error[rows], offsets),
+        *(points.image[seen], points.xy[seen]),
+    )
+
+
+def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
+    """Index of the widest spacing at which each point is wanted in a key image, int64 [n].
+
+    Points that are wanted at none have the number of spacings.
+    """
+    # The point that most images see comes first, in all of them alike.
+    first = np.lexsort((points.error, -np.diff(points.offsets)))
+    rank = np.empty(len(first), np.int64)
+    rank[first] = np.arange(len(first))
+    stage = np.full(len(rank), len(_SPACINGS))
+    for key in keys:
+        index, xy, depth = key.project(points.xyz)
+        best = _core.best_at_spacings(
+            *(xy, depth, rank[index]),
+            width=key.size[0],
+            height=key.size[1],
+            spacings=np.array(_SPACINGS),
+            steps_per_octave=_STEPS_PER_OCTAVE,
+            most_steps=_MOST_STEPS,
+        )
+        stage[index] = np.minimum(stage[index], best)
+    return stage
+
+
+def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) -> ModelPoints:
+    """Points in the holes that the kept ones leave in the key images, first one in each cell."""
+    nearest = [nearest_depth(images[key], kept.xyz) for key in keys]
+    surfaces = [without_gaps(grid) for grid in nearest]
+    usual = _usual_depth(surfaces)
+    filled: list[ModelPoints] = [take_points(kept, np.empty(0, np.int64))]
+    is_first = [np.empty(0, np.bool_)]
+    added = np.empty((0, 3))
+    for place in _spread_order(len(keys)) * _ROUNDS:
+        own = images[keys[place]]
+        grid = without_gaps(np.minimum(nearest[place], nearest_depth(own, added)))
+        rows, columns = np.nonzero(np.isinf(grid) & own.counting_cells)
+        if len(rows) == 0:
+            continue
+        depth = _depth_of_holes(grid, usual)
+        xy, cell, first = _squares(own, rows, columns)
+        is_first.append(first)
+        beside = range(max(place - _BESIDE, 0), min(place + _BESIDE + 1, len(keys)))
+        xyz = _behind(
+            own,
+            xy,
+            depth[rows, columns][cell],
+            float(depth.max()),
+            [(images[keys[i]], surfaces[i]) for i in beside if i != place],
+        )
+        added = np.concatenate([added, xyz])
+        around = (keys[place] - 1, keys[place], keys[place] + 1)
+        there = [i for i in around if 0 <= i < len(images)]
+        filled.append(_with_observations(xyz, images, there, keys[place]))
+    order = np.argsort(~np.concatenate(is_first), kind="stable")
+    return take_points(joined_points(filled), order)
+
+
+def _spread_order(count: int) -> list[int]:
+    """0 to before `count`, halfway points first."""
+    size = max(count - 1, 1).bit_length()
+    order = (int(format(i, f"0{size}b")[::-1], 2) for i in range(1 << size))
+    return [i for i in order if i < count]
+
+
+def _usual_depth(surfaces: list[_Floats]) -> float:
+    """Depth of an image without any point."""
+    known = np.concatenate([grid[np.isfinite(grid)] for grid in surfaces])
+    return float(np.quantile(known, _FARTHER)) if len(known) else 1.0
+
+
+def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
+    """The grid with depths in all cells: those of a hole follow from the cells at its edge.
+
+    Where these are near on one side and far on another the hole shows what is far: sky between
+    roofs, and a point too far away hides nothing.
+    """
+    from scipy.ndimage import binary_dilation, find_objects, label  # noqa: PLC0415 - slow to import
+    from scipy.spatial import KDTree  # noqa: PLC0415
+
+    depth = grid.copy()
+    holes, count = label(np.isinf(grid), structure=np.ones((3, 3)))
+    for number, place in enumerate(find_objects(holes, count), start=1):
+        # With the cells around it.
+        box = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in place)
+        hole = holes[box] == number
+        edge = np.argwhere(binary_dilation(hole, np.ones((3, 3))) & np.isfinite(grid[box]))
+        if len(edge) == 0:
+            depth[box][hole] = usual
+            continue
+        there = grid[box][edge[:, 0], edge[:, 1]]
+        far = there > np.quantile(there, _FARTHER) / _TOO_NEAR
+        tree = KDTree(edge[far])
+        away, nearest = tree.query(np.argwhere(hole), k=np.arange(min(_NEAREST, far.sum())) + 1)
+        weight = 1.0 / away**2
+        inverse = (weight / there[far][nearest]).sum(axis=1) / weight.sum(axis=1)
+        depth[box][hole] = 1.0 / inverse
+    return np.asarray(depth)
+
+
+def _squares(
+    view: PosedCamera, rows: _Ints, columns: _Ints
+) -> tuple[_Floats, _Ints, NDArray[np.bool_]]:
+    """Centres in pixels of the squares in cells, the cell of each, and whether it is its first."""
+    per_cell = CELL // _FILLING
+    xy = squares_of_cells(rows, columns, per_cell)
+    cell = np.repeat(np.arange(len(rows)), per_cell**2)
+    # Cells at the edge may reach beyond it; one square of each lies within.
+    first = np.arange(len(xy)) % per_cell**2 == 0
+    xy[first] = np.minimum(xy[first], np.array(view.size) - 0.5)
+    # Centres of squares are corners of pixels: all four around count.
+    around = [xy + np.array([dx, dy]) for dx in (-0.5, 0.5) for dy in (-0.5, 0.5)]
+    inside = (xy < view.size).all(axis=1) & np.all([view.keeps(at) for at in around], axis=0)
+    return xy[inside], cell[inside], first[inside]
+
+
+def _behind(
+    view: PosedCamera,
+    xy: _Floats,
+    depth: _Floats,
+    farthest: float,
+    others: Sequence[tuple[PosedCamera, _Floats]],
+) -> _Floats:
+    """Points at pixels and depths of an image, farther where they would hide what others see."""
+    rays = view.rays(xy) @ view.cam_from_world[:, :3]
+    xyz = view.centre + rays * np.maximum(depth, farthest)[:, None]
+    left = np.arange(len(xy))
+    for factor in _PUSHED:
+        tried = view.centre + rays[left] * (depth[left] * factor)[:, None]
+        hides = np.zeros(len(left), np.bool_)
+        for other, surface in others:
+            index, seen_at, own_depth = other.project(tried)
+            column, row = (seen_at // CELL).astype(np.int64).T
+            there = surface[row, column]
+            hides[index] |= np.isfinite(there) & (own_depth * _HIDES < there)
+        xyz[left[~hides]] = tried[~hides]
+        left = left[hides]
+        if len(left) == 0:
+            break
+    return np.asarray(xyz)
+
+
+def _with_observations(
+    xyz: _Floats, images: Sequence[PosedCamera], seen_by: Sequence[int], own: int
+) -> ModelPoints:
+    """Points as images have them that they project into, in their own one wherever they are."""
+    seen = []
+    for i in seen_by:
+        index, at, _ = images[i].project(xyz)
+        kept = images[i].keeps(at) | (i == own)
+        seen.append((i, index[kept], at[kept]))
+    point = np.concatenate([index for _, index, _ in seen])
+    image = np.concatenate([np.full(len(index), i) for i, index, _ in seen])
+    xy = np.concatenate([at for *_, at in seen])
+    order = np.lexsort((image, point))
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(xyz)))])
+    black = np.zeros((len(xyz), 3), np.uint8)
+    error = np.full(len(xyz), _UNKNOWN_ERROR)
+    return ModelPoints(xyz, black, error, offsets.astype(np.int64), image[order], xy[order])

@@ -1,0 +1,274 @@
+"""The last stage of `reconstruct`: all tracks on the poses, undistorted images, the model."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
+from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.track_points import (
+    Colours,
+    mean_error,
+    rays_of,
+    seen_in,
+    to_model_points,
+)
+from colmap_av1.geometry.undistortion import (
+    Undistortion,
+    on_pinholes,
+    pinhole_camera,
+    undistorted_masks,
+    undistortion,
+)
+from colmap_av1.images.files import read_image, write_image, write_images
+from colmap_av1.images.takes import Takes
+from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.reconstruct_poses import (
+    PosedImages,
+    check_agreement,
+    read_posed_images,
+    triangulate_in,
+)
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.splats.cloud import take_points
+from colmap_av1.splats.swept_cloud import Look, swept_cloud
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.stages import Kept, run_stage
+from colmap_av1.video.unchanged import check_unchanged
+
+_Image = NDArray[np.uint8]
+
+# Folder of the masks, where there are any.
+_MASKS = "masks"
+
+
+def _tracked_points(
+    run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
+) -> tuple[ModelPoints, float]:
+    """Points of all tracks, as a model of the undistorted images has them, in black.
+
+    Returns:
+        The points, and the share of the tracks that agree with the poses.
+    """
+    seen, view = seen_in(tracks, placed.frames)
+    rays = rays_of(seen, view, placed.camera_of_image)
+    pinholes = [own.camera for own in views]
+    points = triangulate_in(
+        *(run, placed, seen, view),
+        options=run.options.triangulate,
+        pinholes=pinholes,
+        rays=rays,
+        progress=run.progress,
+    )
+    check_agreement(len(points.xyz), points.num_tracks)
+    xy = on_pinholes(rays[points.observation], view[points.observation], pinholes)
+    agreeing = points.num_agreeing / max(points.num_tracks, 1)
+    return to_model_points(points, view, xy), agreeing
+
+
+def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
+    """The undistorted cameras by their ids."""
+    return {int(view.camera.camera_id): view.camera for view in views}
+
+
+def _undistortions(placed: PosedImages, views: Sequence[PosedCamera]) -> list[Undistortion | None]:
+    """What undistorts the picture of each image; None: it has no distortion."""
+    pinholes = _pinholes(views)
+    of_camera = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+    return [of_camera[image.camera_id] for image in placed.images]
+
+
+def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:
+    return how(picture) if how is not None else picture
+
+
+def _written_images(
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    undistort: Sequence[Undistortion | None],
+    look: Look,
+) -> None:
+    """Write the images, undistorted, and look at those of videos on the way."""
+    options, progress = run.options, run.progress
+    index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
+    names = [image.name for image in placed.images]
+
+    def change(first: int, frame: int, picture: _Image) -> _Image:
+        index = index_of_frame[first + frame]
+        shown = _undistorted(picture, undistort[index])
+        look(index, shown)
+        return shown
+
+    done = 0
+
+    def report(count: int) -> None:
+        progress("images", done + count, len(names))
+
+    for take in np.unique(placed.take).tolist():
+        own = np.flatnonzero(placed.take == take)
+        first = int(placed.first_frame[take])
+        if take < len(run.sources):
+            write_images(
+                run.sources[take].pictures,
+                folder,
+                [names[i] for i in own],
+                (placed.frames[own] - first).tolist(),
+                num_threads=options.match.run.num_threads,
+                operating_point=options.match.read.operating_point,
+                change=partial(change, first),
+                kept=run.sources[take].kept,
+                progress=report,
+            )
+        else:
+            photo = run.inputs.photos[take - len(run.sources)]
+            (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
+            shown = _undistorted(read_image(photo.path), undistort[int(own[0])])
+            write_image(folder / photo.name, shown)
+            report(1)
+        done += len(own)
+
+
+def _written_cloud(
+    run: Run,
+    folder: Path,
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    tracked: ModelPoints,
+    *,
+    undistort: Sequence[Undistortion | None],
+) -> ModelPoints:
+    """Write the images; those points, in black, that the options want of tracks and pictures."""
+    options, clock = run.options.triangulate, run.clock
+
+    def show(look: Look) -> None:
+        with clock.measure("images"):
+            _written_images(run, folder, placed, undistort, look)
+
+    if options.points == "survey":
+        show(lambda *_: None)
+        return tracked
+    return swept_cloud(
+        *(tracked, views, placed.take, show),
+        max_points=options.max_points,
+        num_threads=run.options.match.run.num_threads,
+        clock=clock,
+    )
+
+
+def _coloured(
+    run: Run,
+    takes: Takes,
+    placed: PosedImages,
+    views: Sequence[PosedCamera],
+    cloud: ModelPoints,
+    *,
+    undistort: Sequence[Undistortion | None],
+) -> ModelPoints:
+    """The points in the colours of the pictures.
+
+    The images themselves are not read: decompressing them takes several times as long.
+    """
+    colours = Colours(cloud, [view.size for view in views])
+    places = np.searchsorted(takes.images.frames, placed.frames).tolist()
+    index_of = {place: index for index, place in enumerate(places)}
+    with run.clock.measure("colours"):
+        for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
+            index = index_of[place]
+            colours.add(index, picture, undistort[index])
+            run.progress("colours", done, len(views))
+        return replace(cloud, rgb=colours.rgb())
+
+
+def _write_masks(
+    folder: Path,
+    images: Sequence[ModelImage],
+    cameras: Mapping[int, Any],
+    masks: Sequence[Mask | None],
+) -> None:
+    """Write a mask for each image, white where there is none.
+
+    Trainers look for `masks/NAME.png` beside `images/NAME.jpg`, and so does COLMAP where images
+    are PNG.
+    """
+    for image, mask in zip(images, masks, strict=True):
+        camera = cameras[image.camera_id]
+        shape = (int(camera.height), int(camera.width))
+        kept = mask.kept if mask is not None else np.ones(shape, np.bool_)
+        file = (folder / image.name).with_suffix(".png")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_image(file, np.where(kept, np.uint8(255), np.uint8(0)))
+
+
+def model_stage(
+    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], posed: Kept
+) -> Kept:
+    """Triangulate all tracks and write the images and the model that trainers open.
+
+    Args:
+        run: what every stage is given.
+        tracks: the tracks of all takes, without those of what moves by itself.
+        takes: all images.
+        moving: by the names of images, masks that leave out what moves.
+        posed: the stage that holds the poses.
+    """
+    options, clock = run.options, run.clock
+    masked = run.inputs.masks is not None or options.moving == "mask"
+
+    def make(partial: Path) -> dict[str, Any]:
+        placed = read_posed_images(run, posed, takes)
+        cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
+        images = placed.images
+        given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
+        joined = placed.masks_with(moving)
+        counting = undistorted_masks(joined, placed.camera_of_image, cameras)
+        views = views_of(images, cameras, counting)
+        with clock.measure("points"):
+            tracked, agreeing = _tracked_points(run, placed, views, tracks)
+            shows_moving = np.array([image.name in moving for image in images])
+            tracked = take_points(tracked, surely_still(tracked, shows_moving))
+        with clock.measure("images"):
+            undistort = _undistortions(placed, views)
+        cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
+        check_unchanged(*run.files)
+        with clock.measure("coverage"):
+            covered = coverage(views, cloud.xyz)
+        cloud = _coloured(run, takes, placed, views, cloud, undistort=undistort)
+        with clock.measure("writing"):
+            folder = partial / "sparse" / "0"
+            folder.mkdir(parents=True)
+            write_model(folder, cameras, images, cloud)
+            if masked:
+                shown = counting if options.moving == "mask" else given
+                _write_masks(partial / _MASKS, images, cameras, shown)
+        return {
+            "num_points": len(cloud.xyz),
+            "num_observations": len(cloud.image),
+            "coverage": covered,
+            "mean_error": mean_error(cloud),
+            "focal_length": float(views[0].camera.params[0]),
+            "agreeing": agreeing,
+        }
+
+    how = (options.triangulate, options.match.images.image_name, options.moving)
+    kept = run_stage(
+        run.stages,
+        "model",
+        [posed.digest, how],
+        into=run.output,
+        products=["images", "sparse", *([_MASKS] if masked else [])],
+        make=make,
+    )
+    if not masked:
+        # Those of an earlier run are of other images.
+        shutil.rmtree(run.output / _MASKS, ignore_errors=True)
+    return kept

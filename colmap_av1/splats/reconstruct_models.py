@@ -1,0 +1,142 @@
+"""The models that `reconstruct` writes: the largest, and those that nothing connects with it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from colmap_av1.errors import ModelError, cannot_write
+from colmap_av1.geometry.colmap_model import posed_images, read_model
+from colmap_av1.images.takes import Takes
+from colmap_av1.poses.placing.stage import place_stage
+from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_poses
+from colmap_av1.poses.reconstruct_poses import read_posed_images
+from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
+from colmap_av1.splats.reconstruct_model import model_stage
+from colmap_av1.tracks.tracks import join_tracks
+from colmap_av1.util.files import remove_leftovers
+from colmap_av1.util.stages import Kept, run_stage
+
+# Folders of further models, each followed by its number.
+_FOLDER = "model_"
+
+
+@dataclass(frozen=True)
+class FurtherModel:
+    """A model of images that nothing connects with those of the largest.
+
+    Attributes:
+        output: its folder, with `images/` and `sparse/0/` as the largest one's.
+        num_registered: images with a pose.
+        first: name of the first of them, in the order of their frames.
+        last: name of the last one.
+        num_points: 3D points.
+        mean_error: mean reprojection error of the points in pixels.
+    """
+
+    output: Path
+    num_registered: int
+    first: str
+    last: str
+    num_points: int
+    mean_error: float
+
+    def __str__(self) -> str:
+        return (
+            f"'{self.output.name}' holds {self.num_registered} from '{self.first}' to '{self.last}'"
+        )
+
+
+def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
+    """Place the model in the world, and write it with all points."""
+    assert run.positions is not None
+    placed = place_stage(run, takes, posed.last, run.positions)
+    tracks = join_tracks(posed.tracks, posed.links)
+    return {"place": placed, "model": model_stage(run, tracks, takes, posed.moving, placed)}
+
+
+def further_models(
+    run: Run, first: Posed, takes: Takes
+) -> tuple[tuple[FurtherModel, ...], list[str]]:
+    """Write the models of images that nothing connects with those of the first.
+
+    Images may be in two of them, undistorted by other intrinsics: hence a folder each.
+
+    Returns:
+        The models, and the names of the images that are in none, in the order of their frames.
+    """
+    placed = read_posed_images(run, first.last, takes).images
+    left = set(takes.images.names) - {image.name for image in placed}
+    mapped = first.stages["poses"]
+    keyed = takes.some(first.stages["matches"].facts["key_images"])
+    found: list[FurtherModel] = []
+    for poses in mapped.facts["other_models"]:
+        known = set(posed_images(read_model(run.stages / poses)))
+        if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
+            continue
+        own = _run_of_model(run, len(found) + 1)
+        stages = {"poses": _poses_of_model(run, own, mapped, poses)}
+        some, key = _named(takes, known | left), _named(keyed, known)
+        videos = [read_tracks(run, video) for video in range(len(run.sources))]
+        believed = believed_tracks(run, videos, takes)
+        posed = refined_poses(own, stages, believed, some, key, in_place=first.in_place)
+        images = [image.name for image in read_posed_images(own, posed.last, takes).images]
+        left -= set(images)
+        facts = written_model(own, posed, takes)["model"].facts
+        figures = (facts["num_points"], facts["mean_error"])
+        found.append(FurtherModel(own.output, len(images), images[0], images[-1], *figures))
+    _remove_further_models(run, len(found) + 1)
+    return tuple(found), [name for name in takes.images.names if name in left]
+
+
+def _named(takes: Takes, names: AbstractSet[str]) -> Takes:
+    """The images of some names."""
+    return takes.some([i for i, name in enumerate(takes.images.names) if name in names])
+
+
+def _run_of_model(run: Run, number: int) -> Run:
+    """What the stages of a further model are given: it has a folder as the first one has."""
+    output = run.output / f"{_FOLDER}{number}"
+    own = replace(run, output=output, stages=output / run.stages.name)
+    try:
+        own.stages.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ModelError(cannot_write(output, error)) from error
+    for folder in (own.output, own.stages):
+        remove_leftovers(folder)
+    return own
+
+
+def _poses_of_model(run: Run, own: Run, posed: Kept, poses: str) -> Kept:
+    """Hand the poses of a further model of the mapper to that model's own stages.
+
+    Args:
+        run: the run that mapped.
+        own: that of the further model, see `_run_of_model`.
+        posed: the stage that mapped.
+        poses: folder of the model among what that stage made.
+    """
+
+    def make(partial: Path) -> dict[str, Any]:
+        shutil.copytree(run.stages / poses, partial / "poses")
+        return {"poses": "poses"}
+
+    return run_stage(
+        own.stages,
+        "poses",
+        [posed.digest, poses],
+        into=own.stages,
+        products=["poses"],
+        make=make,
+    )
+
+
+def _remove_further_models(run: Run, first: int) -> None:
+    """Remove the folders of further models, from a number on, that an earlier run made."""
+    for folder in run.output.glob(f"{_FOLDER}*"):
+        number = folder.name.removeprefix(_FOLDER)
+        if number.isdecimal() and int(number) >= first and (folder / run.stages.name).is_dir():
+            shutil.rmtree(folder)

@@ -1,0 +1,437 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import sqlite3
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from existing_database import (
+    CAMERA,
+    LAYOUTS,
+    NAMES,
+    NUM_IMAGES,
+    OURS,
+    THEIRS,
+    alter,
+    make_existing,
+    make_layout,
+    query,
+)
+from synthetic_scene import FOCAL, HEIGHT, WIDTH, make_scene, match_scene
+
+from colmap_av1.check.database import CheckReport, check
+from colmap_av1.cli import main
+from colmap_av1.database.reading import pair_id_from_image_ids
+from colmap_av1.database.writing import write_matches
+from colmap_av1.errors import DatabaseError
+from colmap_av1.geometry.cameras import make_camera
+from colmap_av1.options import CameraOptions
+
+
+def found(report: CheckReport) -> list[tuple[str, str]]:
+    return [(finding.severity, finding.text) for finding in report.findings]
+
+
+def maps(path: Path) -> bool:
+    """Whether pycolmap's mapper makes a model with all images of the database."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    try:
+        models = pycolmap.incremental_mapping(path, path.parent, path.parent / "model", options)
+    except (ValueError, IndexError):
+        return False
+    return any(model.num_reg_images() == NUM_IMAGES for model in models.values())
+
+
+def test_new_database(tmp_path: Path) -> None:
+    path = tmp_path / "new.db"
+    write_matches(path, NAMES, CAMERA, **OURS)
+    report = check(path)
+    assert (report.layout, report.readers) == ("3.8 or 3.9", "3.8 and later")
+    assert report.user_version == 3800
+    assert report.num_images == report.num_connected_images == NUM_IMAGES
+    assert report.image_sizes == {(WIDTH, HEIGHT): NUM_IMAGES}
+    assert (report.num_cameras, report.num_priors) == (1, 1)
+    assert report.num_keypoints == sum(len(k.xy) for k in OURS["keypoints"])
+    assert 0.95 < report.num_matched_keypoints / report.num_keypoints <= 1
+    assert report.keypoint_columns == {2: NUM_IMAGES}
+    assert report.num_described_images == 0
+    assert report.num_pairs == report.num_used_pairs == len(OURS["pairs"])
+    assert report.num_inliers == sum(len(g.inlier_matches) for g in OURS["geometries"])
+    assert report.configs == {"CALIBRATED": len(OURS["pairs"])}
+    assert report.parallax is not None
+    # The camera moves 40 degrees around the scene, which only the widest pair sees.
+    assert 25 < report.parallax.angle < 40
+    assert report.parallax.focal_known
+    assert set(report.parallax.names) == {NAMES[0], NAMES[-1]}
+    assert report.mappable
+    assert {finding.severity for finding in report.findings} <= {"note"}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_database_of_sift(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "sift.db"
+    make_existing(path, layout, "sift")
+    report = check(path)
+    expected = {
+        "3.8": ("3.8 or 3.9", "3.8 and later"),
+        "3.11": ("3.10 or 3.11", "3.10 and later"),
+        "3.13": ("3.12 or 3.13", "3.10 and later"),
+        "4.2": ("4.x", "4.x"),
+    }
+    assert (report.layout, report.readers) == expected[layout]
+    assert report.keypoint_columns == {6: NUM_IMAGES}
+    assert report.num_described_images == NUM_IMAGES
+    assert report.num_used_pairs == len(THEIRS["pairs"])
+    assert report.mappable
+    notes = [
+        ("note", "image ids do not follow the order of names: match by name, not id"),
+    ]
+    assert [f for f in found(report) if "have no match" not in f[1]] == notes
+
+
+def test_migrated_database(tmp_path: Path) -> None:
+    path = tmp_path / "given.db"
+    make_existing(path, "3.8", "sift")
+    pycolmap.Database.open(path).close()
+    report = check(path)
+    assert report.layout == "3.8 or 3.9, migrated by 4.x"
+    assert report.readers == "3.8, 3.9 and 4.x"
+
+
+# What is done to a database, what is found, and whether pycolmap still maps all its images.
+CHANGES = {
+    "no camera": (
+        ["UPDATE images SET camera_id = 7 WHERE image_id = 8"],
+        "error: 1 image (frame_000.png) without a camera",
+        False,
+    ),
+    "one frame missing": (
+        [
+            "DELETE FROM frame_data WHERE frame_id = 3",
+            "DELETE FROM frames WHERE frame_id = 3",
+        ],
+        "error: 1 image (frame_005.png) without a frame",
+        False,
+    ),
+    "rigs without frames": (
+        ["DELETE FROM frame_data", "DELETE FROM frames", "UPDATE rigs SET rig_id = 5"],
+        "error: has rigs but no frames",
+        False,
+    ),
+    "image removed": (
+        ["DELETE FROM images WHERE image_id = 8"],
+        "error: 7 pairs are of images that are not listed",
+        False,
+    ),
+    "no keypoints": (["DELETE FROM keypoints"], "error: no image has keypoints", False),
+    "no keypoints of one": (
+        ["DELETE FROM keypoints WHERE image_id = 8"],
+        "error: 1 image (frame_000.png) with matches but without keypoints",
+        False,
+    ),
+    "never verified": (
+        ["DELETE FROM two_view_geometries"],
+        "error: no pair has 15 verified matches",
+        False,
+    ),
+    "some never verified": (
+        ["DELETE FROM two_view_geometries WHERE pair_id % 3 = 0"],
+        "warning: 10 pairs have matches that were never verified",
+        True,
+    ),
+    "degenerate": (
+        ["UPDATE two_view_geometries SET config = 1"],
+        "warning: 28 pairs have inliers, but their geometry is degenerate",
+        False,
+    ),
+    "undefined": (
+        ["UPDATE two_view_geometries SET config = 0"],
+        "warning: 28 pairs have inliers, but their geometry was never estimated",
+        False,
+    ),
+    "few inliers": (
+        ["UPDATE two_view_geometries SET rows = 9, data = SUBSTR(data, 1, 72)"],
+        "note: 28 pairs have fewer than 15 inliers",
+        False,
+    ),
+    "too few to start with": (
+        ["UPDATE two_view_geometries SET rows = 40, data = SUBSTR(data, 1, 320)"],
+        "warning: no pair has 100 inliers",
+        None,
+    ),
+    "no row of matches": (
+        ["DELETE FROM matches"],
+        "warning: 28 verified pairs have no row in 'matches'",
+        True,
+    ),
+    "empty rows": (
+        [
+            "UPDATE two_view_geometries SET rows = 0, data = NULL, config = 1 "
+            "WHERE pair_id % 3 = 0",
+            "UPDATE matches SET rows = 0, data = NULL WHERE pair_id % 3 = 0",
+        ],
+        "note: 10 pairs were matched without result",
+        True,
+    ),
+    "no model": (
+        ["UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL"],
+        "note: parallax is unknown",
+        True,
+    ),
+    "no focal length": (
+        ["UPDATE cameras SET prior_focal_length = 0"],
+        "note: 1 of 1 cameras have no focal length",
+        True,
+    ),
+    "several sizes": (
+        [
+            "INSERT INTO cameras SELECT 2, model, 320, height, params, prior_focal_length "
+            "FROM cameras",
+            "UPDATE images SET camera_id = 2 WHERE image_id = 8",
+        ],
+        "note: images have 2 sizes",
+        None,
+    ),
+    "descriptors removed": (
+        ["UPDATE descriptors SET rows = 1, data = SUBSTR(data, 1, 128) WHERE image_id = 2"],
+        "warning: 1 image (frame_006.png) with another number of descriptors",
+        True,
+    ),
+    "astray": (
+        [
+            "UPDATE keypoints SET rows = rows - 9, data = SUBSTR(data, 1, 24 * (rows - 9)) "
+            "WHERE image_id = 8"
+        ],
+        "pairs match keypoints that are not there",
+        True,
+    ),
+    "orphan keypoints": (
+        ["INSERT INTO keypoints VALUES (99, 0, 2, NULL)"],
+        "note: 1 rows of 'keypoints' belong to no image",
+        True,
+    ),
+    "one image apart": (
+        ["DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = 8", "DELETE FROM matches"],
+        "warning: pairs connect at most 7 of 8 images",
+        False,
+    ),
+    "flat": (
+        ["UPDATE two_view_geometries SET config = 6"],
+        "warning: 100% of the pairs see a plane",
+        None,
+    ),
+    "unknown kind": (
+        ["UPDATE two_view_geometries SET config = 12"],
+        "note: parallax is unknown",
+        True,
+    ),
+    "several models": (
+        ["UPDATE two_view_geometries SET config = 8"],
+        "note: 28 pairs have several geometries",
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "text", "mapped"), CHANGES.values(), ids=CHANGES.keys())
+def test_findings(tmp_path: Path, changes: list[str], text: str, mapped: bool | None) -> None:
+    path = tmp_path / "given.db"
+    make_existing(path, "3.13", "sift")
+    before = found(check(path))
+    for sql in changes:
+        alter(path, sql)
+    report = check(path)
+    lines = [": ".join(f) for f in found(report) if f not in before]
+    assert any(text in line for line in lines), lines
+    assert all("\n" not in line for line in lines)
+    order = [("error", "warning", "note").index(f.severity) for f in report.findings]
+    assert order == sorted(order)
+    if mapped is not None:
+        assert report.mappable or not mapped
+        assert maps(path) == mapped
+
+
+@pytest.mark.parametrize(
+    ("arc", "text"),
+    [
+        (4.0, "warning: parallax of [23]"),
+        (12.0, "note: parallax of (8|9|10)"),
+    ],
+)
+def test_little_parallax(tmp_path: Path, arc: float, text: str) -> None:
+    scene = make_scene(num_frames=NUM_IMAGES, num_points=500, noise=0.05, arc_degrees=arc)
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(scene, CAMERA))
+    assert any(re.match(text, ": ".join(f)) for f in found(check(tmp_path / "a.db")))
+
+
+def test_configuration_of_a_rig(tmp_path: Path) -> None:
+    """Pairs of a calibrated rig have a pose of their essential matrix, as calibrated ones."""
+    path = tmp_path / "a.db"
+    write_matches(path, NAMES, CAMERA, **OURS)
+    before = check(path)
+    alter(path, "UPDATE two_view_geometries SET config = 9")
+    report = check(path)
+    assert report.configs == {"CALIBRATED_RIG": len(OURS["pairs"])}
+    assert report.num_used_pairs == before.num_used_pairs
+    assert report.parallax is not None
+    assert report.parallax.angle == pytest.approx(before.parallax.angle)
+
+
+def test_guessed_focal_length_is_told(tmp_path: Path) -> None:
+    guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
+    scene = make_scene(num_frames=NUM_IMAGES, num_points=500)
+    write_matches(tmp_path / "a.db", NAMES, guess, **match_scene(scene, guess))
+    report = check(tmp_path / "a.db")
+    assert report.configs.keys() == {"UNCALIBRATED"}
+    assert report.parallax is not None
+    assert not report.parallax.focal_known
+    assert report.parallax.angle == pytest.approx(30, rel=0.35)
+
+
+def test_forward_motion(tmp_path: Path) -> None:
+    """Keypoints that move away from the centre, as those of a driving car do."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-8, -6, 8], [8, 6, 30], (4000, 3))
+    xy = []
+    for i in range(NUM_IMAGES):
+        seen = points - [0, 0, 0.7 * i]
+        xy.append(FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2])
+    inside = np.all([((p > 0) & (p < [WIDTH, HEIGHT])).all(axis=1) for p in xy], axis=0)
+    num = int(inside.sum())
+    scene = make_scene(num_frames=NUM_IMAGES)
+    tracks = dataclasses.replace(
+        scene.tracks,
+        offsets=np.arange(num + 1, dtype=np.int64) * NUM_IMAGES,
+        frame=np.tile(np.arange(NUM_IMAGES, dtype=np.int32), num),
+        xy=np.stack([p[inside] for p in xy], axis=1).reshape(-1, 2).astype(np.float32),
+        sigma=np.full(num * NUM_IMAGES, 0.3, dtype=np.float32),
+        confirmed=np.zeros(num * NUM_IMAGES, dtype=np.bool_),
+    )
+    drive = dataclasses.replace(scene, tracks=tracks)
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(drive, CAMERA))
+    texts = [text for _, text in found(check(tmp_path / "a.db"))]
+    assert any("moves along its axis" in text for text in texts)
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("journal", ["delete", "wal"])
+@pytest.mark.parametrize("layout", ["3.8", "4.2"])
+def test_nothing_is_altered(tmp_path: Path, layout: str, journal: str) -> None:
+    path = tmp_path / "given.db"
+    make_existing(path, layout, "sift")
+    query(path, f"PRAGMA journal_mode = {journal}")
+    path.chmod(0o444)
+    before = listing(tmp_path)
+    time = path.stat().st_mtime_ns
+    assert before.keys() == {"given.db"}
+    check(path)
+    assert listing(tmp_path) == before
+    assert path.stat().st_mtime_ns == time
+
+
+def test_log_of_another_process_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "given.db"
+    make_existing(path, "4.2", "listed")
+    writer = sqlite3.connect(path)
+    writer.execute("PRAGMA journal_mode = WAL")
+    writer.execute("DELETE FROM images WHERE image_id > 5")
+    writer.commit()
+    assert path.with_name("given.db-wal").stat().st_size > 0
+    before = path.read_bytes()
+    assert check(path).num_images == 5
+    assert path.read_bytes() == before
+    writer.close()
+
+
+def test_interrupted_write_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "given.db"
+    make_existing(path, "3.8", "sift")
+    query(path, "PRAGMA journal_mode = delete")
+    script = """
+        import os, sqlite3, sys
+        connection = sqlite3.connect(sys.argv[1])
+        connection.execute("PRAGMA cache_size = 5")
+        connection.execute("UPDATE keypoints SET data = ZEROBLOB(LENGTH(data))")
+        os._exit(1)
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(script), path], check=False)
+    assert path.with_name("given.db-journal").stat().st_size > 0
+    before = listing(tmp_path)
+    with pytest.raises(DatabaseError, match="a write to it was interrupted"):
+        check(path)
+    assert listing(tmp_path) == before
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "empty.db").touch()
+    (tmp_path / "text.db").write_text("no database, but long enough to be one\n" * 99)
+    make_layout(tmp_path / "damaged.db", "3.8")
+    alter(tmp_path / "damaged.db", "INSERT INTO keypoints VALUES (1, 5, 2, X'00')")
+    alter(
+        tmp_path / "damaged.db", "INSERT INTO images (image_id, name, camera_id) VALUES (1, 'a', 1)"
+    )
+    for name, message in (
+        ("absent.db", "no such file"),
+        ("empty.db", "is an empty file"),
+        ("text.db", "not a COLMAP database"),
+        ("damaged.db", "keypoints of image 1 are damaged"),
+        (".", "is a folder"),
+    ):
+        with pytest.raises(DatabaseError, match=message) as caught:
+            check(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "absent.db").exists()
+
+
+def test_empty_database_lists_nothing(tmp_path: Path) -> None:
+    make_layout(tmp_path / "a.db", "4.2")
+    assert found(check(tmp_path / "a.db")) == [("error", "lists no images")]
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.db"
+    make_existing(path, "4.2", "sift")
+    assert main(["check", "--database", str(path), "--strict"]) == 0
+    rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    assert ["layout", "COLMAP 4.x (version 4020100)"] in rows
+    assert ["for mapping", "good"] in rows
+    assert all(len(row) == 2 for row in rows), json.dumps(rows)
+    alter(path, "DELETE FROM two_view_geometries")
+    assert main(["check", "--database_path", str(path)]) == 0
+    assert "for mapping\tnot ready" in capsys.readouterr().out
+    assert main(["check", "--database", str(path), "--strict"]) == 1
+    assert main(["check", "--database", str(tmp_path / "none.db")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_large_ids(tmp_path: Path) -> None:
+    """Ids near the limit of COLMAP's pair ids."""
+    path = tmp_path / "a.db"
+    write_matches(path, NAMES[:2], CAMERA, **two_images())
+    big = 2147483646
+    for table in ("images", "keypoints"):
+        alter(path, f"UPDATE {table} SET image_id = ? WHERE image_id = 2", big)
+    for table in ("matches", "two_view_geometries"):
+        alter(path, f"UPDATE {table} SET pair_id = ?", pair_id_from_image_ids(1, big))
+    assert check(path).num_used_pairs == 1
+
+
+def two_images() -> dict[str, object]:
+    (index,) = [k for k, pair in enumerate(OURS["pairs"].tolist()) if pair == [0, 1]]
+    return {
+        "keypoints": OURS["keypoints"][:2],
+        "pairs": OURS["pairs"][[index]],
+        "matches": [OURS["matches"][index]],
+        "geometries": [OURS["geometries"][index]],
+    }

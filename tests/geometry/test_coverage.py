@@ -1,0 +1,94 @@
+"""Share of the images that points fill."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_av1.geometry.coverage import CELL, PosedCamera, coverage, nearest_depth
+
+SIZE = (160, 96)
+PLAIN = pycolmap.Camera(
+    camera_id=1, model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[100, 100, 80, 48]
+)
+# Folds far rays back into the picture.
+BENT = pycolmap.Camera(
+    camera_id=2, model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[100, 80, 48, -0.1]
+)
+HERE = np.column_stack([np.eye(3), np.zeros(3)])
+NUM_CELLS = SIZE[0] // CELL * SIZE[1] // CELL
+
+
+def at_cells(depth: float, camera: pycolmap.Camera = PLAIN) -> np.ndarray:
+    """A point in the centre of each cell, row by row."""
+    y, x = np.mgrid[CELL // 2 : SIZE[1] : CELL, CELL // 2 : SIZE[0] : CELL].reshape(2, -1)
+    rays = np.asarray(camera.cam_from_img(np.column_stack([x, y]).astype(float)))
+    return np.column_stack([rays, np.ones(len(rays))]) * depth
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT])
+def test_points_in_the_picture(camera: pycolmap.Camera) -> None:
+    """Those that COLMAP's camera puts there, beside and behind it too many for a chunk."""
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-3, 3, 3)
+    rotation = pycolmap.Rotation3d(angles).matrix()
+    view = PosedCamera(camera, np.column_stack([rotation, [0.3, -0.2, 0.1]]))
+    xyz = rng.normal(0, 2, (5000, 3))
+    local = xyz @ rotation.T + view.cam_from_world[:, 3]
+    there = np.flatnonzero(local[:, 2] > 0)
+    # Beyond what the picture shows a distortion folds rays back into it.
+    rays = local[there, :2] / local[there, 2:]
+    there = there[(np.abs(rays) < [1.0, 0.6]).all(axis=1)]
+    at = np.asarray(camera.img_from_cam(local[there])).reshape(-1, 2)
+    inside = ((at >= 0) & (at < SIZE)).all(axis=1)
+    index, xy, depth = view.project(xyz)
+    assert len(index) > 200
+    assert index.tolist() == there[inside].tolist()
+    assert np.allclose(xy, at[inside], atol=1e-9)
+    assert np.allclose(depth, local[index, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT])
+def test_share_of_cells(camera: pycolmap.Camera) -> None:
+    view = PosedCamera(camera, HERE)
+    points = at_cells(3.0, camera)
+    assert len(points) == NUM_CELLS
+    assert coverage([view], points) == 1.0
+    assert coverage([view], points[::3]) == pytest.approx(len(points[::3]) / NUM_CELLS)
+    assert coverage([view], np.concatenate([points[::3]] * 5)) < 0.4
+    assert coverage([view], -points) == 0.0
+    assert coverage([view], np.empty((0, 3))) == 0.0
+    assert coverage([], points) == 0.0
+
+
+def test_images_count_alike() -> None:
+    """One that sees nothing halves the share."""
+    turned = PosedCamera(PLAIN, np.column_stack([np.diag([1.0, -1.0, -1.0]), np.zeros(3)]))
+    assert coverage([PosedCamera(PLAIN, HERE), turned], at_cells(3.0)) == 0.5
+
+
+def test_points_behind_a_surface_do_not_fill_its_gap() -> None:
+    view = PosedCamera(PLAIN, HERE)
+    near, far = at_cells(3.0), at_cells(30.0)
+    columns = SIZE[0] // CELL
+    gap = 2 * columns + 4
+    wall = np.delete(near, gap, axis=0)
+    assert coverage([view], np.concatenate([wall, far[[gap]]])) == pytest.approx(1 - 1 / NUM_CELLS)
+    # A point on the surface itself does, and so does what lies beside a surface's edge.
+    assert coverage([view], np.concatenate([wall, 1.1 * near[[gap]]])) == 1.0
+    half = np.arange(NUM_CELLS) % columns < columns // 2
+    assert coverage([view], np.where(half[:, None], near, far)) == 1.0
+
+
+def test_pixels_and_depths() -> None:
+    """Points outside the picture, behind it or folded back by distortion are not in it."""
+    view = PosedCamera(BENT, np.column_stack([np.eye(3), [0.0, 0.0, 1.0]]))
+    points = np.array([[0.5, 0.2, 1.0], [5.0, 0.0, 0.5], [0.1, 0.2, -3.0], [0.0, 0.0, 4.0]])
+    index, xy, depth = view.project(points)
+    assert index.tolist() == [0, 3]
+    assert depth.tolist() == [2.0, 5.0]
+    assert np.allclose(xy[1], (80, 48))
+    grid = nearest_depth(view, points)
+    assert grid.shape == (6, 10)
+    assert np.sort(grid.ravel())[:3].tolist() == [2.0, 5.0, np.inf]

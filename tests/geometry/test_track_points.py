@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.track_points import (
+    Colours,
+    chaining_for_points,
+    seen_in,
+    to_model_points,
+    triangulate_tracks,
+)
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.options import MatchOptions, TrackOptions, TriangulateOptions
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import no_progress
+
+WIDTH, HEIGHT = 640, 480
+PLAIN = pycolmap.Camera(
+    camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[500, 500, 320, 240]
+)
+BENT = pycolmap.Camera(
+    camera_id=2, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[700, 320, 240, -0.2]
+)
+# A camera that moves to the right.
+POSES = [np.column_stack([np.eye(3), [-0.3 * i, 0, 0]]) for i in range(6)]
+
+
+def make_tracks(xy: np.ndarray) -> Tracks:
+    """Tracks [num_tracks, num_frames, 2] that all frames see."""
+    count, length = xy.shape[:2]
+    return Tracks(
+        *(length, WIDTH, HEIGHT, np.arange(count + 1, dtype=np.int64) * length),
+        frame=np.tile(np.arange(length, dtype=np.int32), count),
+        xy=xy.reshape(-1, 2).astype(np.float32),
+        sigma=np.full(count * length, 0.2, np.float32),
+        confirmed=np.zeros(count * length, bool),
+    )
+
+
+def make_points(observation: list[list[int]]) -> TriangulatedPoints:
+    offsets = np.cumsum([0, *map(len, observation)])
+    num = len(observation)
+    flat = np.array([o for each in observation for o in each], dtype=np.int64)
+    return TriangulatedPoints(np.zeros((num, 3)), np.zeros(num), offsets, flat, num, num)
+
+
+@pytest.mark.parametrize(
+    ("given", "min_observations", "min_length", "cell"),
+    [
+        (TrackOptions(), 3, 3, 2),
+        (TrackOptions(), 2, 2, 2),
+        (TrackOptions(), 5, 3, 2),
+        (TrackOptions(seeding=1, cell=None), 3, 3, 1),
+        (TrackOptions(min_length=6, cell=4), 2, 6, 4),
+    ],
+)
+def test_points_come_from_short_tracks_too(
+    given: TrackOptions, min_observations: int, min_length: int, cell: int
+) -> None:
+    options = replace(MatchOptions(), tracks=given)
+    tracks = chaining_for_points(
+        options, TriangulateOptions(min_observations=min_observations)
+    ).tracks
+    assert (tracks.min_length, tracks.cell) == (min_length, cell)
+    assert replace(tracks, min_length=given.min_length, cell=given.cell) == given
+    smaller = chaining_for_points(
+        options, TriangulateOptions(min_observations=min_observations), is_downscaled=True
+    ).tracks
+    assert (smaller.min_length, smaller.cell) == (min_length, given.cell)
+
+
+def test_views_are_places_among_the_frames() -> None:
+    tracks = make_tracks(np.arange(2 * 6 * 2.0).reshape(2, 6, 2))
+    seen, view = seen_in(tracks, np.array([1, 4, 5], dtype=np.int32))
+    assert seen.frame.tolist() == [1, 4, 5, 1, 4, 5]
+    assert view.tolist() == [0, 1, 2, 0, 1, 2]
+    np.testing.assert_array_equal(seen.xy, tracks.xy[[1, 4, 5, 7, 10, 11]])
+
+
+def test_images_of_several_cameras_see_one_scene() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform([-1, -1, 5], [2, 1, 9], (50, 3))
+    cameras = [PLAIN, PLAIN, BENT, BENT, PLAIN, BENT]
+    xy = np.stack(
+        [
+            camera.img_from_cam(truth @ pose[:, :3].T + pose[:, 3])
+            for camera, pose in zip(cameras, POSES, strict=True)
+        ],
+        axis=1,
+    )
+    tracks = make_tracks(xy)
+    seen, view = seen_in(tracks, np.arange(6, dtype=np.int32))
+
+    def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> TriangulatedPoints:
+        return triangulate_tracks(
+            *(replace(seen, xy=xy), view, cameras, POSES, pinhole and [pinhole] * len(cameras)),
+            options=TriangulateOptions(),
+            num_threads=1,
+            progress=no_progress,
+        )
+
+    exact = found(None, seen.xy)
+    np.testing.assert_allclose(exact.xyz, truth, rtol=1e-4)
+    # Errors are shares of the focal length that pixels are counted in.
+    noisy = seen.xy + rng.normal(0, 0.2, seen.xy.shape).astype(np.float32)
+    wide = pycolmap.Camera(
+        camera_id=9, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[50, 50, 320, 240]
+    )
+    assert 0.1 < np.median(found(None, noisy).error) < 0.5
+    assert 0.005 < np.median(found(wide, noisy).error) < 0.05
+
+
+def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
+    """A point in the middle, one in the corner, one of a single image, one twice in an image."""
+    image = np.array([0, 1, 2, 0, 1, 2, 1, 0, 0, 2])
+    xy = np.tile([[320.0, 240.0]], (10, 1))
+    xy[3:6] = WIDTH, HEIGHT
+    offsets = np.array([0, 3, 6, 7, 10])
+    none = np.zeros((4, 3), np.uint8)
+    points = ModelPoints(np.zeros((4, 3)), none, np.zeros(4), offsets, image, xy)
+    colours = Colours(points, [(WIDTH, HEIGHT)] * 3)
+    blue, red, white = np.zeros((3, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    blue[..., 0], red[..., 2], white[...] = 200, 100, 255
+    half = np.ascontiguousarray(red[::2, ::2])
+    half[-1, -1] = [0, 240, 0]
+    for i, picture in enumerate((blue, white, half)):
+        colours.add(i, picture)
+    assert colours.rgb().tolist() == [
+        [100, 0, 0],  # brighter than blue, and white hides it in one picture
+        [0, 240, 0],  # beyond the last pixel is the last pixel
+        [255, 255, 255],
+        [0, 0, 200],
+    ]
+
+
+def test_points_of_a_model_name_the_images_that_see_them() -> None:
+    points = make_points([[4, 1], [0, 3, 5]])
+    view = np.array([0, 1, 2, 0, 1, 2])
+    xy = np.arange(10.0).reshape(5, 2)
+    made = to_model_points(points, view, xy)
+    assert made.image.tolist() == [1, 1, 0, 0, 2]
+    assert made.offsets.tolist() == [0, 2, 5]
+    assert made.rgb.tolist() == [[0, 0, 0]] * 2
+    assert made.xy is xy

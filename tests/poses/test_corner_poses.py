@@ -1,0 +1,140 @@
+"""Images that their corners contradict are placed anew, the others stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from colmap_av1 import ReconstructOptions
+from colmap_av1.geometry.colmap_model import (
+    ModelImage,
+    camera_centres,
+    no_points,
+    posed_images,
+    read_model,
+    write_model,
+)
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.takes import Takes
+from colmap_av1.options import MapperOptions
+from colmap_av1.poses.corners.in_images import place_anew
+from colmap_av1.poses.reconstruct_poses import PosedImages, adjustment_stage
+from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.stages import Kept
+
+NUM_IMAGES, NUM_POINTS, FOCAL = 9, 200, 500.0
+WRONG = 4
+
+
+def scene() -> tuple[PosedImages, Tracks]:
+    """Images along a path with exact poses, and corners that see points with a little noise."""
+    rng = np.random.default_rng(3)
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=640, height=480, params=[FOCAL, 320, 240]
+    )
+    xyz = rng.uniform([-2, -1.5, 4], [2, 1.5, 8], (NUM_POINTS, 3))
+    images, seen = [], []
+    for i in range(NUM_IMAGES):
+        turn = Rotation.from_euler("y", 0.5 * i, degrees=True).as_matrix()
+        pose = np.column_stack([turn, -turn @ np.array([0.15 * i, 0.02 * i, 0])])
+        images.append(ModelImage(i + 1, f"{i}.png", 1, pose))
+        in_camera = xyz @ pose[:, :3].T + pose[:, 3]
+        seen.append(np.asarray(camera.img_from_cam(in_camera)))
+    xy = np.stack(seen, axis=1) + rng.normal(0, 0.1, (NUM_POINTS, NUM_IMAGES, 2))
+    frames = np.arange(NUM_IMAGES, dtype=np.int32)
+    total = NUM_POINTS * NUM_IMAGES
+    tracks = Tracks(
+        num_frames=NUM_IMAGES,
+        width=640,
+        height=480,
+        offsets=np.arange(0, total + 1, NUM_IMAGES),
+        frame=np.tile(frames, NUM_POINTS),
+        xy=xy.reshape(-1, 2).astype(np.float32),
+        sigma=np.full(total, 0.25, np.float32),
+        confirmed=np.ones(total, np.bool_),
+    )
+    first = np.array([0, NUM_IMAGES])
+    placed = PosedImages(
+        images, frames, np.zeros(NUM_IMAGES, np.int32), first, {1: camera}, (None,) * NUM_IMAGES
+    )
+    return placed, tracks
+
+
+RUN = cast(Any, SimpleNamespace(options=ReconstructOptions()))
+
+
+def test_an_image_that_is_off_comes_to_where_its_corners_are() -> None:
+    placed, corners = scene()
+    true = placed.images[WRONG].cam_from_world
+    turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
+    images = list(placed.images)
+    images[WRONG] = replace(images[WRONG], cam_from_world=turned)
+    found = place_anew(RUN, corners, replace(placed, images=images))
+    for image, right in zip(found.images, placed.images, strict=True):
+        # In pixels at the picture's centre and edges.
+        off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
+        assert off < 0.3, image.name
+    assert np.abs(turned - true).max() * FOCAL > 3
+
+
+def test_without_corners_all_stays() -> None:
+    placed, corners = scene()
+    none = replace(
+        corners,
+        offsets=corners.offsets[:1],
+        frame=corners.frame[:0],
+        xy=corners.xy[:0],
+        sigma=corners.sigma[:0],
+        confirmed=corners.confirmed[:0],
+    )
+    assert place_anew(RUN, none, placed) is placed
+
+
+def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
+    placed, seen = scene()
+    joint = 4  # the image before it
+    after = placed.frames > joint
+    # All after the joint is 6 px up there, more than motion may be off.
+    off = np.column_stack([np.eye(3), [0, 0.07, 0]])
+    images = [
+        replace(i, cam_from_world=np.column_stack([i.cam_from_world[:, :3], moved]))
+        if is_after
+        else i
+        for i, is_after, moved in (
+            (i, is_after, i.cam_from_world[:, :3] @ off[:, 3] + i.cam_from_world[:, 3])
+            for i, is_after in zip(placed.images, after, strict=True)
+        )
+    ]
+    number = np.repeat(np.arange(NUM_POINTS), NUM_IMAGES)
+    later = seen.frame > joint
+    tracks = keep_observations(seen, ((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
+    links = keep_observations(seen, (number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
+    (tmp_path / "placed").mkdir()
+    write_model(tmp_path / "placed", placed.cameras, images, no_points())
+    options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
+    run = SimpleNamespace(
+        options=options, stages=tmp_path, clock=Clock(), progress=no_progress, positions=None
+    )
+    takes = Takes(
+        ("",),
+        ChosenImages([image.name for image in images], placed.frames),
+        placed.take,
+        placed.first_frame,
+        placed.masks,
+    )
+    adjusted = adjustment_stage(
+        *(cast(Any, run), tracks, links, takes, Kept({"poses": "placed"}, "", resumed=False)),
+        corners=lambda _, known: (tracks, known),
+    )
+    found = posed_images(read_model(tmp_path / adjusted.facts["poses"]))
+    centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))
+    steps = np.diff(centres, axis=0)
+    usual = np.median(steps, axis=0)
+    assert np.linalg.norm(steps[joint] - usual) < 0.05 * np.linalg.norm(usual)

@@ -1,0 +1,431 @@
+"""What moves by itself, in tracks of a made-up scene and in a clip."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import render_scene
+from conftest import Encode
+from dense_scene import SCENE, Truth
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, no_points
+from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.geometry.triangulation import (
+    Observations,
+    TriangulatedPoints,
+    Views,
+    triangulate,
+)
+from colmap_av1.images.masks import mask_tracks
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    MatchOptions,
+    ReconstructOptions,
+    TriangulateOptions,
+)
+from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks, place_tracks
+from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
+from colmap_av1.poses.dynamic.regions import moving_cells, shares_above_usual, strong_patches
+from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.reconstruct_poses import PosedImages
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.reconstruct import reconstruct
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.video_tracks import VideoSource, track_video
+from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.video.decoding import decode_frames
+from colmap_av1.video.facts import read_video
+
+WIDTH, HEIGHT, FOCAL, CELL = 320, 240, 300.0, 8
+CAMERA = pycolmap.Camera(
+    camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, 160, 120]
+)
+NUM_IMAGES = 24
+WALL, BOX = 6.0, 4.0
+
+
+@dataclass(frozen=True)
+class Made:
+    placed: PlacedTracks
+    views: list[PosedCamera]
+    moves: NDArray[np.bool_]
+
+
+def cameras(rng: np.random.Generator) -> list[PosedCamera]:
+    """A camera that goes to the right, with an unsteady hand."""
+    step = np.arange(NUM_IMAGES)
+    centres = np.column_stack([0.08 * step, 0.05 * np.sin(step / 2), 0.03 * np.cos(step / 3)])
+    poses = []
+    for centre in centres:
+        rotation = cv2.Rodrigues(0.002 * rng.standard_normal(3))[0]
+        poses.append(np.column_stack([rotation, -rotation @ centre]))
+    return [PosedCamera(CAMERA, pose) for pose in poses]
+
+
+def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> Made:
+    """Tracks of a wall, a box before it and, with a velocity in metres an image, a walker.
+
+    Each point is seen where nothing nearer hides it; a part of the tracks drifts.
+    """
+    rng = np.random.default_rng(3)
+    views = cameras(rng)
+    start = np.array([0.5, 0.0, 3.0])
+    low, high = np.array([-0.25, -0.7]), np.array([0.25, 0.9])
+
+    def grid(x: tuple[float, float], y: tuple[float, float], z: float) -> NDArray[np.float64]:
+        across, down = np.meshgrid(np.arange(*x, CELL * z / FOCAL), np.arange(*y, CELL * z / FOCAL))
+        return np.column_stack([across.ravel(), down.ravel(), np.full(across.size, z)])
+
+    still = np.concatenate([grid((-4, 6), (-3, 3), WALL), grid((-0.9, -0.3), (0, 0.8), BOX)])
+    walker = grid((low[0], high[0]), (low[1], high[1]), 0.0 + start[2]) - [0, 0, start[2]]
+    walker = walker if velocity is not None else walker[:0]
+    speed = np.array(velocity if velocity is not None else (0, 0, 0))
+    found: list[list[tuple[int, float, float]]] = [[] for _ in range(len(still) + len(walker))]
+    for number, view in enumerate(views):
+        # Nobody walks as steadily as a camera on rails: steps alone tell that it is no point.
+        there = start + speed * (number + 3 * np.sin(number / 2))
+        xyz = np.concatenate([still, walker + there])
+        index, xy, depth = view.project(xyz)
+        ray = xyz[index] - view.centre
+        hit = view.centre + ray * ((there[2] - view.centre[2]) / ray[:, 2])[:, None] - there
+        behind_walker = (hit[:, :2] > low).all(axis=1) & (hit[:, :2] < high).all(axis=1)
+        behind_walker &= (index < len(still)) & (len(walker) > 0)
+        at_box = view.centre + ray * ((BOX - view.centre[2]) / ray[:, 2])[:, None]
+        behind_box = (at_box[:, 0] > -0.9) & (at_box[:, 0] < -0.3)
+        behind_box &= (at_box[:, 1] > 0) & (at_box[:, 1] < 0.8) & (depth > BOX + 0.5)
+        for i in np.flatnonzero(~behind_walker & ~behind_box):
+            found[index[i]].append((number, *xy[i]))
+    pieces, moves = [], []
+    for point, seen in enumerate(found):
+        # A track ends where its point is hidden.
+        breaks = np.diff([s[0] for s in seen]) > 1
+        # Encoders' tracks break off at other places, too.
+        breaks |= rng.random(len(breaks)) < 0.07
+        for piece in np.split(seen, np.flatnonzero(breaks) + 1):
+            if len(piece) >= 4:
+                pieces.append(np.array(piece))
+                moves.append(point >= len(still))
+    offsets = np.cumsum([0, *map(len, pieces)])
+    rows = np.concatenate(pieces)
+    xy = rows[:, 1:] + 0.1 * rng.standard_normal((len(rows), 2))
+    drifts = np.repeat(rng.random(len(pieces)) < drift, np.diff(offsets))
+    xy[drifts] += np.cumsum(rng.standard_normal((drifts.sum(), 2)), axis=0) % 6
+    image = rows[:, 0].astype(np.int64)
+    tracks = Tracks(
+        *(NUM_IMAGES, WIDTH, HEIGHT, offsets, image.astype(np.int32), xy.astype(np.float32)),
+        np.full(len(rows), 0.3, np.float32),
+        np.zeros(len(rows), np.bool_),
+    )
+    points = triangulate(
+        Observations(offsets, image, np.asarray(CAMERA.cam_from_img(xy)), tracks.sigma),
+        Views(np.array([v.cam_from_world for v in views]), np.full((NUM_IMAGES, 2), FOCAL)),
+        TriangulateOptions(
+            max_reprojection_error=8.0, min_angle=0.0, max_depth_error=None, points="survey"
+        ),
+    )
+    placed = place_tracks(tracks, image, points, views, cell=CELL)
+    return Made(placed, views, np.array(moves))
+
+
+def test_points_lie_in_cells_of_very_wide_pictures() -> None:
+    width, cell, columns = 40_000, 16, [1, 1000, 2047, 2048, 2499]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=64, params=[100, 100, 0, 32])
+    views = [PosedCamera(camera, np.eye(4)[:3]) for _ in range(2)]
+    one, first = np.ones(5), np.zeros(5, np.int64)
+    x = (np.array(columns) + 0.5) * cell
+    xyz = np.column_stack([x / 100, 0 * one, one])
+    # The first image sees each of them all the time, the other one shows where they should be.
+    length = 6
+    track = np.repeat(np.arange(5), length)
+    column = (x // cell).astype(np.int64)[track]
+    placed = PlacedTracks(
+        *((2, 4, width // cell), cell, np.arange(0, 31, length), track, first[track]),
+        *(0 * column + 2, column, one[track], 0 * one, xyz),
+    )
+    unseen = Contradictions(placed, views).unseen(np.zeros(5, np.bool_))
+    assert not unseen[0].any()
+    assert np.argwhere(unseen[1]).tolist() == [[2, k] for k in columns]
+
+
+# Along the epipolar lines against the camera and faster than it, towards it, and upwards.
+WALKS = [(-0.05, 0, 0), (0.13, 0, 0), (-0.01, 0, -0.06), (0, -0.03, 0)]
+
+
+@pytest.mark.parametrize("velocity", WALKS)
+def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, float]) -> None:
+    scene = made(velocity)
+    found = Contradictions(scene.placed, scene.views)
+    by_depth = found.by_depth(np.zeros(len(scene.moves), np.bool_))
+    assert np.mean(by_depth[scene.moves]) > 0.2
+    assert np.mean(by_depth[~scene.moves]) < 0.01
+    cells = moving_cells(scene.placed, scene.views)
+    placed = scene.placed
+    within = placed.mean(cells[placed.image, placed.row, placed.column])
+    assert np.mean(within[scene.moves] > 0.5) > 0.9
+    # Grown by a cell, so what is beside is touched.
+    assert np.mean(within[~scene.moves] > 0.5) < 0.12
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.3])
+def test_nothing_moves_in_a_still_scene(drift: float) -> None:
+    """A box before a wall hides and shows it; encoders let tracks of smooth surfaces drift."""
+    scene = made(None, drift=drift)
+    assert not moving_cells(scene.placed, scene.views).any()
+
+
+def test_what_is_known_to_move_is_not_the_usual() -> None:
+    """Of a scene most of which moves, the rest says by itself what it usually says."""
+    placed = made(None).placed
+    _, _, columns = placed.shape
+    moving = np.zeros(placed.shape, np.bool_)
+    moving[:, :, : 2 * columns // 3] = True
+    within = placed.mean(moving[placed.image, placed.row, placed.column])
+    says = np.where(within > 0.5, 1.0, 0.3)
+    inside = (slice(None), slice(4, -4), slice(2 * columns // 3 + 6, -4))
+    for still, expected in ((~moving, 0.0), (np.ones_like(moving), -0.7)):
+        share = shares_above_usual(placed, says, still)[inside]
+        assert np.median(share) == pytest.approx(expected, abs=0.05)
+
+
+def test_patches_that_only_time_joins_to_what_moves_are_left_out() -> None:
+    cells, share = np.zeros((2, 20, 30), np.bool_), np.full((2, 20, 30), 0.1)
+    cells[:, 2:10, 3:9] = True
+    share[:, 4:9, 4:8] = 0.7
+    cells[0, 12:16, 20:26] = True  # at the edge of what somebody passed
+    share[0, 12, 20] = 0.7
+    found = strong_patches(cells, share)
+    assert found[:, 2:10, 3:9].all()
+    assert found.sum() == 2 * 8 * 6
+
+
+def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None:
+    images = [[0, 1, 2], [2, 3, 4, 5], [3, 4, 5, 6, 7], [4, 5, 6, 8], [9, 10, 11]]
+    count = len(images)
+    points = ModelPoints(
+        *(np.zeros((count, 3)), np.zeros((count, 3), np.uint8), np.zeros(count)),
+        np.cumsum([0, *map(len, images)]),
+        *(np.concatenate(images), np.zeros((sum(map(len, images)), 2))),
+    )
+    shows_moving = np.isin(np.arange(12), range(2, 8))
+    assert surely_still(points, shows_moving).tolist() == [0, 2, 3, 4]
+    assert surely_still(points, np.ones(12, np.bool_)).tolist() == [2]
+    assert surely_still(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
+    assert len(surely_still(no_points(), shows_moving)) == 0
+
+
+# A poster of so many pixels that goes across the pictures of the rendered courtyard.
+POSTER = (88, 200)
+NUM_FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def walked(
+    encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, NDArray[np.bool_]]:
+    """A clip with a textured thing that moves against the picture, and where that is."""
+    scene = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
+    shown = (picture for _, picture in decode_frames(scene))
+    frames = np.array(list(itertools.islice(shown, NUM_FRAMES)))
+    rng = np.random.default_rng(5)
+    texture = rng.integers(0, 256, (POSTER[1] // 8, POSTER[0] // 8, 3), dtype=np.uint8)
+    texture = cv2.resize(texture, POSTER, interpolation=cv2.INTER_CUBIC)
+    there = np.zeros(frames.shape[:3], np.bool_)
+    for number, frame in enumerate(frames):
+        x, y = 120 + 6 * number + round(4 * np.sin(number)), 100
+        frame[y : y + POSTER[1], x : x + POSTER[0]] = texture
+        there[number, y : y + POSTER[1], x : x + POSTER[0]] = True
+    return encode(frames, tmp_path_factory.mktemp("walked") / "walked.mp4"), there
+
+
+def test_reconstruct_leaves_out_what_moves(
+    walked: tuple[Path, NDArray[np.bool_]], truth: Truth, tmp_path: Path
+) -> None:
+    video, there = walked
+    options = ReconstructOptions(
+        match=MatchOptions(
+            images=ImageOptions(every=1),
+            camera=CameraOptions(camera_model="PINHOLE", camera_params="520,520,320,180"),
+        ),
+        moving="mask",
+    )
+    report = reconstruct(video, tmp_path / "out", options=options)
+    model = pycolmap.Reconstruction(report.output / "sparse" / "0")
+    assert len(model.images) == NUM_FRAMES
+    on_it = total = 0
+    for image in model.images.values():
+        xy = np.array([p.xy for p in image.points2D if p.has_point3D()]).astype(int)
+        on_it += int(there[int(image.name[6:12]), xy[:, 1], xy[:, 0]].sum())
+        total += len(xy)
+    assert total > 20_000
+    masks = sorted((report.output / "masks").iterdir())
+    found = np.array([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) == 0 for path in masks])
+    assert np.mean(found[there]) > 0.8
+    assert on_it < 0.002 * total
+    assert np.mean(found[~there]) < 0.08
+    assert report.moving == pytest.approx(found.mean(), rel=0.05)
+    errors = pose_errors(model_poses(model, NUM_FRAMES), truth.cam_from_world[:NUM_FRAMES])
+    assert errors is not None
+    assert errors.ate < 0.0002 * errors.extent
+
+
+@dataclass(frozen=True)
+class Passed:
+    """The scene with a broad band that goes across its pictures and cuts the tracks it hides.
+
+    Attributes:
+        run: what the stages before leave.
+        moving: masks that leave out the band, by the images' names.
+        tracks: tracks of the scene, ended and begun anew at the band.
+        placed: its images.
+        left: the first column of the band in each.
+    """
+
+    run: Run
+    moving: dict[str, Mask]
+    tracks: Tracks
+    placed: PosedImages
+    left: NDArray[np.int64]
+
+
+@pytest.fixture(scope="module")
+def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
+    video = read_video(SCENE)
+    source = VideoSource(video, video)
+    every = track_video(
+        source, MatchOptions(), one_size=True, clock=Clock(), progress=no_progress
+    ).tracks
+    frames = np.arange(NUM_FRAMES, dtype=np.int32)
+    left = 60 + 14 * np.arange(NUM_FRAMES)
+    column = np.arange(640)
+    masks = [
+        make_mask(np.tile((column < at) | (column >= at + 100), (360, 1))) for at in left.tolist()
+    ]
+    names = [f"{frame}.png" for frame in frames]
+    placed = PosedImages(
+        images=[
+            ModelImage(frame + 1, name, 7, truth.cam_from_world[frame])
+            for frame, name in enumerate(names)
+        ],
+        frames=frames,
+        take=np.zeros(NUM_FRAMES, np.int32),
+        first_frame=np.array([0, every.num_frames]),
+        cameras={7: truth.camera},
+        masks=(None,) * NUM_FRAMES,
+    )
+    inputs: Any = None  # for stages before
+    folder = tmp_path_factory.mktemp("passed")
+    run = Run(*(inputs, (source,), folder, folder, ReconstructOptions(), Clock(), no_progress))
+    some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
+    cut = mask_tracks(keep_frames(every, frames), dict(enumerate(masks)), 4)
+    moving = dict(zip(names, masks, strict=True))
+    return Passed(run, moving, select_tracks(cut, some), placed, left)
+
+
+def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The observations before gaps of five and more frames, and pixels by which tracks are off
+    behind some of them."""
+    before = np.flatnonzero((np.diff(tracks.frame) > 5) & (np.diff(tracks.track) == 0))
+    scene = render_scene.build_scene()
+    off = []
+    for row in before[::3]:
+        xy, _ = render_scene.transfer(
+            scene, tracks.xy[[row]].astype(float), *tracks.frame[[row, row + 1]].tolist()
+        )
+        off.append(np.linalg.norm(xy[0] - tracks.xy[row + 1]))
+    return before, np.array(off)
+
+
+def test_tracks_are_followed_behind_what_passes(passed: Passed) -> None:
+    found = follow_behind(passed.run, passed.moving, passed.tracks, passed.placed)
+    assert len(found.frame) > 1.1 * len(passed.tracks.frame)
+    assert len(off_behind(passed.tracks)[0]) < 10
+    taken_up, off = off_behind(found)
+    assert len(taken_up) > 80
+    assert np.median(off) < 0.25
+    assert np.quantile(off, 0.9) < 1
+    left = passed.left[found.frame]
+    on_it = (found.xy[:, 0] >= left + 1) & (found.xy[:, 0] < left + 99)
+    assert on_it.mean() < 0.001
+
+
+@pytest.mark.parametrize("pixels", [1, 7])
+def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) -> None:
+    """What lies where a track is expected in vain is not followed from there on."""
+    turn = Rotation.from_euler("y", pixels / 520).as_matrix()
+    images = [
+        replace(image, cam_from_world=turn @ image.cam_from_world) if frame >= 20 else image
+        for frame, image in enumerate(passed.placed.images)
+    ]
+    early = keep_frames(passed.tracks, np.arange(20, dtype=np.int32))
+    found = follow_behind(passed.run, passed.moving, early, replace(passed.placed, images=images))
+    first = np.repeat(found.offsets[:-1], np.diff(found.offsets))
+    late = np.flatnonzero(found.frame >= 20)
+    if pixels > 1:  # beyond what is searched
+        assert len(late) < 10
+        return
+    assert len(late) > 100
+    scene = render_scene.build_scene()
+    off = []
+    for row in late[::40]:
+        frames = found.frame[[first[row], row]].tolist()
+        xy, _ = render_scene.transfer(scene, found.xy[[first[row]]].astype(float), *frames)
+        off.append(np.linalg.norm(xy[0] - found.xy[row]))
+    assert np.median(off) < 0.4
+
+
+def test_points_are_looked_for_where_they_should_be_seen() -> None:
+    rng = np.random.default_rng(3)
+    views = cameras(rng)
+    x, y = np.meshgrid(np.arange(-3.0, 5.0, 0.5), np.arange(-2.0, 2.5, 0.5))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, WALL)])
+    # Of each the first three images that show it, and three after a gap.
+    rows = []
+    shown = [dict(zip(*view.project(xyz)[:2], strict=True)) for view in views]
+    for point in range(len(xyz)):
+        images = [i for i, own in enumerate(shown) if point in own]
+        rows += [(point, i, *shown[i][point]) for i in [*images[:3], *images[5:8]]]
+    table = np.array(rows)
+    point, image = table[:, :2].astype(np.int64).T
+    kept = np.isin(point, np.flatnonzero(np.bincount(point) == 6))
+    number = np.unique(point[kept])
+    offsets = 6 * np.arange(len(number) + 1)
+    frames = np.arange(0, 2 * NUM_IMAGES, 2, dtype=np.int32)
+    tracks = Tracks(
+        *(frames[-1] + 1, WIDTH, HEIGHT, offsets, frames[image[kept]]),
+        table[kept, 2:].astype(np.float32),
+        *(np.full(kept.sum(), 0.3, np.float32), np.zeros(kept.sum(), np.bool_)),
+    )
+    points = TriangulatedPoints(
+        *(xyz[number], np.zeros(len(number)), offsets, np.arange(kept.sum())),
+        *(len(number), len(number)),
+    )
+    left_half = np.ones((HEIGHT, WIDTH), np.bool_)
+    left_half[:, : WIDTH // 2] = False
+    views = [replace(view, mask=make_mask(left_half)) for view in views]
+    found, expected = expect_in_views(tracks, image[kept], points, views, frames)
+    # What was seen stays, and each point is expected where it is in other images, later ones only,
+    # off the edge and where the mask does not leave it out.
+    np.testing.assert_array_equal(found.xy[~expected], tracks.xy)
+    np.testing.assert_array_equal(found.frame[~expected], tracks.frame)
+    assert expected.sum() > 300
+    for row in np.flatnonzero(expected):
+        own, seen_in = found.track[row], int(found.frame[row]) // 2
+        np.testing.assert_allclose(found.xy[row], shown[seen_in][number[own]], atol=1e-3)
+        assert found.xy[row, 0] >= WIDTH // 2
+        assert found.frame[row] > tracks.frame[offsets[own]]
+        assert found.frame[row] not in tracks.frame[offsets[own] : offsets[own + 1]]
+    assert (np.diff(found.frame)[np.diff(found.track) == 0] > 0).all()

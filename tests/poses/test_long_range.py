@@ -1,0 +1,94 @@
+"""Views from far apart in time held against poses, of models that hold together and that do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_av1 import ImageError
+from colmap_av1.cli import main
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.poses.long_range import model_far_views
+from colmap_av1.reconstruct import ReconstructReport
+
+_FAILED_CHECK = 1
+
+
+@pytest.fixture(scope="module")
+def bent(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model with the later half of its images turned by five degrees about the camera."""
+    model = read_model(made.output / "sparse" / "0")
+    half = len(model.images) // 2
+    turn = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(cv2.Rodrigues(np.radians([5.0, 0, 0]))[0]), np.zeros(3)
+    )
+    for image in sorted(model.images.values(), key=lambda image: image.name)[half:]:
+        frame = model.frames[image.frame_id]
+        frame.rig_from_world = turn * image.cam_from_world()
+    folder = tmp_path_factory.mktemp("bent") / "0"
+    folder.mkdir()
+    model.write(folder)
+    return folder
+
+
+def test_model_that_holds_together(made: ReconstructReport) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    found = model_far_views(model, made.output / "images")
+    assert found.median == pytest.approx(made.far_views, rel=0.05)
+    assert found.median is not None
+    assert found.median < 1
+    assert found.warning() is None
+
+
+def test_bent_model_is_told(
+    made: ReconstructReport, bent: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = made.output / "images"
+    found = model_far_views(read_model(bent), images)
+    assert found.median is not None
+    assert found.median > 10
+    assert found.warning() is not None
+    words = ["check", "--strict", "--model", str(bent), "--image_path", str(images)]
+    assert main(words) == _FAILED_CHECK
+    told = capsys.readouterr()
+    assert "far views agree to" in told.out
+    assert "surfaces may be doubled" in told.err
+    whole = ["check", "--strict", "--model", str(made.output / "sparse" / "0")]
+    assert main([*whole, "--image_path", str(images)]) == 0
+
+
+def test_pictures_that_show_nothing_are_told(made: ReconstructReport, tmp_path: Path) -> None:
+    for path in (made.output / "images").iterdir():
+        blurred = cv2.blur(cv2.imread(str(path)), (61, 61))
+        cv2.imwrite(str(tmp_path / path.name), blurred)
+    found = model_far_views(read_model(made.output / "sparse" / "0"), tmp_path)
+    assert found.median is None
+    warning = found.warning()
+    assert warning is not None
+    assert "show nothing in common" in warning
+
+
+def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: Path) -> None:
+    for path in (made.output / "images").iterdir():
+        cv2.imwrite(str(tmp_path / path.name), np.zeros((20, 30, 3), np.uint8))
+    with pytest.raises(ImageError, match="30x20"):
+        model_far_views(read_model(made.output / "sparse" / "0"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "give --database, or --model"),
+        (["--model", "m"], "give both --model and --image_path"),
+        (["--database", "d.db", "--image_path", "i"], "give both --model and --image_path"),
+    ],
+)
+def test_half_a_question_is_refused(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", *words]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from dense_scene import NUM_IMAGES, Truth
+from scipy.spatial.transform import Rotation
+
+from colmap_av1.errors import ModelError
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.geometry.colmap_model import posed_images, read_model
+from colmap_av1.options import MapOptions, Mapper
+from colmap_av1.poses import mapper as mapper_module
+from colmap_av1.reconstruct import ReconstructReport
+from colmap_av1.util.progress import Progress, no_progress
+
+
+def run_mapper(folder: Path, database: Path, mapper: Mapper, progress: Progress) -> None:
+    mapper_module.map_poses(
+        database,
+        folder / "poses",
+        MapOptions(mapper=mapper, num_threads=1),
+        image_path=None,
+        log=folder / "log",
+        num_images=NUM_IMAGES,
+        progress=progress,
+    )
+
+
+def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> None:
+    def interrupt(stage: str, done: int, total: int | None) -> None:
+        if done >= 2:
+            raise KeyboardInterrupt
+
+    copy = tmp_path / "mapped.db"
+    copy.write_bytes(made.database.read_bytes())
+    with pytest.raises(KeyboardInterrupt):
+        run_mapper(tmp_path, copy, "incremental", interrupt)
+    assert not list((tmp_path / "poses").rglob("*.bin"))
+
+
+def test_mapper_that_fails(tmp_path: Path) -> None:
+    (tmp_path / "no.db").write_bytes(b"no database")
+    with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log says where"):
+        run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
+    assert (tmp_path / "log").stat().st_size > 0
+
+
+def test_mapper_starts_from_the_longest_tracks(
+    made: ReconstructReport, truth: Truth, tmp_path: Path
+) -> None:
+    """And finds the points of the others, too."""
+    found = {}
+    for start_tracks in (None, 40):
+        folder = tmp_path / str(start_tracks)
+        folder.mkdir()
+        copy = folder / "mapped.db"
+        copy.write_bytes(made.database.read_bytes())
+        sizes = mapper_module.map_poses(
+            copy,
+            folder / "poses",
+            MapOptions(mapper="global", num_threads=1),
+            image_path=None,
+            log=folder / "log",
+            num_images=NUM_IMAGES,
+            progress=no_progress,
+            start_tracks=start_tracks,
+        )
+        model = read_model(folder / "poses" / "0")
+        counts = re.search(r"Before filtering: (\d+), after filtering: (\d+)", log_of(folder))
+        assert counts is not None
+        error = pose_errors(model_poses(model, 60), truth.cam_from_world)
+        found[start_tracks] = (sizes, [int(n) for n in counts.groups()], model, error)
+    (sizes, (before, after), whole, error), (few_sizes, few, model, few_error) = found.values()
+    assert few_sizes == sizes == (made.num_key_images,)
+    assert (few[0], after) == (before, before)
+    assert few[1] < before / 2
+    assert model.num_points3D() > 0.9 * whole.num_points3D()
+    assert few_error.rotation < 2 * error.rotation
+
+
+def log_of(folder: Path) -> str:
+    return (folder / "log").read_text()
+
+
+def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
+    model = read_model(made.output / ".stages" / "adjusted")
+    rng = np.random.default_rng(0)
+    for frame in model.frames.values():
+        pose = frame.rig_from_world
+        turn = pycolmap.Rotation3d(rng.normal(0.0, 0.004, 3)) * pose.rotation
+        frame.rig_from_world = pycolmap.Rigid3d(turn, pose.translation + rng.normal(0.0, 0.02, 3))
+    bent = pose_errors(model_poses(model, 60), truth.cam_from_world)
+    focal_length = model.cameras[1].mean_focal_length()
+    model.write_binary(tmp_path)
+    mapper_module.adjust_model(
+        tmp_path,
+        refine_intrinsics=False,
+        loss_scales=(0.5,),
+        seed=0,
+        num_threads=1,
+        log=tmp_path / "log",
+    )
+    adjusted = read_model(tmp_path)
+    errors = pose_errors(model_poses(adjusted, 60), truth.cam_from_world)
+    before = pose_errors(
+        model_poses(read_model(made.output / "sparse" / "0"), 60), truth.cam_from_world
+    )
+    assert errors.rotation < min(bent.rotation / 3, before.rotation + 0.05)
+    assert errors.ate < min(bent.ate / 3, before.ate * 1.5)
+    assert adjusted.cameras[1].mean_focal_length() == focal_length
+
+
+def test_the_end_of_a_video_bends_back(
+    made: ReconstructReport, truth: Truth, tmp_path: Path
+) -> None:
+    """The last images are off together with what they see: only points at the joint tell."""
+    model = read_model(made.output / ".stages" / "adjusted")
+    for number, point in list(model.points3D.items()):
+        if point.track.length() > 6:
+            model.delete_point3D(number)
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    last = {image.image_id for image in images[-6:]}
+    joint = images[-7].projection_center()
+    turn = Rotation.from_euler("y", 4, degrees=True).as_matrix()
+    bent = pycolmap.Sim3d(1.5, pycolmap.Rotation3d(turn), joint - 1.5 * turn @ joint)
+    for point in model.points3D.values():
+        if np.mean([element.image_id in last for element in point.track.elements]) > 0.5:
+            point.xyz = bent * point.xyz
+    for image in images[-6:]:
+        centre = bent * image.projection_center()
+        rotation = image.frame.rig_from_world.rotation.matrix() @ turn.T
+        image.frame.rig_from_world = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(rotation), -rotation @ centre
+        )
+    before = model_poses(model, 60)
+    errors = {}
+    for scales in ((0.25,), (1.0, 0.25)):
+        model.write_binary(tmp_path)
+        how = {"refine_intrinsics": False, "seed": 0, "num_threads": 1, "log": tmp_path / "log"}
+        mapper_module.adjust_model(tmp_path, loss_scales=scales, **how)
+        poses = model_poses(read_model(tmp_path), 60)
+        errors[scales] = pose_errors(poses, truth.cam_from_world).ate
+    assert pose_errors(before, truth.cam_from_world).ate > 0.08
+    assert errors[1.0, 0.25] < 0.003
+    assert errors[0.25,] > 10 * errors[1.0, 0.25]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
+def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
+    """COLMAP says nothing of what it cannot write."""
+    import resource  # noqa: PLC0415 - there is none on Windows
+
+    shutil.copytree(made.output / ".stages" / "adjusted", tmp_path / "model")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(ModelError, match="was not written to its end: see that the disk has"):
+            mapper_module.adjust_model(
+                tmp_path / "model",
+                refine_intrinsics=False,
+                loss_scales=(0.5,),
+                seed=0,
+                num_threads=1,
+                log=tmp_path / "log",
+            )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(("kept", "stays"), [(8, False), (29, False), (30, True)])
+def test_images_that_see_hardly_any_point_are_left_out(
+    made: ReconstructReport, tmp_path: Path, kept: int, stays: bool
+) -> None:
+    """Nothing but a few points tells their pose, as where something near fills the picture."""
+    model = read_model(made.output / ".stages" / "adjusted")
+    assert model.num_reg_images() == NUM_IMAGES
+    image = min(model.images.values(), key=lambda image: image.name)
+    seen = [index for index, p in enumerate(image.points2D) if p.has_point3D()]
+    for index in seen[kept:]:
+        model.delete_observation(image.image_id, index)
+    model.write_binary(tmp_path)
+    found = mapper_module.without_unseen_images(tmp_path)
+    names = {own.name for own in model.images.values()} - (set() if stays else {image.name})
+    assert set(posed_images(found)) == set(posed_images(read_model(tmp_path))) == names
+
+
+def test_images_of_a_model_of_few_points_stay(made: ReconstructReport, tmp_path: Path) -> None:
+    model = read_model(made.output / ".stages" / "adjusted")
+    by_length = sorted(model.points3D, key=lambda number: -model.points3D[number].track.length())
+    for number in by_length[25:]:
+        model.delete_point3D(number)
+    model.write_binary(tmp_path)
+    before = (tmp_path / "images.bin").read_bytes()
+    found = mapper_module.without_unseen_images(tmp_path)
+    assert 0 < min(image.num_points3D for image in found.images.values()) <= 25
+    assert found.num_reg_images() == NUM_IMAGES
+    assert (tmp_path / "images.bin").read_bytes() == before

@@ -1,0 +1,199 @@
+"""What joins neighbouring images of a model, and where it hardly does."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+import pytest
+
+from colmap_av1.check.crossings import model_crossings
+from colmap_av1.cli import main
+from colmap_av1.geometry.cameras import make_camera
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.options import CameraOptions
+from colmap_av1.poses.seams import model_joints
+from colmap_av1.reconstruct import ReconstructReport
+
+_FAILED_CHECK = 1
+_LEFT = 5
+_SOUND = 0.95
+
+
+def test_model_that_holds_together(made: ReconstructReport) -> None:
+    joints = model_joints(read_model(made.output / "sparse" / "0"))
+    assert len(joints.pairs) == made.num_registered - 1
+    assert joints.weak == []
+    assert joints.warning is None
+
+
+def test_a_joint_that_few_points_hold(
+    made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    by_name = sorted(model.images.values(), key=lambda image: image.name)
+    middle = len(by_name) // 2
+    before = {image.image_id for image in by_name[:middle]}
+    joining = []
+    for point_id, point in sorted(model.points3D.items()):
+        own = [element.image_id in before for element in point.track.elements]
+        if any(own) and not all(own):
+            joining.append((len({e.image_id for e in point.track.elements}) > 2, point_id))
+    for _, point_id in sorted(joining)[:-_LEFT]:
+        model.delete_point3D(point_id)
+
+    joints = model_joints(model)
+    first, second = by_name[middle - 1].name, by_name[middle].name
+    assert [joints.pairs[i] for i in joints.weak] == [(first, second)]
+    assert joints.num_points[joints.weak].tolist() == [_LEFT]
+
+    model.write(tmp_path)
+    words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
+    assert main(["check", "--strict", *words]) == _FAILED_CHECK
+    assert f"only {_LEFT} points join '{first}'" in capsys.readouterr().err
+
+
+def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
+    """Thirty images in a row; 100 points join neighbours, 500 are seen by the first and last."""
+    write_row(tmp_path, [[k, k + 1, k + 2] for k in range(28) for _ in range(100)], 500)
+    found = model_joints(read_model(tmp_path)).num_points
+    assert found.tolist() == [600, *[200] * 27, 600]
+
+
+def test_a_cut_is_no_weak_joint_where_its_sides_see_each_other_elsewhere(tmp_path: Path) -> None:
+    views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
+    write_row(tmp_path, views, 20)
+    assert model_joints(read_model(tmp_path)).weak == [14]
+    write_row(tmp_path, views, 150)
+    assert model_joints(read_model(tmp_path)).weak == []
+
+
+def write_row(folder: Path, views: list[list[int]], again: int) -> None:
+    """Write a model of thirty images in a row.
+
+    Args:
+        folder: gets the model.
+        views: for points, which images see them.
+        again: further points, that the first two and the last two see.
+    """
+    camera = make_camera(CameraOptions(), 640, 480)
+    poses = [np.column_stack([np.eye(3), [-0.1 * k, 0.0, 0.0]]) for k in range(30)]
+    images = [
+        ModelImage(k + 1, f"{k:03}.png", int(camera.camera_id), pose)
+        for k, pose in enumerate(poses)
+    ]
+    views = [*views, *[[0, 1, 28, 29]] * again]
+    count = len(views)
+    points = ModelPoints(
+        xyz=np.tile([1.5, 0.0, 5.0], (count, 1)),
+        rgb=np.zeros((count, 3), np.uint8),
+        error=np.zeros(count),
+        offsets=np.concatenate([[0], np.cumsum([len(own) for own in views])]),
+        image=np.concatenate(views),
+        xy=np.zeros((sum(map(len, views)), 2)),
+    )
+    write_model(folder, {int(camera.camera_id): camera}, images, points)
+
+
+def test_parts_that_are_joined_wrongly(
+    made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All after the middle is turned about it, as where a mapper takes the wrong of two poses."""
+    model = read_model(made.output / "sparse" / "0")
+    database = made.output / "database.db"
+    sound = model_crossings(model, database)
+    assert len(sound.pairs) == made.num_registered - 1
+    assert sound.share.min() > _SOUND
+    assert sound.warning is None
+
+    by_name = sorted(model.images.values(), key=lambda image: image.name)
+    middle = len(by_name) // 2
+    turn = pycolmap.Rotation3d(np.array([0, 0, np.sin(0.1), np.cos(0.1)]))
+    about = by_name[middle].cam_from_world()
+    aside = about.inverse() * pycolmap.Rigid3d(turn, np.zeros(3)) * about
+    for image in by_name[middle:]:
+        image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * aside)
+    bent = model_crossings(model, database)
+    first, second = by_name[middle - 1].name, by_name[middle].name
+    assert (first, second) in [bent.pairs[i] for i in bent.wrong]
+    assert bent.warning is not None
+    named = re.search("across '(.*)' and '(.*)' fit the poses", bent.warning)
+    assert named is not None
+    assert named[1] <= first < second <= named[2]
+
+    model.write(tmp_path)
+    words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
+    assert main(["check", "--strict", "--database", str(database), *words]) == _FAILED_CHECK
+    assert "joined wrongly there" in capsys.readouterr().err
+
+
+def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int = 0) -> list[str]:
+    """Write the model of a camera that walks, turns about itself and walks on.
+
+    Args:
+        folder: gets the model.
+        degrees: by which it turns.
+        aside: how far it moves meanwhile.
+        rest: images before it walks.
+
+    Returns:
+        The names of the images from the last before the turn to the first after it.
+    """
+    before, turning = 12, 20
+    share = np.concatenate([np.zeros(rest + before), np.linspace(0, 1, turning), np.ones(before)])
+    walked = np.concatenate([np.full(rest, -2), np.linspace(-2, 0, before)])
+    turned = aside * np.linspace(0, 1, turning)
+    along = np.concatenate([walked, turned, aside + np.linspace(0.2, 2, before)])
+    rng = np.random.default_rng(0)
+    direction = np.radians(rng.uniform(-60, 60 + degrees, 4000))
+    far = rng.uniform(5, 12, 4000)
+    xyz = np.column_stack(
+        [far * np.sin(direction), rng.uniform(-2, 2, 4000), far * np.cos(direction)]
+    )
+    camera = make_camera(CameraOptions("SIMPLE_PINHOLE", "600,320,240"), 640, 480)
+    images, seen, xy = [], [], []
+    for k, (turn, x) in enumerate(zip(np.radians(degrees) * share, along, strict=True)):
+        rotation = pycolmap.Rotation3d(
+            np.array([0, np.sin(-turn / 2), 0, np.cos(turn / 2)])
+        ).matrix()
+        pose = np.column_stack([rotation, -rotation @ [x, 0, 0]])
+        images.append(ModelImage(k + 1, f"frame_{k:06d}.png", 1, pose))
+        local = xyz @ rotation.T + pose[:, 3]
+        at = 600 * local[:, :2] / local[:, 2:] + [320, 240]
+        seen.append((local[:, 2] > 0) & (at > 0).all(axis=1) & (at < [640, 480]).all(axis=1))
+        xy.append(at)
+    point, image = np.nonzero(np.array(seen).T)
+    counts = np.count_nonzero(seen, axis=0)
+    points = ModelPoints(
+        *(xyz[counts > 0], np.zeros((np.count_nonzero(counts), 3), np.uint8)),
+        error=np.zeros(np.count_nonzero(counts)),
+        offsets=np.append(0, np.cumsum(counts[counts > 0])),
+        image=image,
+        xy=np.array(xy)[image, point],
+    )
+    write_model(folder, {1: camera}, images, points)
+    return [image.name for image in images[rest + before - 1 : rest + before + turning + 1]]
+
+
+@pytest.mark.parametrize(("degrees", "aside", "rest"), [(25, 0.0, 0), (80, 1.0, 0), (25, 0.0, 10)])
+def test_turns_that_something_is_seen_across(
+    tmp_path: Path, degrees: float, aside: float, rest: int
+) -> None:
+    _walk_with_a_turn(tmp_path, degrees, aside, rest)
+    joints = model_joints(read_model(tmp_path))
+    assert joints.unscaled == []
+    assert joints.warning is None
+
+
+def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
+    turn = _walk_with_a_turn(tmp_path, degrees=80)
+    joints = model_joints(read_model(tmp_path))
+    assert joints.weak == []
+    lost = {joints.pairs[i] for i in joints.unscaled}
+    assert len(lost) > len(turn) / 2
+    assert lost <= set(pairwise(turn))
+    assert joints.warning is not None
+    assert joints.warning.startswith("nothing carries the scale from 'frame_0000")

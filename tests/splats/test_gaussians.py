@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.splats.gaussians import (
+    Gaussians,
+    check_gaussians_path,
+    initial_gaussians,
+    write_gaussians,
+)
+
+FOCAL = 400.0
+CAMERA = pycolmap.Camera(
+    camera_id=1, model="PINHOLE", width=640, height=360, params=[FOCAL, FOCAL, 320, 180]
+)
+STEP = 0.05  # between points of a surface
+
+
+def views(step: float, count: int = 8) -> list[PosedCamera]:
+    """A camera that moves to the right by steps."""
+    poses = [np.column_stack([np.eye(3), [-step * i, 0, 0]]) for i in range(count)]
+    return [PosedCamera(CAMERA, pose) for pose in poses]
+
+
+def seen(xyz: np.ndarray, images: list[PosedCamera], error: np.ndarray) -> ModelPoints:
+    """The points, each seen by all images."""
+    n, m = len(xyz), len(images)
+    offsets = np.arange(n + 1) * m
+    rgb = np.tile(np.array([200, 100, 50], np.uint8), (n, 1))
+    xy = np.zeros((n * m, 2))
+    return ModelPoints(xyz, rgb, error, offsets, np.tile(np.arange(m), n), xy)
+
+
+def slope(depth: float, tilt: float = 0.5) -> np.ndarray:
+    """Points of a plane, evenly spread across it; its normal is (-tilt, 0, 1)."""
+    x, y = np.meshgrid(np.arange(-20, 21) * STEP, np.arange(-15, 16) * STEP)
+    return np.column_stack([x.ravel(), y.ravel(), depth + tilt * x.ravel()])
+
+
+def turned(gaussians: Gaussians) -> np.ndarray:
+    """Rotation matrices of the quaternions."""
+    w, x, y, z = gaussians.rotation.T
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+
+
+def test_discs_lie_on_their_surface() -> None:
+    """They cover it at half the distance of neighbours, and are thin where depth is sure."""
+    images = views(0.5)
+    xyz = slope(5.0)
+    made = initial_gaussians(seen(xyz, images, np.full(len(xyz), 0.0)), images)
+    normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    inner = (np.abs(xyz[:, 0]) < 0.9) & (np.abs(xyz[:, 1]) < 0.7)
+    assert np.abs(made.normal[inner] @ normal).min() > 0.999
+    axes = turned(made)
+    assert np.allclose(axes @ axes.transpose(0, 2, 1), np.eye(3), atol=1e-9)
+    assert np.allclose(np.linalg.det(axes), 1)
+    assert np.allclose(axes[:, :, 2], made.normal)
+    across = made.scale[inner, 0]
+    assert np.array_equal(across, made.scale[inner, 1])
+    assert (np.abs(across / (0.5 * STEP) - 1) < 0.3).all()
+    assert (made.scale[inner, 2] < 0.45 * across).all()
+
+
+def test_unknown_depth_is_thick_and_far_surfaces_are_coarse() -> None:
+    images = views(0.5)
+    near, far = slope(5.0, 0.0), 4 * slope(5.0, 0.0)
+    error = np.concatenate([np.full(len(near), -1.0), np.full(len(far), 3.0)])
+    made = initial_gaussians(seen(np.concatenate([near, far]), images, error), images)
+    assert np.allclose(made.scale[:, 2], 0.5 * made.scale[:, 0])
+    ratio = np.median(made.scale[len(near) :, 0]) / np.median(made.scale[: len(near), 0])
+    assert 3.5 < ratio < 4.5
+
+
+def test_coinciding_lone_and_unseen_points_have_sizes() -> None:
+    images = views(0.1)
+    behind = np.array([0.0, 0, -5])
+    for xyz in ([[0.0, 0, 5]] * 3 + [behind], [[0.0, 0, 5]], [behind] * 2):
+        points = np.array(xyz, dtype=np.float64).reshape(-1, 3)
+        made = initial_gaussians(seen(points, images, np.zeros(len(points))), images)
+        assert np.isfinite(made.scale).all()
+        assert (made.scale > 0).all()
+        assert np.isfinite(made.rotation).all()
+
+
+def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
+    images = views(0.5)
+    xyz = slope(5.0)
+    made = initial_gaussians(seen(xyz, images, np.zeros(len(xyz))), images)
+    path = tmp_path / "below" / "init.ply"
+    write_gaussians(path, made)
+    assert [p.name for p in path.parent.iterdir()] == ["init.ply"]
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = header.decode().split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[2].startswith("comment ")
+    assert lines[3] == f"element vertex {len(xyz)}"
+    names = [line.split()[2] for line in lines[4:] if line]
+    assert all(line.startswith("property float ") for line in lines[4:] if line)
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    # The reference implementation refuses any other number.
+    rest = [name for name in names if name.startswith("f_rest_")]
+    assert rest == [f"f_rest_{i}" for i in range(3 * (3 + 1) ** 2 - 3)]
+    assert names[54:] == [
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    table = np.frombuffer(body, "<f4").reshape(len(xyz), len(names))
+    assert np.allclose(table[:, :3], xyz)
+    assert np.allclose(table[:, 6:9] * 0.28209479177387814 + 0.5, made.rgb / 255, atol=1e-6)
+    assert (table[:, 9:54] == 0).all()
+    assert np.allclose(1 / (1 + np.exp(-table[:, 54])), made.opacity)
+    assert np.allclose(np.exp(table[:, 55:58]), made.scale)
+    assert np.allclose(table[:, 58:], made.rotation, atol=1e-6)
+
+
+def test_files_that_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"init\.txt: .* give a name that ends so"):
+        check_gaussians_path(tmp_path / "init.txt", [])
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(OptionError, match="exists and is no file"):
+        check_gaussians_path(tmp_path / "folder.ply", [])
+    (tmp_path / "file").touch()
+    with pytest.raises(OptionError, match="cannot be written: give another file"):
+        check_gaussians_path(tmp_path / "file" / "init.ply", [])
+    empty = Gaussians(*(np.empty((0, k)) for k in (3, 3, 3, 4)), np.empty(0), np.empty((0, 3)))
+    with pytest.raises(ModelError, match="cannot be written"):
+        write_gaussians(tmp_path / "file" / "init.ply", empty)
+    assert {p.name for p in tmp_path.iterdir()} == {"folder.ply", "file"}
+    mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
+    write_gaussians(mine, empty)
+    other.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
+    check_gaussians_path(mine, [])
+    check_gaussians_path(other, [], overwrite=True)
+    with pytest.raises(OptionError, match=r"other\.ply: exists"):
+        check_gaussians_path(other, [])
+    with pytest.raises(OptionError, match=r"mine\.ply: is the input itself"):
+        check_gaussians_path(mine, [mine], overwrite=True)
