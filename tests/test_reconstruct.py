@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,12 +23,14 @@ import pycolmap
 import pytest
 from conftest import Encode, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, STAGES, Truth
+from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.geometry.coverage import evenly_spread
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
@@ -213,12 +216,51 @@ def test_opensplat(made: ReconstructReport) -> None:
         assert np.linalg.norm(image.qvec) == pytest.approx(1)
 
 
-def test_brush(made: ReconstructReport) -> None:
-    """The only cameras.bin below the folder is the model's, with its images in `images`."""
-    (cameras,) = [p for p in made.output.glob("**/cameras.bin") if ".stages" not in p.parts]
-    assert cameras.parent == made.output / "sparse" / "0"
-    assert not [*made.output.glob("**/*.ply")]
-    assert all(0 <= camera.model_id <= 10 for camera in raw_model(cameras.parent)[0].values())
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_trainers_take_the_finished_model(
+    made: ReconstructReport, trainer: Callable[[Path], Taken]
+) -> None:
+    check_taken(trainer(made.output), made.output)
+
+
+def check_taken(taken: Taken, output: Path) -> None:
+    """A trainer takes the model of a folder, with its own pictures and points."""
+    assert taken.model == output / "sparse" / "0"
+    assert taken.points == taken.model / "points3D.bin"
+    assert all(picture == output / "images" / name for name, picture in taken.pictures.items())
+    assert all(picture.is_file() for picture in taken.pictures.values())
+
+
+def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: ReconstructReport) -> None:
+    """Brush and others search hidden folders, too."""
+    kinds = re.compile(
+        r"(cameras|images|points3D)\..*|transforms.*\.json|.*\.(ply|png|jpe?g)", re.IGNORECASE
+    )
+    found = {
+        path.relative_to(made.output).parts[0]
+        for path in made.output.rglob("*")
+        if path.is_file() and kinds.fullmatch(path.name)
+    }
+    assert found == {"images", "sparse"}
+
+
+def test_models_among_the_stages_of_an_earlier_version_go(
+    made: ReconstructReport, tmp_path: Path
+) -> None:
+    """Such folders had a model with as many images as the finished one, and a smaller path."""
+    output = tmp_path / "out"
+    shutil.copytree(made.output, output)
+    for name in ("poses/0", "placed", "adjusted"):
+        shutil.copytree(output / "sparse" / "0", output / ".stages" / name)
+    assert brush(output).model == output / ".stages" / "adjusted"
+    reconstruct(SCENE, output, options=OPTIONS)
+    check_taken(brush(output), output)
+
+
+def test_masks_are_those_of_the_model(made: ReconstructReport, tmp_path: Path) -> None:
+    masked = reconstruct(SCENE, tmp_path / "out", options=replace(OPTIONS, moving="mask"))
+    for name, masks in brush(masked.output).masks.items():
+        assert masks == {masked.output / "masks" / Path(name).with_suffix(".png").name}
 
 
 def test_poses_are_true(made: ReconstructReport, truth: Truth) -> None:
@@ -346,8 +388,8 @@ def contents(output: Path) -> dict[str, bytes]:
     [
         (".stages/tracks.npz", "tracks"),
         ("database.db", "matches"),
-        (".stages/poses/0/images.bin", "poses"),
-        (".stages/placed/images.bin", "resection"),
+        (".stages/poses/0.npz", "poses"),
+        (".stages/placed.npz", "resection"),
         (".stages/moving.npz", "moving"),
         ("images/frame_000006.png", "model"),
         ("sparse/0/points3D.bin", "model"),
@@ -508,7 +550,7 @@ def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
     words += ["--pose_tracks_per_image", "300", "--pose_spacing", "24"]
     command = [sys.executable, "-m", "colmap_av1", "reconstruct", *words, "--quiet"]
     with subprocess.Popen(command, cwd=tmp_path) as process:
-        while not (output / ".stages" / "poses.partial" / "poses").is_dir():
+        while not (output / ".stages" / "mapper.log").is_file():
             assert process.poll() is None
             time.sleep(0.01)
         process.kill()
@@ -574,9 +616,10 @@ def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Pat
     assert plain.num_key_images == plain.num_registered == NUM_IMAGES
     # The lens is estimated from all images all the same.
     assert cameras_of(plain.database) == cameras_of(made.database)
-    mapped = read_model(plain.output / ".stages" / "poses" / "0")
+    mapped = read_posed_model(plain.output / ".stages" / "poses" / "0.npz").by_name
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
-    np.testing.assert_allclose(poses, model_poses(mapped, 60), atol=1e-9)
+    for name, image in posed_images(read_model(plain.output / "sparse" / "0")).items():
+        np.testing.assert_allclose(image.cam_from_world, mapped[name].cam_from_world, atol=1e-9)
     adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
     errors, before = (pose_errors(p, truth.cam_from_world) for p in (adjusted, poses))
     # With a loss that counts errors of half a pixel nearly in full it would be 0.40 and 0.75.

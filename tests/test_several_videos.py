@@ -16,6 +16,7 @@ from conftest import PROJECT, Encode, make_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from trainers import brush
 
 from colmap_av1.check.database import check
 from colmap_av1.cli import main
@@ -29,6 +30,8 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
+from colmap_av1.geometry.colmap_model import no_points, write_model
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import labels_of
 from colmap_av1.images.takes import count_through
@@ -327,7 +330,10 @@ def test_two_videos_and_photos_are_one_model(
     }
     assert {frozenset({"walk_in"}), frozenset({"back"}), frozenset({"walk_in", "back"})} <= seen_by
 
-    posed = made.output / ".stages" / "adjusted"
+    adjusted = read_posed_model(made.output / ".stages" / "adjusted.npz")
+    posed = tmp_path / "posed"
+    posed.mkdir()
+    write_model(posed, adjusted.cameras, adjusted.images, no_points())
     dense = densify(posed, halves, tmp_path / "dense", photos=photos)
     assert dense.num_images == made.num_images
     assert dense.agreeing > 0.9
@@ -359,6 +365,10 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
         shown |= names
     assert len(shown) == made.num_images
     assert model.num_points3D() == further.num_points > 500
+    taken = brush(made.output)  # either of the two, as they are of one size, with its own pictures
+    folder = taken.model.parents[1]
+    assert set(taken.pictures.values()) == {*(folder / "images").rglob("*.png")}
+    assert brush(further.output).model == further.output / "sparse" / "0"
 
     again = reconstruct(halves, tmp_path / "out", options=apart)
     assert again.resumed[-1] == "model"

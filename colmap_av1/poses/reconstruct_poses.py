@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,12 +18,16 @@ from colmap_av1.geometry.colmap_model import (
     ModelImage,
     ModelPoints,
     joined_points,
-    no_points,
-    posed_images,
     read_model,
     write_model,
 )
 from colmap_av1.geometry.masks import Mask, joined_masks
+from colmap_av1.geometry.posed_model import (
+    PosedModel,
+    posed_model,
+    read_posed_model,
+    write_posed_model,
+)
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
@@ -101,27 +106,36 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
             # pycolmap brings a database to its own layout.
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
-            sizes = map_poses(
-                copy,
-                partial / "poses",
-                how,
-                image_path=None,
-                log=run.stages / "mapper.log",
-                num_images=len(keyed.images.names),
-                progress=progress,
-                start_tracks=start_tracks,
-                tolerance=tolerance,
-            )
-        if max(sizes, default=0) < LEAST_IMAGES:
+            with tempfile.TemporaryDirectory() as models:
+                sizes = map_poses(
+                    copy,
+                    Path(models),
+                    how,
+                    image_path=None,
+                    log=run.stages / "mapper.log",
+                    num_images=len(keyed.images.names),
+                    progress=progress,
+                    start_tracks=start_tracks,
+                    tolerance=tolerance,
+                )
+                found = [
+                    posed_model(read_model(Path(models) / str(number)))
+                    for number, size in enumerate(sizes)
+                    if size >= LEAST_IMAGES
+                ]
+        if not found:
             raise ModelError(_why_no_start(matched.facts, mapper))
-        found = [k for k, size in enumerate(sizes) if size >= LEAST_IMAGES]
-        first, *others = _largest_first([partial / "poses" / str(k) for k in found], takes, keyed)
+        found = _largest_first(found, takes, keyed)
+        (partial / "poses").mkdir()
+        files = [f"poses/{number}.npz" for number in range(len(found))]
+        for file, model in zip(files, found, strict=True):
+            write_posed_model(partial / file, model)
         return {
-            "num_registered": sizes[int(first.name)],
-            "other_models": [f"poses/{model.name}" for model in others],
+            "num_registered": len(found[0].images),
+            "other_models": files[1:],
             "mapper": mapper,
-            "poses": f"poses/{first.name}",
-            "registered": _registered(first, keyed),
+            "poses": files[0],
+            "registered": _registered(found[0], keyed),
         }
 
     return run_stage(
@@ -134,30 +148,29 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
     )
 
 
-def _largest_first(models: list[Path], takes: Takes, keyed: Takes) -> list[Path]:
-    """The folders of models by how many images, key images or between these, they stand for."""
+def _largest_first(models: list[PosedModel], takes: Takes, keyed: Takes) -> list[PosedModel]:
+    """The models by how many images, key images or between these, they stand for."""
     if len(models) < 2:
         return models
     key = keyed.images.frames
     nearest = np.searchsorted((key[1:] + key[:-1]) / 2, takes.images.frames)
     stands_for = np.bincount(nearest, minlength=len(key))
-    posed = [posed_images(read_model(model)) for model in models]
     size = [
         sum(
             int(count)
             for name, count in zip(keyed.images.names, stands_for, strict=True)
             if name in images
         )
-        for images in posed
+        for images in (model.by_name for model in models)
     ]
     return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
 
 
-def _registered(model: Path, takes: Takes) -> dict[str, int]:
+def _registered(model: PosedModel, takes: Takes) -> dict[str, int]:
     """Images with a pose of each of several videos, by its name."""
     if len(takes.videos) == 1:
         return {}
-    posed = posed_images(read_model(model))
+    posed = model.by_name
     return {
         name: sum(image in posed for image in takes.of_video(video).names)
         for video, name in enumerate(takes.videos)
@@ -206,18 +219,20 @@ def resection_stage(run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed:
         known = read_posed_images(run, posed, keyed)
         with run.clock.measure("resection"):
             placed = _resect(run, tracks, takes, known)
-        folder = partial / "placed"
-        folder.mkdir()
-        write_model(folder, known.cameras, placed, no_points())
-        facts = {"poses": "placed", "num_registered": len(placed)}
-        return facts | {"registered": _registered(folder, takes)}
+        model = PosedModel(known.cameras, placed)
+        write_posed_model(partial / "placed.npz", model)
+        return {
+            "poses": "placed.npz",
+            "num_registered": len(placed),
+            "registered": _registered(model, takes),
+        }
 
     return run_stage(
         run.stages,
         "resection",
         [posed.digest, _RESECTED, run.options.match.run.seed],
         into=run.stages,
-        products=["placed"],
+        products=["placed.npz"],
         make=make,
     )
 
@@ -314,9 +329,8 @@ def adjustment_stage(
                 followed, placed = corners(join_tracks(spread, linked), placed)
             few = shorter_tracks(every_nth_track(spread, _BESIDE), _MOST_BESIDE)
             sets = [(few, _BESIDE_CORNERS), (join_tracks(linked, followed), FROM_PICTURES)]
-        with run.clock.measure("adjustment"):
-            folder = partial / "adjusted"
-            folder.mkdir()
+        with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as model:
+            folder = Path(model)
             num_points = _write_black_points(run, folder, placed, sets)
             check_agreement(num_points, len(spread.offsets) - 1)
             run.progress("adjustment", 0, 1)
@@ -329,12 +343,14 @@ def adjustment_stage(
                 log=run.stages / "adjustment.log",
             )
             run.progress("adjustment", 1, 1)
-        adjusted = without_unseen_images(folder)
+            adjusted = without_unseen_images(folder)
         joints = model_joints(adjusted)
+        result = posed_model(adjusted, with_points=True)
+        write_posed_model(partial / "adjusted.npz", result)
         return {
-            "poses": "adjusted",
-            "num_registered": adjusted.num_reg_images(),
-            "registered": _registered(folder, takes),
+            "poses": "adjusted.npz",
+            "num_registered": len(result.images),
+            "registered": _registered(result, takes),
             "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
             "joints_warning": joints.warning,
         }
@@ -347,7 +363,7 @@ def adjustment_stage(
         "adjustment",
         [posed.digest, given, moved.digest if moved is not None else None],
         into=run.stages,
-        products=["adjusted"],
+        products=["adjusted.npz"],
         make=make,
     )
 
@@ -408,8 +424,8 @@ class PosedImages:
 
 def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
     """The images with the poses that a stage left."""
-    poses = read_model(run.stages / posed.facts["poses"])
-    posed_by_name = posed_images(poses)
+    poses = read_posed_model(run.stages / posed.facts["poses"])
+    posed_by_name = poses.by_name
     names = takes.images.names
     index = [i for i, name in enumerate(names) if name in posed_by_name]
     found = [posed_by_name[names[i]] for i in index]

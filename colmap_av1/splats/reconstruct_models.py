@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ModelError, cannot_write
-from colmap_av1.geometry.colmap_model import posed_images, read_model
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.takes import Takes
 from colmap_av1.poses.placing.stage import place_stage
 from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_poses
@@ -61,9 +61,11 @@ def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
 def further_models(
     run: Run, first: Posed, takes: Takes
 ) -> tuple[tuple[FurtherModel, ...], list[str]]:
-    """Write the models of images that nothing connects with those of the first.
+    """Write the models of images that nothing connects with those of the first, in a folder each.
 
-    Images may be in two of them, undistorted by other intrinsics: hence a folder each.
+    The mapper may place an image in several models. It is written in the first of these only:
+    trainers that search the whole output folder would take one model's picture or mask for
+    another's.
 
     Returns:
         The models, and the names of the images that are in none, in the order of their frames.
@@ -74,7 +76,7 @@ def further_models(
     keyed = takes.some(first.stages["matches"].facts["key_images"])
     found: list[FurtherModel] = []
     for poses in mapped.facts["other_models"]:
-        known = set(posed_images(read_model(run.stages / poses)))
+        known = set(read_posed_model(run.stages / poses).by_name)
         if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
             continue
         own = _run_of_model(run, len(found) + 1)
@@ -83,9 +85,12 @@ def further_models(
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
         believed = believed_tracks(run, videos, takes)
         posed = refined_poses(own, stages, believed, some, key, in_place=first.in_place)
-        images = [image.name for image in read_posed_images(own, posed.last, takes).images]
+        new = _named(takes, left)
+        images = [image.name for image in read_posed_images(own, posed.last, new).images]
+        if len(images) < LEAST_IMAGES:
+            continue
         left -= set(images)
-        facts = written_model(own, posed, takes)["model"].facts
+        facts = written_model(own, posed, new)["model"].facts
         figures = (facts["num_points"], facts["mean_error"])
         found.append(FurtherModel(own.output, len(images), images[0], images[-1], *figures))
     _remove_further_models(run, len(found) + 1)
@@ -121,15 +126,15 @@ def _poses_of_model(run: Run, own: Run, posed: Kept, poses: str) -> Kept:
     """
 
     def make(partial: Path) -> dict[str, Any]:
-        shutil.copytree(run.stages / poses, partial / "poses")
-        return {"poses": "poses"}
+        shutil.copyfile(run.stages / poses, partial / "mapped.npz")
+        return {"poses": "mapped.npz"}
 
     return run_stage(
         own.stages,
         "poses",
         [posed.digest, poses],
         into=own.stages,
-        products=["poses"],
+        products=["mapped.npz"],
         make=make,
     )
 

@@ -151,7 +151,7 @@ def test_training_on_cpu(scene: tuple[Path, Path], tmp_path: Path) -> None:
     assert TORCH_PYTHON is not None
     told: list[int] = []
     script = tmp_path / "program.py"
-    aid = PROJECT / "tests" / "splatting_on_cpu.py"
+    aid = PROJECT / "tests" / "support" / "splatting_on_cpu.py"
     script.write_text(
         f"import runpy, sys\nsys.argv.insert(1, {str(splatting._PROGRAM)!r})\n"
         f"runpy.run_path({str(aid)!r}, run_name='__main__')\n"

@@ -15,11 +15,8 @@ from colmap_av1 import ReconstructOptions
 from colmap_av1.geometry.colmap_model import (
     ModelImage,
     camera_centres,
-    no_points,
-    posed_images,
-    read_model,
-    write_model,
 )
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.takes import Takes
 from colmap_av1.options import MapperOptions
@@ -116,8 +113,7 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
     later = seen.frame > joint
     tracks = keep_observations(seen, ((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
     links = keep_observations(seen, (number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
-    (tmp_path / "placed").mkdir()
-    write_model(tmp_path / "placed", placed.cameras, images, no_points())
+    write_posed_model(tmp_path / "placed.npz", PosedModel(placed.cameras, images))
     options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
     run = SimpleNamespace(
         options=options, stages=tmp_path, clock=Clock(), progress=no_progress, positions=None
@@ -130,10 +126,10 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
         placed.masks,
     )
     adjusted = adjustment_stage(
-        *(cast(Any, run), tracks, links, takes, Kept({"poses": "placed"}, "", resumed=False)),
+        *(cast(Any, run), tracks, links, takes, Kept({"poses": "placed.npz"}, "", resumed=False)),
         corners=lambda _, known: (tracks, known),
     )
-    found = posed_images(read_model(tmp_path / adjusted.facts["poses"]))
+    found = read_posed_model(tmp_path / adjusted.facts["poses"]).by_name
     centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))
     steps = np.diff(centres, axis=0)
     usual = np.median(steps, axis=0)

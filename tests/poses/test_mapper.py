@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import sys
 from pathlib import Path
 
@@ -13,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
-from colmap_av1.geometry.colmap_model import posed_images, read_model
+from colmap_av1.geometry.colmap_model import posed_images, read_model, write_model
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import MapOptions, Mapper
 from colmap_av1.poses import mapper as mapper_module
 from colmap_av1.reconstruct import ReconstructReport
@@ -88,8 +88,15 @@ def log_of(folder: Path) -> str:
     return (folder / "log").read_text()
 
 
+def adjusted_model(made: ReconstructReport, folder: Path) -> pycolmap.Reconstruction:
+    """The model that the adjustment left, with its points, as COLMAP's files in a folder."""
+    adjusted = read_posed_model(made.output / ".stages" / "adjusted.npz")
+    write_model(folder, adjusted.cameras, adjusted.images, adjusted.points)
+    return read_model(folder)
+
+
 def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
-    model = read_model(made.output / ".stages" / "adjusted")
+    model = adjusted_model(made, tmp_path)
     rng = np.random.default_rng(0)
     for frame in model.frames.values():
         pose = frame.rig_from_world
@@ -120,7 +127,7 @@ def test_the_end_of_a_video_bends_back(
     made: ReconstructReport, truth: Truth, tmp_path: Path
 ) -> None:
     """The last images are off together with what they see: only points at the joint tell."""
-    model = read_model(made.output / ".stages" / "adjusted")
+    model = adjusted_model(made, tmp_path)
     for number, point in list(model.points3D.items()):
         if point.track.length() > 6:
             model.delete_point3D(number)
@@ -156,7 +163,8 @@ def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
     """COLMAP says nothing of what it cannot write."""
     import resource  # noqa: PLC0415 - there is none on Windows
 
-    shutil.copytree(made.output / ".stages" / "adjusted", tmp_path / "model")
+    (tmp_path / "model").mkdir()
+    adjusted_model(made, tmp_path / "model")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
@@ -178,7 +186,7 @@ def test_images_that_see_hardly_any_point_are_left_out(
     made: ReconstructReport, tmp_path: Path, kept: int, stays: bool
 ) -> None:
     """Nothing but a few points tells their pose, as where something near fills the picture."""
-    model = read_model(made.output / ".stages" / "adjusted")
+    model = adjusted_model(made, tmp_path)
     assert model.num_reg_images() == NUM_IMAGES
     image = min(model.images.values(), key=lambda image: image.name)
     seen = [index for index, p in enumerate(image.points2D) if p.has_point3D()]
@@ -191,7 +199,7 @@ def test_images_that_see_hardly_any_point_are_left_out(
 
 
 def test_images_of_a_model_of_few_points_stay(made: ReconstructReport, tmp_path: Path) -> None:
-    model = read_model(made.output / ".stages" / "adjusted")
+    model = adjusted_model(made, tmp_path)
     by_length = sorted(model.points3D, key=lambda number: -model.points3D[number].track.length())
     for number in by_length[25:]:
         model.delete_point3D(number)

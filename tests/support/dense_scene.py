@@ -18,7 +18,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 
-_EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+_EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCENE = _EXAMPLES / "scene.mp4"
 EVERY = 3
 NUM_IMAGES = 20

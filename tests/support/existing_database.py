@@ -40,7 +40,7 @@ def alter(database: Path, sql: str, *values: object) -> None:
 
 def make_layout(path: Path, layout: str) -> None:
     """An empty database, as the version's database_creator makes it."""
-    script = Path(__file__).parent / "data" / "schemas" / f"colmap-{layout}.sql"
+    script = Path(__file__).parents[1] / "data" / "schemas" / f"colmap-{layout}.sql"
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.executescript(script.read_text())

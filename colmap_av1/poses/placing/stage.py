@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
-from colmap_av1.geometry.colmap_model import ModelImage, no_points, write_model
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.undistortion import pinhole_camera
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Takes
@@ -37,7 +38,7 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
         positions: what is known of where the images of `takes` were taken.
     """
     options, seed = run.options.place, run.options.match.run.seed
-    folder = f"{run.stages.name}/in_place"
+    file = f"{run.stages.name}/in_place.npz"
 
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
@@ -47,20 +48,23 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
             known = _surroundings(run, takes, placed, positions)
             found = find_placement(placed.images, pinholes, known, options, seed)
         write_place(partial, found)
-        (partial / folder).mkdir(parents=True)
-        poses = posed.facts["poses"]
+        images = placed.images
         if found.is_moved:
-            images = _moved_images(placed.images, found.similarity.apply_to_poses)
-            write_model(partial / folder, placed.cameras, images, no_points())
-            poses = "in_place"
-        return {"poses": poses, "place": found.facts, "place_warnings": list(found.warnings)}
+            images = _moved_images(images, found.similarity.apply_to_poses)
+        (partial / file).parent.mkdir()
+        write_posed_model(partial / file, PosedModel(placed.cameras, images))
+        return {
+            "poses": Path(file).name,
+            "place": found.facts,
+            "place_warnings": list(found.warnings),
+        }
 
     return run_stage(
         run.stages,
         "place",
         [posed.digest, options, positions.digest, seed],
         into=run.output,
-        products=[PLACE_FILE, folder],
+        products=[PLACE_FILE, file],
         make=make,
     )
 

@@ -1,0 +1,124 @@
+"""Cameras, image poses and points in one file of our own, which later steps go on from.
+
+COLMAP's own files would mislead: programs that train on a folder search it for `cameras.bin`,
+hidden folders too, and may take an intermediate model for the finished one.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import (
+    ModelImage,
+    ModelPoints,
+    model_points,
+    no_points,
+    posed_images,
+)
+
+
+@dataclass(frozen=True)
+class PosedModel:
+    """The cameras, the registered images and the points of a model.
+
+    Attributes:
+        cameras: pycolmap.Camera by camera id.
+        images: the registered images.
+        points: the points; none where only the poses matter.
+    """
+
+    cameras: Mapping[int, Any]
+    images: Sequence[ModelImage]
+    points: ModelPoints = field(default_factory=no_points)
+
+    @property
+    def by_name(self) -> dict[str, ModelImage]:
+        """The images by their names."""
+        return {image.name: image for image in self.images}
+
+
+def posed_model(reconstruction: Any, *, with_points: bool = False) -> PosedModel:
+    """The cameras and registered images of a pycolmap.Reconstruction, and its points if asked."""
+    images = list(posed_images(reconstruction).values())
+    used = {image.camera_id for image in images}
+    # Copies: pycolmap's own would go with the reconstruction.
+    cameras = {i: copy.copy(reconstruction.cameras[i]) for i in sorted(used)}
+    points = model_points(reconstruction, images) if with_points else no_points()
+    return PosedModel(cameras, images, points)
+
+
+def write_posed_model(path: Path, model: PosedModel) -> None:
+    """Write a model to a file, to the last bit.
+
+    Args:
+        path: the file, .npz.
+        model: the model.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    cameras = [
+        {
+            "camera_id": camera_id,
+            "model": camera.model.name,
+            "width": camera.width,
+            "height": camera.height,
+            "params": [float(value) for value in camera.params],
+            "has_prior_focal_length": camera.has_prior_focal_length,
+        }
+        for camera_id, camera in model.cameras.items()
+    ]
+    with path.open("wb") as file:
+        np.savez(
+            file,
+            cameras=np.array(json.dumps(cameras)),
+            image_id=np.array([image.image_id for image in model.images], np.int64),
+            name=np.array([image.name for image in model.images], np.str_),
+            camera_id=np.array([image.camera_id for image in model.images], np.int64),
+            cam_from_world=np.array([i.cam_from_world for i in model.images]).reshape(-1, 3, 4),
+            **{f"points_{name}": array for name, array in vars(model.points).items()},
+        )
+
+
+def read_posed_model(path: Path) -> PosedModel:
+    """Read what `write_posed_model` wrote.
+
+    Raises:
+        ModelError: the file cannot be read.
+    """
+    try:
+        with np.load(path) as file:
+            cameras = {
+                int(own["camera_id"]): pycolmap.Camera(
+                    camera_id=own["camera_id"],
+                    model=own["model"],
+                    width=own["width"],
+                    height=own["height"],
+                    params=own["params"],
+                    has_prior_focal_length=own["has_prior_focal_length"],
+                )
+                for own in json.loads(str(file["cameras"]))
+            }
+            images = [
+                ModelImage(int(image_id), str(name), int(camera_id), pose)
+                for image_id, name, camera_id, pose in zip(
+                    file["image_id"],
+                    file["name"],
+                    file["camera_id"],
+                    file["cam_from_world"],
+                    strict=True,
+                )
+            ]
+            points = ModelPoints(**{f.name: file[f"points_{f.name}"] for f in fields(ModelPoints)})
+    except (OSError, ValueError, KeyError) as error:
+        raise ModelError(f"{path}: cannot be read: {error}: run the same command again") from error
+    return PosedModel(cameras, images, points)

@@ -1,0 +1,117 @@
+"""Which files trainers of 3D Gaussians take from a folder, by the rules in their sources."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a trainer takes.
+
+    Attributes:
+        model: the folder of the COLMAP model.
+        pictures: the picture of each registered image, by the image's name.
+        masks: every file that may be taken for the mask of an image, by the image's name.
+        points: the file of the initial points.
+    """
+
+    model: Path
+    pictures: dict[str, Path]
+    masks: dict[str, set[Path]]
+    points: Path
+
+
+def names_in(model: Path) -> list[str]:
+    """Names of the registered images of a model."""
+    reconstruction = pycolmap.Reconstruction(model)
+    return sorted(reconstruction.images[i].name for i in reconstruction.reg_image_ids())
+
+
+def brush(folder: Path) -> Taken:
+    """Brush 1.0: the model with the most images anywhere below, hidden folders included.
+
+    Ties go to the smaller path (crates/brush-dataset/src/formats/colmap.rs). Pictures and masks are
+    searched for below the folder, too, by their names (formats/mod.rs).
+    """
+    files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    models = [p.parent for p in files if p.name.lower() in ("cameras.bin", "cameras.txt")]
+    size = {model: len(names_in(folder / model)) for model in models}
+    model = min(models, key=lambda own: (-size[own], own))
+    pictures, masks = {}, {}
+    for name in names_in(folder / model):
+        parts = Path(name).parts
+        ending = [p for p in files if p.parts[-len(parts) :] == parts and "masks" not in p.parts]
+        pictures[name] = folder / ending[0]
+        masks[name] = {folder / p for p in files if _is_mask_of(p, ending[0])}
+    (points,) = (p for p in files if p.parent == model and p.name == "points3D.bin")
+    return Taken(folder / model, pictures, masks, folder / points)
+
+
+def _is_mask_of(file: Path, picture: Path) -> bool:
+    if file.stem.lower() not in (
+        picture.name.lower(),
+        picture.stem.lower(),
+        f"{picture.stem.lower()}.mask",
+    ):
+        return False
+    lower = [part.lower() for part in file.parts]
+    if "masks" not in lower[:-1]:
+        return False
+    below = file.parts[lower.index("masks") + 1 : -1]
+    return not below or picture.parent.parts[-len(below) :] == below
+
+
+def lichtfeld_studio(folder: Path) -> Taken:
+    """LichtFeld Studio: the first of `sparse/0`, `sparse` and the folder that has each file."""
+    places = (folder / "sparse" / "0", folder / "sparse", folder)
+    cameras, _, points = (
+        next(place / name for place in places if (place / name).is_file())
+        for name in ("cameras.bin", "images.bin", "points3D.bin")
+    )
+    pictures = {name: folder / "images" / name for name in names_in(cameras.parent)}
+    return Taken(cameras.parent, pictures, {}, points)
+
+
+def gsplat(folder: Path) -> Taken:
+    """gsplat's examples (examples/datasets/colmap.py): `sparse/0` or `sparse`, by pycolmap.
+
+    The sorted files of `images` and of the folder of reduced images stand for each other, so
+    `images` holds the registered images and nothing else.
+    """
+    model = folder / "sparse" / "0"
+    model = model if model.exists() else folder / "sparse"
+    images = folder / "images"
+    files = sorted(p.relative_to(images).as_posix() for p in images.rglob("*") if p.is_file())
+    assert files == names_in(model)
+    return Taken(model, {name: images / name for name in files}, {}, model / "points3D.bin")
+
+
+def nerfstudio(folder: Path) -> Taken:
+    """nerfstudio's colmap dataparser with `--colmap-path sparse/0`: text files before binary."""
+    model = folder / "sparse" / "0"
+    suffix = ".txt" if (model / "cameras.txt").exists() else ".bin"
+    points = model / "points3D.bin"
+    points = points if points.exists() else model / "points3D.txt"
+    assert (model / f"images{suffix}").is_file()
+    pictures = {name: folder / "images" / name for name in names_in(model)}
+    return Taken(model, pictures, {}, points)
+
+
+def reference_implementation(folder: Path) -> Taken:
+    """graphdeco's 3D Gaussian Splatting (scene/dataset_readers.py): binary files of `sparse/0`.
+
+    A `points3D.ply` beside them is taken in place of the points; of a name only the last part
+    counts.
+    """
+    model = folder / "sparse" / "0"
+    points = model / "points3D.ply"
+    points = points if points.exists() else model / "points3D.bin"
+    pictures = {name: folder / "images" / Path(name).name for name in names_in(model)}
+    return Taken(model, pictures, {}, points)
+
+
+TRAINERS = (brush, lichtfeld_studio, gsplat, nerfstudio, reference_implementation)
