@@ -44,13 +44,7 @@ from colmap_av1.splats.gaussians import (
     write_gaussians,
 )
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
-from colmap_av1.tracks.tracks import (
-    Tracks,
-    keep_frames,
-    least_length,
-    scale_tracks,
-    tracks_in_a_row,
-)
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     VideoSource,
     decoded_pictures,
@@ -182,7 +176,7 @@ def densify(
         )
         images = [posed[name] for name in takes.images.names]
         views = views_of(images, cameras, takes.masks)
-        row = tracks_in_a_row([own.tracks for own in tracked], takes.num_frames)
+        row = Tracks.in_sequence([own.tracks for own in tracked], takes.num_frames)
         seen, view = seen_in(row, takes.images.frames)
         with clock.measure("points"):
             points = _triangulate(seen, view, views, options, progress)
@@ -236,11 +230,11 @@ def _track(
         found = track_video(source, matching, one_size=True, clock=clock, progress=progress)
         with clock.measure("choice"):
             chosen = _choose(found.tracks, source, images.names, images.folder, options.match)
-    tracks = scale_tracks(found.tracks, images.size)
+    tracks = found.tracks.scale_to(images.size)
     if images.masks is not None:
         least = least_length(matching.tracks)
         tracks = images.masks.on_tracks(tracks, chosen, least)
-    tracks = keep_frames(tracks, chosen.frames)
+    tracks = tracks.keep_frames(chosen.frames)
     return _TrackedImages(tracks, chosen, source.conversion, found.warnings)
 
 

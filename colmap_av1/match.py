@@ -37,7 +37,7 @@ from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -349,7 +349,7 @@ def _with_chosen_tracks(
         *(prepared.tracks, prepared.display, prepared.source.pictures.frame_rate, options, clock)
     )
     with clock.measure("pairs"):
-        tracks = select_tracks(keep_frames(tracks, prepared.chosen.frames), options.density)
+        tracks = select_tracks(tracks.keep_frames(prepared.chosen.frames), options.density)
     return replace(
         prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks, read_out=read_out)
     )
@@ -357,7 +357,7 @@ def _with_chosen_tracks(
 
 def _figures(tracks: Sequence[Tracks], matched: MatchedImages) -> dict[str, Any]:
     """The counts of tracks and matches in `MatchReport`."""
-    lengths = np.concatenate([np.diff(own.offsets) for own in tracks])
+    lengths = np.concatenate([own.lengths for own in tracks])
     quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower") if len(lengths) else ()
     kinds = [geometry.config.name for geometry in matched.geometries]
     num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]

@@ -45,7 +45,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.reconstruct import reconstruct
-from colmap_av1.tracks.tracks import Tracks, tracks_in_a_row
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.decoding import decode_frames
 
 SCENE = PROJECT / "examples" / "scene.mp4"
@@ -293,11 +293,11 @@ def some_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
 
 def test_frames_are_counted_through() -> None:
     one, two = some_tracks(5, (64, 48)), some_tracks(3, (32, 80))
-    row = tracks_in_a_row([one, two], 9)
+    row = Tracks.in_sequence([one, two], 9)
     assert (row.num_frames, row.width, row.height) == (9, 64, 80)
     assert row.offsets.tolist() == [0, 5, 7, 10, 12]
     assert row.frame.tolist() == [0, 1, 2, 3, 4, 3, 4, 5, 6, 7, 6, 7]
-    assert tracks_in_a_row([one], 5) is one
+    assert Tracks.in_sequence([one], 5) is one
     chosen = [ChosenImages(["0.png", "4.png"], np.array([0, 4], np.int32))]
     chosen.append(ChosenImages(["2.png"], np.array([2], np.int32)))
     takes = count_through(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])

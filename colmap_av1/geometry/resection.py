@@ -55,7 +55,7 @@ def sightings_of(
 
     Args:
         points: points of `seen`.
-        seen: the tracks in the frames of known poses, as `keep_frames` leaves them.
+        seen: the tracks in the frames of known poses, as `Tracks.keep_frames` leaves them.
         tracks: the same tracks in all frames.
         frames: int32 [num_images] frames whose poses are asked for, ascending.
         camera: their pycolmap.Camera.
@@ -67,7 +67,7 @@ def sightings_of(
     # A track that slid from one surface to another has two points: the first one counts.
     first = points.observation[points.offsets[:-1]]
     own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)
-    point = np.full(len(tracks.offsets) - 1, -1, dtype=np.int64)
+    point = np.full(tracks.num_tracks, -1, dtype=np.int64)
     point[in_seen[own - 1]] = index
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))

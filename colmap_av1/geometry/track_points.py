@@ -14,7 +14,7 @@ from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import MatchOptions, TriangulateOptions
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress
 
 _Image = NDArray[np.uint8]
@@ -58,7 +58,7 @@ def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[
     """The tracks in some frames only, and the index into `frames` of each observation."""
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))
-    seen = keep_frames(tracks, frames)
+    seen = tracks.keep_frames(frames)
     return seen, place[seen.frame]
 
 
@@ -82,7 +82,7 @@ def triangulate_tracks(
     rays = rays_of(tracks, view, cameras) if rays is None else rays
     shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
-    num_tracks = len(tracks.offsets) - 1
+    num_tracks = tracks.num_tracks
     return (splat_points if options.points == "splats" else triangulate)(
         Observations(tracks.offsets, view, rays, tracks.sigma),
         Views(np.stack(poses), focal),

@@ -432,7 +432,7 @@ def _rotation_field(
 def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
     """A function that lists the tracks a frame sees, ascending."""
     number = tracks.track
-    order = order_by_frame(tracks.frame, tracks.num_frames)
+    order = tracks.order_by_frame()
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
     return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]
 

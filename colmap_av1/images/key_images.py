@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.choosing import choose_frames
 from colmap_av1.options import ImageOptions
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
 
 # Share of its cells with tracks that a key image has in common with the next one: of three in a row
 # they then have half in common, and a point takes three views.
@@ -81,14 +81,14 @@ class _TracksByImage:
     """Which tracks each image sees, and in how many of its cells."""
 
     def __init__(self, tracks: Tracks, frames: NDArray[np.int32], spacing: float) -> None:
-        order = order_by_frame(tracks.frame, tracks.num_frames)
+        order = tracks.order_by_frame()
         ends = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
         self._rows = [order[ends[frame] : ends[frame + 1]] for frame in frames.tolist()]
         self._number = tracks.track.astype(np.int32)
         self._xy = tracks.xy
         self._spacing = np.float32(max(spacing, 1.0))
         self._num_columns = int(tracks.width // self._spacing) + 1
-        self._compared = np.zeros(len(tracks.offsets) - 1, dtype=np.bool_)
+        self._compared = np.zeros(tracks.num_tracks, dtype=np.bool_)
 
     def compare_with(self, image: int) -> None:
         """Count from now on the tracks that this image sees, too."""

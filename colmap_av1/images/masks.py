@@ -19,7 +19,7 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
 from colmap_av1.options.images import ImageOptions
-from colmap_av1.tracks.tracks import Tracks, keep_long_tracks, order_by_frame, split_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.cpus import threads_or_cpus
 
 _SUFFIX = ".png"
@@ -294,9 +294,9 @@ def mask_tracks(
     """
     size = (tracks.width, tracks.height)
     of_all, by_frame = (masks.kept, {}) if isinstance(masks, Mask) else (None, masks)
-    kept = np.ones(len(tracks.frame), dtype=np.bool_)
-    begins = np.zeros(len(tracks.frame), dtype=np.bool_)
-    order = order_by_frame(tracks.frame, tracks.num_frames)
+    kept = np.ones(tracks.num_observations, dtype=np.bool_)
+    begins = np.zeros(tracks.num_observations, dtype=np.bool_)
+    order = tracks.order_by_frame()
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
     unseen = _Unseen(tracks)
     for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
@@ -310,7 +310,7 @@ def mask_tracks(
         begins[passing] |= ~counted_at(pixels, between, own_size)
     if kept.all() and not begins.any():
         return tracks
-    return keep_long_tracks(split_tracks(tracks, kept, begins), min_length)
+    return tracks.split_at_removed(kept, begins).keep_long(min_length)
 
 
 class _Unseen:

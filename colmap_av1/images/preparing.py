@@ -26,7 +26,7 @@ from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.recognising import check_content, is_turned_back
 from colmap_av1.options import MatchOptions
-from colmap_av1.tracks.tracks import Tracks, least_length, scale_tracks, show_tracks
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
@@ -194,7 +194,7 @@ def prepare_images(
         source=source,
         display=display,
         tracked=tracked,
-        tracks=scale_tracks(tracks, size),
+        tracks=tracks.scale_to(size),
         chosen=chosen,
         size=size,
         pixel_aspect=fit.pixel_aspect,
@@ -237,7 +237,7 @@ def _tracks_that_count(
 def _tracks_as_shown(tracks: Tracks, source: VideoSource, fit: _Fit) -> Tracks:
     """The tracks as the images show the video; refuses a stream of other pictures."""
     if fit.back is not None:
-        tracks = show_tracks(tracks, fit.back)
+        tracks = tracks.as_displayed(fit.back)
     width, height = fit.video_size
     if (tracks.width, tracks.height) != fit.video_size:
         raise VideoError(

@@ -20,7 +20,7 @@ from colmap_av1.matching.two_view_geometry import (
     TwoViewGeometry,
 )
 from colmap_av1.matching.weak_gaps import thin_gap_warning, thin_gaps
-from colmap_av1.tracks.tracks import Tracks, no_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.graphs import connected_components
 
 # A feature within this many pixels of a track's keypoint is the same keypoint.
@@ -158,7 +158,7 @@ def links_as_tracks(
         for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True)
     ]
     if not ends:
-        return no_tracks(num_frames, size)
+        return Tracks.empty(num_frames, size)
     label = connected_components(total, np.concatenate(ends))
     frame = np.repeat(frames[images], counts)
     size_of = np.bincount(label, minlength=label.max() + 1)
@@ -169,7 +169,7 @@ def links_as_tracks(
     order = order[~np.isin(label[order], ambiguous)]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(label[order]) != 0]))
     if len(order) == 0:
-        return no_tracks(num_frames, size)
+        return Tracks.empty(num_frames, size)
     xy = np.concatenate([features[i].xy for i in images])
     return Tracks(
         num_frames=num_frames,

@@ -45,7 +45,7 @@ from colmap_av1.matching.link_plan import (
     weak_and_probed_gaps,
 )
 from colmap_av1.options import MatchOptions
-from colmap_av1.tracks.tracks import Tracks, no_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Clock, Progress
 
 # Inliers across a gap from which on mappers take it: they register an image by 30 points of its,
@@ -237,7 +237,7 @@ def link_images(
     if plan.wanted:
         linked = link(plan)
     else:
-        nothing = no_tracks(takes.num_frames, _largest(cameras))
+        nothing = Tracks.empty(takes.num_frames, _largest(cameras))
         linked = LinkedImages(matched, nothing, LinkReport(**_take_report(matched, takes)))
     if linked.report.doubtful_gaps and not plan.key:
         plan = plan_anywhere(plan, takes, matched, images_apart)

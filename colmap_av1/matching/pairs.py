@@ -64,7 +64,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     image_of_frame = np.full(tracks.num_frames, -1, dtype=np.int64)
     image_of_frame[chosen] = np.arange(chosen.size)
     image = image_of_frame[tracks.frame]
-    num_tracks = tracks.offsets.size - 1
+    num_tracks = tracks.num_tracks
     track = tracks.track
     seen = image >= 0
     often_enough = np.bincount(track[seen], minlength=num_tracks) >= 2

@@ -86,7 +86,7 @@ def may_link(
     A video that is too short for a track needs no pictures to say so.
     """
     links = options.links.links
-    lacks_tracks = len(tracks.offsets) == 1 and tracks.num_frames >= least_length(options.tracks)
+    lacks_tracks = tracks.num_tracks == 0 and tracks.num_frames >= least_length(options.tracks)
     return links == "sift" or (
         links == "auto" and (lacks_tracks or bool(weak_gaps(inter_share, frames).any()))
     )

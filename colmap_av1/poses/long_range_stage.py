@@ -20,7 +20,7 @@ from colmap_av1.poses.reconstruct_poses import (
     triangulate_in,
 )
 from colmap_av1.poses.reconstruct_tracks import Run, pose_tracks
-from colmap_av1.tracks.tracks import Tracks, every_nth_track
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
 # Tracks at most whose points tell which images see the same; short ones are left out.
@@ -74,7 +74,7 @@ def _compared(
 
 def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDArray[np.float64]]:
     """Float64 [n, 3] positions of some points that each image sees."""
-    some = every_nth_track(tracks, max(1, (len(tracks.offsets) - 1) // _NUM_TRACKS))
+    some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
     seen, view = seen_in(pose_tracks(run, some), placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FOR_POSES)
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)

@@ -17,7 +17,7 @@ from colmap_av1.poses.long_range_stage import far_view_stage
 from colmap_av1.poses.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
 from colmap_av1.poses.reconstruct_stages import match_stage, read_links
 from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks
-from colmap_av1.tracks.tracks import Tracks, cut_tracks, tracks_in_a_row
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
 
@@ -147,8 +147,8 @@ def _pose_stages(
 def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut where motion is not believed, and the links."""
     links, broken = read_links(run.stages)
-    tracks = tracks_in_a_row([own.tracks for own in videos], takes.num_frames)
-    return cut_tracks(tracks, broken.tolist()), links
+    tracks = Tracks.in_sequence([own.tracks for own in videos], takes.num_frames)
+    return tracks.split_after_frames(broken.tolist()), links
 
 
 def refined_poses(

@@ -37,14 +37,7 @@ from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_u
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.poses.seams import model_joints
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import (
-    Tracks,
-    every_nth_track,
-    join_tracks,
-    keep_frames,
-    keep_tracks_of,
-    shorter_tracks,
-)
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress, no_progress, progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -240,8 +233,8 @@ def resection_stage(run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed:
 def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[ModelImage]:
     """The images that have a pose, and those between them that get one; see `resection_stage`."""
     run_options = run.options.match.run
-    seen_thrice = keep_tracks_of(pose_tracks(run, tracks), known.frames, _FEWEST_VIEWS)
-    spread = select_tracks(keep_frames(seen_thrice, takes.images.frames), _RESECTED)
+    seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
+    spread = select_tracks(seen_thrice.keep_frames(takes.images.frames), _RESECTED)
     seen, view = seen_in(spread, known.frames)
     points = triangulate_in(run, known, seen, view, options=FOR_POSES)
     check_agreement(len(points.xyz), points.num_tracks)
@@ -318,21 +311,21 @@ def adjustment_stage(
     def make(partial: Path) -> dict[str, Any]:
         placed = read_posed_images(run, posed, takes)
         # The long tracks of all images are several times as large as those chosen: they go at once.
-        spread = select_tracks(keep_frames(pose_tracks(run, tracks), placed.frames), _ADJUSTED)
+        spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
         if follow is not None:
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
-        linked = keep_frames(links, placed.frames)
-        sets = [(join_tracks(spread, linked), FOR_POSES)]
+        linked = links.keep_frames(placed.frames)
+        sets = [(Tracks.concatenate(spread, linked), FOR_POSES)]
         if corners is not None:
             with run.clock.measure("refinement"):
-                followed, placed = corners(join_tracks(spread, linked), placed)
-            few = shorter_tracks(every_nth_track(spread, _BESIDE), _MOST_BESIDE)
-            sets = [(few, _BESIDE_CORNERS), (join_tracks(linked, followed), FROM_PICTURES)]
+                followed, placed = corners(Tracks.concatenate(spread, linked), placed)
+            few = spread.every_nth(_BESIDE).split_to_length(_MOST_BESIDE)
+            sets = [(few, _BESIDE_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as model:
             folder = Path(model)
             num_points = _write_black_points(run, folder, placed, sets)
-            check_agreement(num_points, len(spread.offsets) - 1)
+            check_agreement(num_points, spread.num_tracks)
             run.progress("adjustment", 0, 1)
             adjust_model(
                 folder,

@@ -38,7 +38,7 @@ from colmap_av1.poses.reconstruct_tracks import (
     tracks_of,
 )
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
@@ -134,7 +134,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[i
     index: list[int] = []
     for video, own in enumerate(videos):
         frames = own.chosen.frames
-        tracks = keep_frames(pose_tracks(run, own.tracks), frames)
+        tracks = pose_tracks(run, own.tracks).keep_frames(frames)
         found = key_images_of_video(run, tracks, own.chosen, own.inter_share)
         index += (found + takes.images_of(video).start).tolist()
     return index + list(range(takes.images_of(len(videos)).start, len(takes.take)))
@@ -157,9 +157,7 @@ def _paired_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> Pai
     for video, own in enumerate(videos):
         chosen = takes.of_video(video)
         with run.clock.measure("pairs"):
-            sparse = select_tracks(
-                keep_frames(pose_tracks(run, own.tracks), chosen.frames), density
-            )
+            sparse = select_tracks(pose_tracks(run, own.tracks).keep_frames(chosen.frames), density)
         linked_anyway = may_link(own.inter_share, chosen.frames, sparse, options)
         paired.append(
             pair_images(

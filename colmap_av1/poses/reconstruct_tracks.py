@@ -27,14 +27,7 @@ from colmap_av1.options import (
     ReconstructOptions,
     RefineOptions,
 )
-from colmap_av1.tracks.tracks import (
-    Tracks,
-    every_nth_track,
-    in_frames_alone,
-    keep_frames,
-    keep_long_tracks,
-    least_length,
-)
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
@@ -147,13 +140,13 @@ def track_stage(run: Run, video: int) -> Kept:
             tracked.tracks, shown.display, shown.frame_rate, options, clock
         )
         # Of a long video no other frame is of use from here on.
-        tracks = keep_frames(tracks, chosen.frames) if is_long else tracks
+        tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
         _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
         check_unchanged(*source.files)
         return {
             "num_frames": tracks.num_frames,
-            "num_tracks": len(tracks.offsets) - 1,
+            "num_tracks": tracks.num_tracks,
             "read_out": read_out,
             "warnings": list(tracked.warnings),
         }
@@ -251,10 +244,10 @@ def _track_long(run: Run, video: int, options: MatchOptions) -> tuple[TrackedVid
     if is_plain and held <= _MOST_HELD:
         tracked = _track(run, video, options, frames=candidates, clock=clock)
         with clock.measure("choice"):
-            few = every_nth_track(tracked.tracks, _FEWER)
+            few = tracked.tracks.every_nth(_FEWER)
             chosen = _spread_in(run, video, replace(tracked, tracks=few), candidates)
-            tracks = keep_frames(tracked.tracks, chosen.frames)
-            return replace(tracked, tracks=keep_long_tracks(tracks, _FEWEST_SEEN)), chosen
+            tracks = tracked.tracks.keep_frames(chosen.frames)
+            return replace(tracked, tracks=tracks.keep_long(_FEWEST_SEEN)), chosen
     with clock.measure("choice"):
         sketch = replace(
             run.options.match,
@@ -277,7 +270,7 @@ def _spread_in(
     every = ChosenImages(names, candidates)
     key = key_images_of_video(run, tracks, every, tracked.inter_share)
     most = min(run.options.max_images, len(candidates))
-    return every.some(spread_images(in_frames_alone(tracks, candidates), most, key))
+    return every.some(spread_images(tracks.subsample_frames(candidates), most, key))
 
 
 def key_images_of_video(
@@ -330,4 +323,4 @@ def tracks_of(file: Any) -> Tracks:
 
 def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
     """The tracks that poses are estimated from; short ones are for points only."""
-    return keep_long_tracks(tracks, least_length(run.options.match.tracks))
+    return tracks.keep_long(least_length(run.options.match.tracks))

@@ -16,7 +16,7 @@ from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_p
 from colmap_av1.poses.reconstruct_poses import read_posed_images
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
 from colmap_av1.splats.reconstruct_model import model_stage
-from colmap_av1.tracks.tracks import join_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -54,7 +54,7 @@ def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
     """Place the model in the world, and write it with all points."""
     assert run.positions is not None
     placed = place_stage(run, takes, posed.last, run.positions)
-    tracks = join_tracks(posed.tracks, posed.links)
+    tracks = Tracks.concatenate(posed.tracks, posed.links)
     return {"place": placed, "model": model_stage(run, tracks, takes, posed.moving, placed)}
 
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
@@ -77,7 +77,7 @@ def follow_corners(
         Tracks of three and more of the pictures, in the frames of `guide` and pixels of the
         pictures.
     """
-    by_frame = order_by_frame(guide.frame, guide.num_frames)
+    by_frame = guide.order_by_frame()
     bounds = np.searchsorted(guide.frame[by_frame], np.arange(guide.num_frames + 1))
     track = guide.track
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
+from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 # Pixels that nothing over the picture moves by: the finest step of a motion vector.
 _STILL = 0.125
@@ -28,7 +28,7 @@ def remove_overlays(tracks: Tracks) -> Tracks:
     Returns:
         The other tracks in their former order; the same object where nothing is left out.
     """
-    if len(tracks.offsets) == 1:
+    if tracks.num_tracks == 0:
         return tracks
     first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
     travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(tracks))])
@@ -39,16 +39,16 @@ def remove_overlays(tracks: Tracks) -> Tracks:
     for index in np.flatnonzero(over_picture):
         xy = tracks.xy[first[index] : last[index] + 1]
         over_picture[index] = _length(xy - xy[0]).max() <= _STILL
-    return keep_observations(tracks, np.repeat(~over_picture, np.diff(tracks.offsets)))
+    return tracks.keep_tracks(~over_picture)
 
 
 def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     """Median motion of tracks into each frame in pixels: float64 [num_frames], 0 without any."""
-    starts = np.zeros(len(tracks.frame), dtype=np.bool_)
+    starts = np.zeros(tracks.num_observations, dtype=np.bool_)
     starts[tracks.offsets[:-1]] = True
     # Every n-th: steps of a track follow each other, so all tracks have their part.
-    stride = max(1, len(tracks.frame) // (_NUM_STEPS * tracks.num_frames))
-    to = np.arange(0, len(tracks.frame), stride)
+    stride = max(1, tracks.num_observations // (_NUM_STEPS * tracks.num_frames))
+    to = np.arange(0, tracks.num_observations, stride)
     to = to[~starts[to]]
     step = _length(tracks.xy[to] - tracks.xy[to - 1])
     frame = tracks.frame[to]

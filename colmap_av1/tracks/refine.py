@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.options import RefineOptions
 from colmap_av1.tracks.texture import texture_at
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
 
 # Pixels around a template's window: one for its gradients, two for the way back.
 _MARGIN = 3
@@ -99,7 +99,7 @@ def match_tracks(
     Args and errors are those of `refine_tracks`.
     """
     state = RefinedTracks.start(tracks, options, expected)
-    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
+    by_frame = tracks.order_by_frame()
     bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
     next_frame = 0
     for count, (index, image) in enumerate(frames, start=1):
@@ -160,7 +160,7 @@ class RefinedTracks:
         cls, tracks: Tracks, options: RefineOptions, expected: NDArray[np.bool_] | None
     ) -> RefinedTracks:
         """What is known before the first frame."""
-        num_observations = len(tracks.frame)
+        num_observations = tracks.num_observations
         is_first = np.zeros(num_observations, dtype=np.bool_)
         is_first[tracks.offsets[:-1]] = True
         is_last = np.zeros(num_observations, dtype=np.bool_)
@@ -295,7 +295,7 @@ class _Templates:
         tile = options.refine_window + 2 * _MARGIN
         columns = max(1, tracks.width // tile)
         height = max(tracks.height, tile * math.ceil(max(capacity, 1) / columns))
-        num_tracks = len(tracks.offsets) - 1
+        num_tracks = tracks.num_tracks
         return cls(
             tile=tile,
             columns=columns,

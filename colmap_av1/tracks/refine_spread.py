@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.options import DensityOptions, RefineOptions
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.selection import spread_observations
-from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks
 
 # More than a mapper or a bundle adjustment is given: these choose anew among them.
 _SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.0, max_sigma=0.0)
@@ -44,12 +44,12 @@ def refine_spread_tracks(
     in_image = np.zeros(tracks.num_frames, dtype=np.bool_)
     in_image[frames] = True
     observation = np.flatnonzero(in_image[tracks.frame])
-    seen = keep_observations(tracks, in_image[tracks.frame])
+    seen = tracks.keep_observations(in_image[tracks.frame])
     if len(observation) == 0:
         return tracks
     spread = spread_observations(seen, _SPREAD)
     observation = observation[spread]
-    refined = refine_tracks(keep_observations(seen, spread), pictures, _LK, progress)
+    refined = refine_tracks(seen.keep_observations(spread), pictures, _LK, progress)
     xy, sigma, confirmed = tracks.xy.copy(), tracks.sigma.copy(), tracks.confirmed.copy()
     xy[observation] = refined.xy
     sigma[observation] = refined.sigma

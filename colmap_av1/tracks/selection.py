@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.presets import Limits, limits_of
-from colmap_av1.tracks.tracks import Tracks, keep_observations, order_by_frame
+from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 # Error in pixels that an observation has however accurate its motion is; keeps one sure
 # observation from outweighing many good ones.
@@ -59,8 +59,8 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         way *= way
         sure = variance <= np.maximum(np.float32(max_variance), way, out=way)
         del way
-        tracks, variance = keep_observations(tracks, sure), variance[sure]
-    return keep_observations(tracks, _spread(tracks, variance, limits))
+        tracks, variance = tracks.keep_observations(sure), variance[sure]
+    return tracks.keep_observations(_spread(tracks, variance, limits))
 
 
 def spread_observations(tracks: Tracks, options: DensityOptions) -> NDArray[np.bool_]:
@@ -95,7 +95,7 @@ def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: Limits) -> ND
 def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
     """Variance of each observation relative to the first kept one of its track, in px^2."""
     variance = tracks.sigma * tracks.sigma
-    variance -= np.repeat(variance[tracks.offsets[:-1]], np.diff(tracks.offsets))
+    variance -= np.repeat(variance[tracks.offsets[:-1]], tracks.lengths)
     np.maximum(variance, 0, out=variance)
     return variance
 
@@ -104,7 +104,7 @@ def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
     """Distance of each observation to the first kept one of its track, in px."""
     squared = np.zeros(len(tracks.xy), dtype=np.float32)
     for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
-        step = np.repeat(along[tracks.offsets[:-1]], np.diff(tracks.offsets))
+        step = np.repeat(along[tracks.offsets[:-1]], tracks.lengths)
         np.subtract(along, step, out=step)
         squared += np.multiply(step, step, out=step)
     np.sqrt(squared, out=squared)

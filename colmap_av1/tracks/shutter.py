@@ -49,7 +49,7 @@ def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.fl
 def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
     """Float64 [num_observations, 2] motion to so many frames later; NaN where that is unknown."""
     found = np.full(tracks.xy.shape, np.nan)
-    if len(tracks.frame) > shift:
+    if tracks.num_observations > shift:
         number = tracks.track
         own = np.flatnonzero(
             (number[shift:] == number[:-shift])

@@ -53,9 +53,233 @@ class Tracks:
     confirmed: NDArray[np.bool_]
 
     @property
+    def num_tracks(self) -> int:
+        """Number of tracks."""
+        return len(self.offsets) - 1
+
+    @property
+    def num_observations(self) -> int:
+        """Number of observations of all tracks."""
+        return len(self.frame)
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Int64 [num_tracks] the number of observations of each track."""
+        return np.diff(self.offsets)
+
+    @property
     def track(self) -> NDArray[np.int64]:
         """Int64 [num_observations] the track of each observation."""
-        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+        return np.repeat(np.arange(self.num_tracks), self.lengths)
+
+    @staticmethod
+    def empty(num_frames: int, size: tuple[int, int]) -> Tracks:
+        """No tracks, of a video of `num_frames` frames of `size` (width, height)."""
+        return Tracks(
+            num_frames=num_frames,
+            width=size[0],
+            height=size[1],
+            offsets=np.zeros(1, np.int64),
+            frame=np.empty(0, np.int32),
+            xy=np.empty((0, 2), np.float32),
+            sigma=np.empty(0, np.float32),
+            confirmed=np.empty(0, np.bool_),
+        )
+
+    @staticmethod
+    def concatenate(first: Tracks, *others: Tracks) -> Tracks:
+        """All tracks of several sets through the same frames, in the order of the sets.
+
+        The number of frames and the size are those of the first set, which is returned itself
+        where the others are empty.
+        """
+        sets = [first, *(other for other in others if other.num_tracks)]
+        if len(sets) == 1:
+            return first
+        return replace(
+            first,
+            offsets=_joined_offsets(sets),
+            frame=np.concatenate([one.frame for one in sets]),
+            xy=np.concatenate([one.xy for one in sets]),
+            sigma=np.concatenate([one.sigma for one in sets]),
+            confirmed=np.concatenate([one.confirmed for one in sets]),
+        )
+
+    @staticmethod
+    def in_sequence(videos: Sequence[Tracks], num_frames: int) -> Tracks:
+        """The tracks of several videos as of one video that shows them one after the other.
+
+        Args:
+            videos: the tracks of each video.
+            num_frames: frames of all videos, and of what has no tracks after them.
+
+        Returns:
+            All tracks in the order of the videos. Positions stay in pixels of their own video;
+            width and height are the largest. The tracks of the video itself where there is only
+            one and nothing after it.
+        """
+        first = videos[0]
+        if len(videos) == 1 and num_frames == first.num_frames:
+            return first
+        starts = np.cumsum([0, *(video.num_frames for video in videos[:-1])])
+        frames = [v.frame + np.int32(start) for v, start in zip(videos, starts, strict=True)]
+        return Tracks(
+            num_frames=num_frames,
+            width=max(video.width for video in videos),
+            height=max(video.height for video in videos),
+            offsets=_joined_offsets(videos),
+            frame=np.concatenate(frames).astype(np.int32),
+            xy=np.concatenate([video.xy for video in videos]),
+            sigma=np.concatenate([video.sigma for video in videos]),
+            confirmed=np.concatenate([video.confirmed for video in videos]),
+        )
+
+    def order_by_frame(self) -> NDArray[np.int64]:
+        """Indices of the observations sorted by frame; within a frame they keep their order."""
+        return order_by_frame(self.frame, self.num_frames)
+
+    def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:
+        """The tracks with some of their observations only.
+
+        Args:
+            kept: bool [num_observations].
+
+        Returns:
+            Tracks in the same order, without those that keep nothing; itself where all are kept.
+        """
+        if kept.all():
+            return self
+        so_far = np.zeros(len(kept) + 1, dtype=np.min_scalar_type(len(kept)))
+        np.cumsum(kept, out=so_far[1:])
+        lengths = np.diff(so_far[self.offsets].astype(np.int64))
+        offsets = np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64)
+        return self._take(kept, offsets)
+
+    def keep_frames(self, frames: NDArray[np.int32]) -> Tracks:
+        """The tracks with the observations in these frames only, as `keep_observations`."""
+        wanted = np.zeros(self.num_frames, dtype=np.bool_)
+        wanted[frames] = True
+        return self.keep_observations(wanted[self.frame])
+
+    def subsample_frames(self, frames: NDArray[np.int32]) -> Tracks:
+        """The tracks as of a video that has these frames only, numbered anew from 0.
+
+        Args:
+            frames: int32 [n] display indices, ascending.
+        """
+        number = np.full(self.num_frames, -1, dtype=np.int32)
+        number[frames] = np.arange(len(frames), dtype=np.int32)
+        seen = self.keep_frames(frames)
+        return replace(seen, num_frames=len(frames), frame=number[seen.frame])
+
+    def keep_tracks(self, kept: NDArray[np.bool_]) -> Tracks:
+        """Some of the tracks, in the same order.
+
+        Args:
+            kept: bool [num_tracks].
+        """
+        return self.keep_observations(np.repeat(kept, self.lengths))
+
+    def keep_long(self, min_length: int) -> Tracks:
+        """The tracks of at least `min_length` observations."""
+        return self.keep_tracks(self.lengths >= min_length)
+
+    def keep_observed_in(self, frames: NDArray[np.int32], min_frames: int) -> Tracks:
+        """The whole tracks that are observed in at least `min_frames` of these frames."""
+        counted = np.zeros(self.num_frames, dtype=np.bool_)
+        counted[frames] = True
+        so_far = np.concatenate([[0], np.cumsum(counted[self.frame])])
+        return self.keep_tracks(np.diff(so_far[self.offsets]) >= min_frames)
+
+    def every_nth(self, n: int) -> Tracks:
+        """One in `n` of the tracks, from the first."""
+        return self.keep_tracks(np.arange(self.num_tracks) % n == 0)
+
+    def split_to_length(self, max_length: int) -> Tracks:
+        """All observations, each track split into equal parts of `max_length` at most."""
+        lengths = self.lengths
+        part = -(-lengths // -(-lengths // max_length))
+        place = np.arange(self.num_observations) - np.repeat(self.offsets[:-1], lengths)
+        starts = np.flatnonzero(place % np.repeat(part, lengths) == 0)
+        offsets = np.append(starts, self.num_observations).astype(np.int64)
+        return replace(self, offsets=offsets)
+
+    def split_after_frames(self, frames: Sequence[int]) -> Tracks:
+        """All observations, the tracks split between each of these frames and the next.
+
+        Args:
+            frames: display indices; where there are none, the tracks themselves are returned.
+        """
+        if len(frames) == 0:
+            return self
+        part = np.searchsorted(np.sort(np.asarray(frames)), self.frame, side="left")
+        starts = np.zeros(self.num_observations + 1, dtype=np.bool_)
+        starts[self.offsets] = True
+        starts[1:-1] |= np.diff(part) != 0
+        return replace(self, offsets=np.flatnonzero(starts).astype(np.int64))
+
+    def split_at_removed(self, kept: NDArray[np.bool_], starts: NDArray[np.bool_]) -> Tracks:
+        """The tracks with some of their observations only, split where one between is removed.
+
+        Args:
+            kept: bool [num_observations].
+            starts: bool [num_observations] further observations before which a track is split.
+        """
+        part = np.cumsum(~kept | starts)
+        begins = np.ones(int(np.count_nonzero(kept)), dtype=np.bool_)
+        begins[1:] = (np.diff(self.track[kept]) != 0) | (np.diff(part[kept]) != 0)
+        return self._take(kept, np.append(np.flatnonzero(begins), len(begins)).astype(np.int64))
+
+    def scale_to(self, size: tuple[int, int]) -> Tracks:
+        """The tracks in pictures that are scaled to another (width, height) in pixels."""
+        if size == (self.width, self.height):
+            return self
+        # All in numbers of four bytes: the arrays are the largest of a whole run.
+        factor = np.array([size[0] / self.width, size[1] / self.height], np.float32)
+        return replace(
+            self,
+            width=size[0],
+            height=size[1],
+            xy=self.xy * factor,
+            sigma=self.sigma * np.float32(math.sqrt(float(factor.prod()))),
+        )
+
+    def as_displayed(self, display: Display, presented: NDArray[np.int32] | None = None) -> Tracks:
+        """The tracks in the pictures that players show, from those in the stored pictures.
+
+        Args:
+            display: how the pictures are cropped and rotated.
+            presented: indices of the frames that players show, ascending; None: all.
+
+        Returns:
+            The observations within what is shown; frames are numbered anew where some are not.
+        """
+        size = shown_size((self.width, self.height), display)
+        xy = shown_points(self.xy, (self.width, self.height), display)
+        shown = replace(self, width=size[0], height=size[1], xy=xy)
+        # By columns: NumPy's loops over rows of two take several times as long.
+        x, y = xy[:, 0], xy[:, 1]
+        kept = (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
+        if presented is not None:
+            presented = presented[presented < self.num_frames]
+            number = np.full(self.num_frames, -1, dtype=np.int32)
+            number[presented] = np.arange(len(presented), dtype=np.int32)
+            shown = replace(shown, num_frames=len(presented), frame=number[self.frame])
+            kept &= shown.frame >= 0
+        return shown.keep_observations(kept)
+
+    def _take(self, kept: NDArray[np.bool_], offsets: NDArray[np.int64]) -> Tracks:
+        """Some of the observations, in tracks with these offsets."""
+        # A position is taken as one number of eight bytes: rows of two take several times as long.
+        xy = np.ascontiguousarray(self.xy).view(np.uint64)[:, 0][kept]
+        return replace(
+            self,
+            offsets=offsets,
+            frame=self.frame[kept],
+            xy=xy.view(np.float32).reshape(-1, 2),
+            sigma=self.sigma[kept],
+            confirmed=self.confirmed[kept],
+        )
 
 
 @checks_arguments
@@ -119,241 +343,20 @@ def build_tracks(
     return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
 
 
-def show_tracks(
-    tracks: Tracks, display: Display, presented: NDArray[np.int32] | None = None
-) -> Tracks:
-    """The tracks in the pictures that players show, in place of those that are stored.
-
-    Args:
-        tracks: tracks through all shown frames of a bitstream.
-        display: how its pictures are cut and turned.
-        presented: indices of the frames that players show, ascending; None: all.
-
-    Returns:
-        The observations within what is shown; frames are numbered anew where some are left out.
-    """
-    size = shown_size((tracks.width, tracks.height), display)
-    xy = shown_points(tracks.xy, (tracks.width, tracks.height), display)
-    shown = replace(tracks, width=size[0], height=size[1], xy=xy)
-    # By columns: NumPy's loops over rows of two take several times as long, here and below.
-    x, y = xy[:, 0], xy[:, 1]
-    kept = (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
-    if presented is not None:
-        presented = presented[presented < tracks.num_frames]
-        number = np.full(tracks.num_frames, -1, dtype=np.int32)
-        number[presented] = np.arange(len(presented), dtype=np.int32)
-        shown = replace(shown, num_frames=len(presented), frame=number[tracks.frame])
-        kept &= shown.frame >= 0
-    return keep_observations(shown, kept)
-
-
-def keep_observations(tracks: Tracks, kept: NDArray[np.bool_]) -> Tracks:
-    """The tracks with some of their observations only.
-
-    Args:
-        tracks: any tracks.
-        kept: bool [num_observations].
-
-    Returns:
-        Tracks in their former order, without those that keep nothing.
-    """
-    if kept.all():
-        return tracks
-    so_far = np.zeros(len(kept) + 1, dtype=np.min_scalar_type(len(kept)))
-    np.cumsum(kept, out=so_far[1:])
-    lengths = np.diff(so_far[tracks.offsets].astype(np.int64))
-    return replace(
-        tracks,
-        offsets=np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64),
-        frame=tracks.frame[kept],
-        xy=_rows(tracks.xy, kept),
-        sigma=tracks.sigma[kept],
-        confirmed=tracks.confirmed[kept],
-    )
-
-
-def _rows(xy: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Some rows of a [n, 2] array: as numbers of eight bytes, which takes no indices."""
-    rows = np.ascontiguousarray(xy).view(np.uint64)[:, 0]
-    return rows[kept].view(np.float32).reshape(-1, 2)
-
-
-def keep_frames(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
-    """The tracks with the observations in these frames only, as `keep_observations`."""
-    wanted = np.zeros(tracks.num_frames, dtype=np.bool_)
-    wanted[frames] = True
-    return keep_observations(tracks, wanted[tracks.frame])
-
-
-def in_frames_alone(tracks: Tracks, frames: NDArray[np.int32]) -> Tracks:
-    """The tracks as of a video that shows some frames only, and no others between them.
-
-    Args:
-        tracks: any tracks.
-        frames: int32 [n] display indices, ascending.
-    """
-    number = np.full(tracks.num_frames, -1, dtype=np.int32)
-    number[frames] = np.arange(len(frames), dtype=np.int32)
-    seen = keep_frames(tracks, frames)
-    return replace(seen, num_frames=len(frames), frame=number[seen.frame])
-
-
-def keep_tracks_of(tracks: Tracks, frames: NDArray[np.int32], fewest: int) -> Tracks:
-    """The tracks that this many of some frames see at least, with all their observations."""
-    counted = np.zeros(tracks.num_frames, dtype=np.bool_)
-    counted[frames] = True
-    so_far = np.concatenate([[0], np.cumsum(counted[tracks.frame])])
-    counts = np.diff(so_far[tracks.offsets])
-    return keep_observations(tracks, np.repeat(counts >= fewest, np.diff(tracks.offsets)))
-
-
-def keep_long_tracks(tracks: Tracks, min_length: int) -> Tracks:
-    """The tracks that are observed in `min_length` frames or more, in their former order."""
-    lengths = np.diff(tracks.offsets)
-    return keep_observations(tracks, np.repeat(lengths >= min_length, lengths))
-
-
-def every_nth_track(tracks: Tracks, n: int) -> Tracks:
-    """One in `n` of the tracks, in their former order."""
-    kept = np.arange(len(tracks.offsets) - 1) % n == 0
-    return keep_observations(tracks, np.repeat(kept, np.diff(tracks.offsets)))
-
-
-def shorter_tracks(tracks: Tracks, most: int) -> Tracks:
-    """Tracks in pieces of much the same length that have so many observations at most.
-
-    Args:
-        tracks: any tracks.
-        most: observations of a piece.
-
-    Returns:
-        All observations in their former order.
-    """
-    length = np.diff(tracks.offsets)
-    piece = -(-length // -(-length // most))
-    place = np.arange(len(tracks.frame)) - np.repeat(tracks.offsets[:-1], length)
-    starts = np.flatnonzero(place % np.repeat(piece, length) == 0)
-    return replace(tracks, offsets=np.append(starts, len(tracks.frame)).astype(np.int64))
-
-
-def cut_tracks(tracks: Tracks, after: Sequence[int]) -> Tracks:
-    """The tracks, cut in two wherever they pass from one of these frames to the next.
-
-    Args:
-        tracks: any tracks.
-        after: display indices of the frames before each cut.
-
-    Returns:
-        All observations in their former order; the same object where nothing is cut.
-    """
-    if len(after) == 0:
-        return tracks
-    part = np.searchsorted(np.sort(np.asarray(after)), tracks.frame, side="left")
-    starts = np.zeros(len(tracks.frame) + 1, dtype=np.bool_)
-    starts[tracks.offsets] = True
-    starts[1:-1] |= np.diff(part) != 0
-    return replace(tracks, offsets=np.flatnonzero(starts).astype(np.int64))
-
-
-def split_tracks(tracks: Tracks, kept: NDArray[np.bool_], cut: NDArray[np.bool_]) -> Tracks:
-    """The tracks with some of their observations only, cut in two where one between is left out.
-
-    Args:
-        tracks: any tracks.
-        kept: bool [num_observations].
-        cut: bool [num_observations] those before which a track is cut all the same.
-    """
-    part = np.cumsum(~kept | cut)
-    begins = np.ones(int(np.count_nonzero(kept)), dtype=np.bool_)
-    begins[1:] = (np.diff(tracks.track[kept]) != 0) | (np.diff(part[kept]) != 0)
-    return replace(
-        tracks,
-        offsets=np.append(np.flatnonzero(begins), len(begins)).astype(np.int64),
-        frame=tracks.frame[kept],
-        xy=_rows(tracks.xy, kept),
-        sigma=tracks.sigma[kept],
-        confirmed=tracks.confirmed[kept],
-    )
-
-
-def no_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
-    """Tracks of a video where there are none."""
-    return Tracks(
-        *(num_frames, *size, np.zeros(1, np.int64), np.empty(0, np.int32)),
-        *(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty(0, np.bool_)),
-    )
-
-
-def join_tracks(a: Tracks, b: Tracks) -> Tracks:
-    """All tracks of one video that two sets hold, those of the first first."""
-    if len(b.offsets) == 1:
-        return a
-    return replace(
-        a,
-        offsets=np.concatenate([a.offsets, b.offsets[1:] + a.offsets[-1]]),
-        frame=np.concatenate([a.frame, b.frame]),
-        xy=np.concatenate([a.xy, b.xy]),
-        sigma=np.concatenate([a.sigma, b.sigma]),
-        confirmed=np.concatenate([a.confirmed, b.confirmed]),
-    )
-
-
-def tracks_in_a_row(videos: Sequence[Tracks], num_frames: int) -> Tracks:
-    """The tracks of several videos as of one that shows them in a row.
-
-    Args:
-        videos: tracks of each.
-        num_frames: frames of them all, and of what has no tracks after them.
-
-    Returns:
-        All tracks, those of the first video first, each in pixels of its own; width and height are
-        the largest. The same object where there is but one video and nothing after it.
-    """
-    first = videos[0]
-    if len(videos) == 1 and num_frames == first.num_frames:
-        return first
-    starts = np.cumsum([0, *(video.num_frames for video in videos)])
-    counts = np.cumsum([0, *(video.offsets[-1] for video in videos)])
-    return Tracks(
-        num_frames=num_frames,
-        width=max(video.width for video in videos),
-        height=max(video.height for video in videos),
-        offsets=np.concatenate(
-            [[0], *(v.offsets[1:] + n for v, n in zip(videos, counts, strict=False))]
-        ).astype(np.int64),
-        frame=np.concatenate(
-            [v.frame + np.int32(n) for v, n in zip(videos, starts, strict=False)]
-        ).astype(np.int32),
-        xy=np.concatenate([video.xy for video in videos]),
-        sigma=np.concatenate([video.sigma for video in videos]),
-        confirmed=np.concatenate([video.confirmed for video in videos]),
-    )
-
-
 def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
-    """Indices of observations by their frames, those of a frame in their former order."""
+    """Indices of observations sorted by frame; within a frame they keep their order."""
     # A type of two bytes is sorted by radix, in a quarter of the time.
     return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")
-
-
-def scale_tracks(tracks: Tracks, size: tuple[int, int]) -> Tracks:
-    """The tracks in pictures that are scaled to another (width, height) in pixels."""
-    if size == (tracks.width, tracks.height):
-        return tracks
-    # All in numbers of four bytes: the arrays are the largest of a whole run.
-    factor = np.array([size[0] / tracks.width, size[1] / tracks.height], np.float32)
-    return replace(
-        tracks,
-        width=size[0],
-        height=size[1],
-        xy=tracks.xy * factor,
-        sigma=tracks.sigma * np.float32(math.sqrt(float(factor.prod()))),
-    )
 
 
 def least_length(options: TrackOptions) -> int:
     """Shown frames that a track is seen in at least."""
     return _MIN_LENGTH if options.min_length is None else options.min_length
+
+
+def _joined_offsets(sets: Sequence[Tracks]) -> NDArray[np.int64]:
+    """Offsets of the tracks of several sets, one set after the other."""
+    return np.cumsum(np.concatenate([[0], *(one.lengths for one in sets)]), dtype=np.int64)
 
 
 def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:

@@ -25,7 +25,7 @@ from colmap_av1.options import EncodeOptions, MatchOptions
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.refine_spread import refine_spread_tracks
-from colmap_av1.tracks.tracks import Tracks, build_tracks, scale_tracks, show_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.video.coded_size import coded_size, with_downscale
@@ -232,10 +232,10 @@ def track_video(
             num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
             tracks = remove_overlays(tracks)
             share_over_picture = 1 - len(tracks.offsets) / num_tracks
-            tracks = show_tracks(tracks, source.stream.display, presented)
+            tracks = tracks.as_displayed(source.stream.display, presented)
             num_pixels = num_frames * tracks.width * tracks.height
             if source.stream is not source.pictures:
-                tracks = scale_tracks(tracks, source.pictures.picture_size)
+                tracks = tracks.scale_to(source.pictures.picture_size)
         # Reading happened inside the chaining.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":

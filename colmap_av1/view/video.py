@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import OptionError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
-from colmap_av1.tracks.tracks import Tracks, build_tracks, order_by_frame, show_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.util.outputs import check_files
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
@@ -99,7 +99,7 @@ def view_video(
         )
         # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
         opened = read_video(video, operating_point)
-        chained = show_tracks(chained, opened.display, opened.presented)
+        chained = chained.as_displayed(opened.display, opened.presented)
         drawing = _prepare(chained, options)
         draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
         check_video()
@@ -145,8 +145,8 @@ class _Drawing:
 
 
 def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
-    length = np.diff(tracks.offsets)
-    by_frame = order_by_frame(tracks.frame, tracks.num_frames)
+    length = tracks.lengths
+    by_frame = tracks.order_by_frame()
     step = np.diff(tracks.xy, axis=0, prepend=tracks.xy[:1])
     interval = np.diff(tracks.frame, prepend=tracks.frame[:1])
     starts = tracks.offsets[:-1][length > 1]
@@ -159,7 +159,7 @@ def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
         options=options,
         by_frame=by_frame,
         bounds=np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1)),
-        age=np.arange(tracks.frame.size) - np.repeat(tracks.offsets[:-1], length),
+        age=np.arange(tracks.num_observations) - np.repeat(tracks.offsets[:-1], length),
         velocity=velocity,
         full_speed=max(full_speed, _LEAST_FULL_SPEED),
         has_tail=np.repeat(_is_spread(tracks, options.spacing), length),
@@ -171,7 +171,7 @@ def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
 
     Of the tracks that start in a cell within as many frames as tails are long, the longest.
     """
-    length = np.diff(tracks.offsets)
+    length = tracks.lengths
     start = tracks.offsets[:-1]
     cell = np.floor(tracks.xy[start] / max(spacing, 1)).astype(np.int64)
     time = tracks.frame[start] // _FRAMES_PER_CHOICE

@@ -146,7 +146,7 @@ def measure(clip: str, folder: Path, setting: EncodeOptions) -> Row:
     where = folder / name_of(setting)
     stream, cpu_seconds = converted(source, where / "stream", setting)
     tracks = build_tracks(read_motion(stream))
-    length = np.diff(tracks.offsets)
+    length = tracks.lengths
     errors: dict[int, float] = {}
     if sequence.camera is not None and sequence.cam_from_world is not None:
         cameras = (sequence.cam_from_world, sequence.camera)

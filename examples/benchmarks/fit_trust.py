@@ -96,7 +96,7 @@ def main() -> int:
         tracks = build_tracks(motion)
         steps.append(step_samples(each, tracks, motion))
         matches.append(match_samples(each, tracks))
-        print(f"{each.name}: {len(tracks.frame)} observations", file=sys.stderr)
+        print(f"{each.name}: {tracks.num_observations} observations", file=sys.stderr)
     for what, samples, names in (
         ("steps", steps, STEP_TRAITS),
         ("matches", matches, MATCH_TRAITS),
@@ -184,7 +184,7 @@ def draw(count: int) -> NDArray[np.int64]:
 
 def step_samples(clip: Clip, tracks: Tracks, motion: list[FrameMotion]) -> Samples:
     """Steps to the frame before, by what the bitstream says of the unit that made them."""
-    first = np.zeros(len(tracks.frame), bool)
+    first = np.zeros(tracks.num_observations, bool)
     first[tracks.offsets[:-1]] = True
     later = np.flatnonzero(~first)
     later = later[tracks.frame[later] - tracks.frame[later - 1] == 1]

@@ -126,13 +126,13 @@ def test_tracks_of_a_database_are_those_written(clip, tmp_path):
     assert (tmp_path / "a.db").read_bytes() == before
     assert (found.num_frames, found.width, found.height) == (16, 192, 128)
     assert found.offsets[0] == 0
-    assert np.diff(found.offsets).min() >= 2
-    assert found.offsets[-1] == len(found.frame) == len(found.xy)
+    assert found.lengths.min() >= 2
+    assert found.offsets[-1] == found.num_observations == len(found.xy)
     written = {(f, *xy) for f, xy in zip(tracks.frame, tracks.xy.tolist(), strict=True)}
     assert {(f, *xy) for f, xy in zip(found.frame, found.xy.tolist(), strict=True)} <= written
-    assert len(found.frame) > 0.7 * len(tracks.frame)
+    assert found.num_observations > 0.7 * tracks.num_observations
     of = {}
-    for t in range(len(tracks.offsets) - 1):
+    for t in range(tracks.num_tracks):
         for i in range(*tracks.offsets[t : t + 2]):
             of[(tracks.frame[i], *tracks.xy[i].tolist())] = t
     for start, end in zip(found.offsets[:-1], found.offsets[1:], strict=True):

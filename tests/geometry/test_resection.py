@@ -7,7 +7,7 @@ import pytest
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.resection import Sightings, interpolate_poses, resect, sightings_of
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 
 _FOCAL = 500.0
 
@@ -77,7 +77,7 @@ def test_sightings_are_those_of_the_tracks_that_have_points(wanted: tuple[int, .
     xy = np.column_stack([10.0 + np.arange(11), 20.0 + np.arange(11)]).astype(np.float32)
     offsets, zero = np.array([0, 5, 7, 11]), np.zeros(11, np.float32)
     tracks = Tracks(5, 100, 80, offsets, frame, xy, zero, zero > 0)
-    seen = keep_frames(tracks, np.array([0, 2, 4], np.int32))
+    seen = tracks.keep_frames(np.array([0, 2, 4], np.int32))
     points = TriangulatedPoints(
         np.array([[1.0, 2, 3], [4, 5, 6]]), np.zeros(2), np.array([0, 3, 5]), np.arange(5), 2, 2
     )

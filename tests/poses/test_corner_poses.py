@@ -22,7 +22,7 @@ from colmap_av1.images.takes import Takes
 from colmap_av1.options import MapperOptions
 from colmap_av1.poses.corners.in_images import place_anew
 from colmap_av1.poses.reconstruct_poses import PosedImages, adjustment_stage
-from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.util.stages import Kept
 
@@ -111,8 +111,8 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
     ]
     number = np.repeat(np.arange(NUM_POINTS), NUM_IMAGES)
     later = seen.frame > joint
-    tracks = keep_observations(seen, ((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
-    links = keep_observations(seen, (number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
+    tracks = seen.keep_observations(((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
+    links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
     write_posed_model(tmp_path / "placed.npz", PosedModel(placed.cameras, images))
     options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
     run = SimpleNamespace(

@@ -44,7 +44,7 @@ from colmap_av1.poses.reconstruct_poses import PosedImages
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import VideoSource, track_video
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.video.decoding import decode_frames
@@ -330,7 +330,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     folder = tmp_path_factory.mktemp("passed")
     run = Run(*(inputs, (source,), folder, folder, ReconstructOptions(), Clock(), no_progress))
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
-    cut = mask_tracks(keep_frames(every, frames), dict(enumerate(masks)), 4)
+    cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)
     moving = dict(zip(names, masks, strict=True))
     return Passed(run, moving, select_tracks(cut, some), placed, left)
 
@@ -351,7 +351,7 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
 
 def test_tracks_are_followed_behind_what_passes(passed: Passed) -> None:
     found = follow_behind(passed.run, passed.moving, passed.tracks, passed.placed)
-    assert len(found.frame) > 1.1 * len(passed.tracks.frame)
+    assert found.num_observations > 1.1 * passed.tracks.num_observations
     assert len(off_behind(passed.tracks)[0]) < 10
     taken_up, off = off_behind(found)
     assert len(taken_up) > 80
@@ -370,9 +370,9 @@ def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) 
         replace(image, cam_from_world=turn @ image.cam_from_world) if frame >= 20 else image
         for frame, image in enumerate(passed.placed.images)
     ]
-    early = keep_frames(passed.tracks, np.arange(20, dtype=np.int32))
+    early = passed.tracks.keep_frames(np.arange(20, dtype=np.int32))
     found = follow_behind(passed.run, passed.moving, early, replace(passed.placed, images=images))
-    first = np.repeat(found.offsets[:-1], np.diff(found.offsets))
+    first = np.repeat(found.offsets[:-1], found.lengths)
     late = np.flatnonzero(found.frame >= 20)
     if pixels > 1:  # beyond what is searched
         assert len(late) < 10

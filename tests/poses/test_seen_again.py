@@ -19,7 +19,7 @@ from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.seen_again import found_again
-from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks
 
 FOCAL, WIDTH, HEIGHT = 300.0, 320, 240
 NUM_FOLLOWED = 3  # images that corners were followed through, the first ones
@@ -147,7 +147,7 @@ def test_corners_are_where_other_views_show_them_without_drift(
         assert len(off) > 50
         assert np.median(off) < 0.05
         assert np.quantile(off, 0.95) < 0.2
-    assert np.diff(found.offsets).max() == len(POSES)
+    assert found.lengths.max() == len(POSES)
     assert (np.diff(found.frame)[np.diff(found.track) == 0] > 0).all()
 
 
@@ -232,8 +232,8 @@ def test_no_corners_are_no_tracks(scene: Scene, kept: GreyPictures) -> None:
     none = np.empty(0, np.int64)
     nothing = replace(
         scene,
-        corners=keep_observations(scene.corners, np.zeros(len(scene.corners.frame), np.bool_)),
+        corners=scene.corners.keep_observations(np.zeros(scene.corners.num_observations, np.bool_)),
         view=none,
         points=TriangulatedPoints(np.empty((0, 3)), np.empty(0), np.zeros(1, np.int64), none, 0, 0),
     )
-    assert len(look(nothing, kept).offsets) == 1
+    assert look(nothing, kept).num_tracks == 0

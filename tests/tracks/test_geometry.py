@@ -159,7 +159,7 @@ def test_epipolar_error_needs_poses(true_tracks, scene, camera):
     poses = scene.cam_from_world.copy()
     poses[15:] = np.nan
     some = epipolar_errors(true_tracks, poses, camera, 2)
-    assert len(some) == 3 * (len(true_tracks.offsets) - 1)  # from 10, 11 and 12
+    assert len(some) == 3 * true_tracks.num_tracks  # from 10, 11 and 12
     poses[:] = poses[0]
     assert len(epipolar_errors(true_tracks, poses, camera, 2)) == 0
 

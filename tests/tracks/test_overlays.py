@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import colmap_av1
 from colmap_av1.tracks.overlays import remove_overlays
-from colmap_av1.tracks.tracks import Tracks, keep_frames
+from colmap_av1.tracks.tracks import Tracks
 
 SCENE = PROJECT / "examples" / "scene.mp4"
 
@@ -63,9 +63,9 @@ def test_the_way_between_kept_frames_counts() -> None:
     """Where observations of every fifth frame are kept, the picture moves as far as in all."""
     paths = [(0, np.full((21, 2), 50.0)), (0, moving(0.25, 21)), (0, moving(0.25, 21))]
     tracks = make_tracks(paths, 21)
-    some = keep_frames(tracks, np.arange(0, 21, 5, dtype=np.int32))
+    some = tracks.keep_frames(np.arange(0, 21, 5, dtype=np.int32))
     kept = remove_overlays(some)
-    assert len(kept.offsets) == 3
+    assert kept.num_tracks == 2
     np.testing.assert_array_equal(kept.xy, some.xy[5:])
 
 
@@ -106,5 +106,5 @@ def test_logo_over_a_clip(tmp_path: Path) -> None:
     assert still_in_logo(tracks) > 20
     # A few move a little to and fro.
     assert still_in_logo(kept) < 0.15 * still_in_logo(tracks)
-    num_left_out = len(tracks.offsets) - len(kept.offsets)
+    num_left_out = tracks.num_tracks - kept.num_tracks
     assert num_left_out < 2 * still_in_logo(tracks)

@@ -71,7 +71,7 @@ def moving_tracks(step_error: float, seed: int = 2) -> tuple[Tracks, NDArray[np.
 
 def is_textured(tracks: Tracks) -> NDArray[np.bool_]:
     first = tracks.xy[tracks.offsets[:-1], 0]
-    return np.asarray(np.repeat(first > FLAT, np.diff(tracks.offsets)))
+    return np.asarray(np.repeat(first > FLAT, tracks.lengths))
 
 
 def test_errors_shrink_and_do_not_add_up() -> None:
@@ -100,13 +100,13 @@ def test_what_pixels_cannot_confirm_keeps_the_bitstreams_steps() -> None:
     assert not refined.confirmed[flat].any()
     np.testing.assert_allclose(refined.xy[flat], tracks.xy[flat], atol=1e-4)
     np.testing.assert_allclose(refined.sigma[flat], tracks.sigma[flat], rtol=1e-4)
-    assert len(refined.frame) == len(tracks.frame)
+    assert refined.num_observations == tracks.num_observations
 
 
 def test_a_wrong_step_is_not_confirmed_and_gets_lost_for_good() -> None:
     tracks, truth = moving_tracks(0.05)
     # From frame 5 on every third track is 8 px off.
-    off = np.repeat(np.arange(len(tracks.offsets) - 1) % 3 == 0, FRAMES) & (tracks.frame >= 5)
+    off = np.repeat(np.arange(tracks.num_tracks) % 3 == 0, FRAMES) & (tracks.frame >= 5)
     tracks.xy[off] += np.float32(8)
     refined = refine_tracks(tracks, pictures(), LK)
     textured = is_textured(tracks)
@@ -182,7 +182,7 @@ def test_progress_counts_frames() -> None:
 def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
     tracks = build_tracks(read_motion(EXAMPLE))
     refined = refine_tracks(tracks, decode_frames(EXAMPLE), LK)
-    later = np.ones(len(tracks.frame), bool)
+    later = np.ones(tracks.num_observations, bool)
     later[tracks.offsets[:-1]] = False
     assert refined.confirmed[later].mean() > 0.9
     np.testing.assert_array_equal(refined.xy[~later], tracks.xy[~later])
@@ -190,7 +190,7 @@ def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
 
     scene = render_scene.build_scene()
     # Tracks that start in every twentieth frame, four steps later.
-    start = tracks.offsets[:-1][np.diff(tracks.offsets) > 4]
+    start = tracks.offsets[:-1][tracks.lengths > 4]
     start = start[(tracks.frame[start] % 20 == 0) & (tracks.frame[start + 4] % 20 == 4)]
     truth = np.full((len(start), 2), np.nan)
     for first in np.unique(tracks.frame[start]):
@@ -226,7 +226,7 @@ def test_few_tracks_are_corrected_in_the_images_alone() -> None:
     np.testing.assert_array_equal(refined.sigma[elsewhere], tracks.sigma[elsewhere])
     textured = refined.confirmed & (tracks.frame > 0)
     # As many as are spread over the picture, 10 pixels apart.
-    assert 300 < textured.sum() / 3 < len(tracks.offsets)
+    assert 300 < textured.sum() / 3 < tracks.num_tracks
     error = np.linalg.norm(refined.xy - truth.reshape(-1, 2), axis=1)[textured]
     before = np.linalg.norm(tracks.xy - truth.reshape(-1, 2), axis=1)[textured]
     assert np.median(error) < 0.25 * np.median(before)

@@ -7,7 +7,7 @@ import numpy as np
 
 from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_observations
+from colmap_av1.tracks.tracks import Tracks
 
 WIDTH, HEIGHT, FRAMES = 320, 240, 30
 ANY = {"max_tracks_per_image": 0, "spacing": 0.0, "min_images": 1, "max_sigma": 0.0}
@@ -82,39 +82,39 @@ def test_sure_and_long_tracks_come_first() -> None:
     options = DensityOptions(**ANY | {"max_tracks_per_image": 60, "min_images": 3})
     chosen = select_tracks(tracks, options)
     assert (chosen.xy[:, 0] < WIDTH / 2).mean() > 0.6
-    assert np.diff(chosen.offsets).mean() > 1.15 * np.diff(tracks.offsets).mean()
+    assert chosen.lengths.mean() > 1.15 * tracks.lengths.mean()
 
 
 def test_max_sigma_and_min_images_hold_for_what_is_left() -> None:
     tracks = random_tracks()
     chosen = select_tracks(tracks, DensityOptions(**ANY | {"max_sigma": 0.5, "min_images": 5}))
     assert chosen.sigma.max() <= 0.5
-    assert np.diff(chosen.offsets).min() >= 5
+    assert chosen.lengths.min() >= 5
     # What is left out is too unsure or too short.
-    expected = keep_observations(tracks, tracks.sigma <= 0.5)
-    assert len(chosen.offsets) - 1 == (np.diff(expected.offsets) >= 5).sum()
+    expected = tracks.keep_observations(tracks.sigma <= 0.5)
+    assert chosen.num_tracks == (expected.lengths >= 5).sum()
 
 
 def test_presets_follow_the_distance_of_images() -> None:
     tracks = random_tracks()
     # Every fourth frame is an image, and errors are as large as those of four steps.
-    spaced = keep_observations(tracks, tracks.frame % 4 == 0)
+    spaced = tracks.keep_observations(tracks.frame % 4 == 0)
     chosen = select_tracks(spaced, DensityOptions())
     largest = chosen.sigma.max()
     assert largest > 0.8
     sigma = spaced.sigma.astype(float)
-    first = np.repeat(sigma[spaced.offsets[:-1]], np.diff(spaced.offsets))
+    first = np.repeat(sigma[spaced.offsets[:-1]], spaced.lengths)
     reach = np.sqrt(np.maximum(sigma**2 - first**2, 0))
     given = select_tracks(spaced, DensityOptions(max_sigma=0.5, min_images=1))
     assert len(given.frame) <= (reach <= 0.5).sum()
     # The first observation that is left is what the others are held against.
-    late = keep_observations(tracks, tracks.sigma >= 0.3)
+    late = tracks.keep_observations(tracks.sigma >= 0.3)
     assert len(select_tracks(late, DensityOptions(**ANY | {"max_sigma": 0.2})).frame) > 0
 
 
 def moving(tracks: Tracks, pixels: float) -> Tracks:
     """The tracks with every second one moving so far from each frame to the next."""
-    track = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    track = tracks.track
     step = np.arange(len(track)) - tracks.offsets[:-1][track]
     way = np.float32([pixels, 0]) * (step * (track % 2 == 0))[:, None].astype(np.float32)
     return replace(tracks, xy=tracks.xy + way)
@@ -126,8 +126,8 @@ def test_errors_are_held_against_the_way() -> None:
     near = select_tracks(tracks, options)
     # By far more than thirty times their error.
     quick = select_tracks(moving(tracks, 40), options)
-    moves = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets)) % 2 == 0
-    assert len(near.frame) < 0.9 * len(tracks.frame)
+    moves = tracks.track % 2 == 0
+    assert near.num_observations < 0.9 * tracks.num_observations
     assert len(quick.frame) == moves.sum() + ((tracks.sigma <= 0.5) & ~moves).sum()
 
 
@@ -137,7 +137,7 @@ def test_images_keep_the_surest_of_their_widest_tracks() -> None:
     for wide_tracks in (0, 20, 60):
         options = DensityOptions(**ANY | {"max_sigma": 0.3, "wide_tracks": wide_tracks})
         chosen = select_tracks(tracks, options)
-        start = np.repeat(chosen.xy[chosen.offsets[:-1], 0], np.diff(chosen.offsets))
+        start = np.repeat(chosen.xy[chosen.offsets[:-1], 0], chosen.lengths)
         unsure = chosen.sigma > 0.3
         way = chosen.xy[:, 0] - start
         for frame in range(12, FRAMES):
@@ -148,29 +148,29 @@ def test_images_keep_the_surest_of_their_widest_tracks() -> None:
             assert (wide_tracks > 0) == np.any(own & unsure)
             if wide_tracks:
                 assert np.count_nonzero(own & unsure & (way < 0.8 * farthest)) < 10 * wide_tracks
-        sizes.append(len(chosen.frame))
+        sizes.append(chosen.num_observations)
     assert sizes == sorted(set(sizes))
-    assert sizes[-1] < 0.9 * len(tracks.frame)
+    assert sizes[-1] < 0.9 * tracks.num_observations
 
 
 def test_kept_observations_stay_with_their_tracks() -> None:
     tracks = random_tracks(50)
-    kept = np.random.default_rng(1).random(len(tracks.frame)) < 0.3
+    kept = np.random.default_rng(1).random(tracks.num_observations) < 0.3
     kept[tracks.offsets[3] : tracks.offsets[4]] = False
-    subset = keep_observations(tracks, kept)
+    subset = tracks.keep_observations(kept)
     expected = [
         tracks.xy[a:b][kept[a:b]]
         for a, b in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True)
         if kept[a:b].any()
     ]
-    assert len(subset.offsets) - 1 == len(expected) < 50
+    assert subset.num_tracks == len(expected) < 50
     for i, xy in enumerate(expected):
         np.testing.assert_array_equal(subset.xy[subset.offsets[i] : subset.offsets[i + 1]], xy)
 
 
 def test_no_tracks_are_no_error() -> None:
     tracks = random_tracks()
-    none = keep_observations(tracks, np.zeros(len(tracks.frame), bool))
+    none = tracks.keep_observations(np.zeros(tracks.num_observations, bool))
     assert len(none.offsets) == 1
     for preset in ("sparse", "default", "dense"):
         assert len(select_tracks(none, DensityOptions(preset=preset)).frame) == 0

@@ -18,15 +18,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import TrackOptions
-from colmap_av1.tracks.tracks import (
-    Tracks,
-    build_tracks,
-    in_frames_alone,
-    keep_frames,
-    keep_long_tracks,
-    no_tracks,
-    shorter_tracks,
-)
+from colmap_av1.tracks.tracks import Tracks, build_tracks
 
 BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32, BLOCK_64X64 = 0, 3, 6, 9, 12
 NEWMV, GLOBALMV = 16, 15
@@ -149,13 +141,13 @@ def split(tracks: Tracks) -> list[tuple[NDArray[np.int32], NDArray[np.float32]]]
 
 
 def check_invariants(tracks: Tracks, min_length: int, cell: int = 4) -> None:
-    lengths = np.diff(tracks.offsets)
+    lengths = tracks.lengths
     assert tracks.offsets[0] == 0
-    assert tracks.offsets[-1] == len(tracks.frame) == len(tracks.xy)
-    assert len(tracks.sigma) == len(tracks.confirmed) == len(tracks.frame)
+    assert tracks.offsets[-1] == tracks.num_observations == len(tracks.xy)
+    assert len(tracks.sigma) == len(tracks.confirmed) == tracks.num_observations
     assert not tracks.confirmed.any()
     assert (lengths >= min_length).all()
-    inside = np.ones(len(tracks.frame), bool)
+    inside = np.ones(tracks.num_observations, bool)
     inside[tracks.offsets[:-1]] = False
     assert (np.diff(tracks.frame, prepend=-1)[inside] > 0).all()
     assert np.isfinite(tracks.sigma).all()
@@ -317,7 +309,7 @@ def test_rotation_and_zoom_stay_near_the_true_path(angle: float, zoom: float) ->
     motion = mv_of(flow, width, height)
     tracks = build_tracks(low_delay([motion] * 8, width=width, height=height), SMALL_PICTURES)
     check_invariants(tracks, 4)
-    assert len(tracks.offsets) > 900
+    assert tracks.num_tracks > 900
     errors = []
     for _, xy in split(tracks):
         truth = xy[-1].astype(float)
@@ -335,7 +327,7 @@ def test_warp_is_inverted_without_an_offset() -> None:
     frames[1:] = [warp_units(f, params) for f in frames[1:]]
     tracks = build_tracks(frames, SMALL_PICTURES)
     check_invariants(tracks, 4)
-    assert len(tracks.offsets) > 50
+    assert tracks.num_tracks > 50
     matrix = np.array(params[2:], float).reshape(2, 2) / ONE
     shift = np.array(params[:2]) / ONE
     for _, xy in split(tracks):
@@ -383,7 +375,7 @@ def test_a_frame_coded_ahead_ends_the_video() -> None:
         hierarchy((0.0, 0.0), (0.0, 0.0))[:3], TrackOptions(min_length=3, border=None)
     )
     assert tracks.num_frames == 5
-    assert len(tracks.offsets) - 1 == 16 * 12
+    assert tracks.num_tracks == 16 * 12
     np.testing.assert_array_equal(tracks.frame.reshape(-1, 3), [[0, 2, 4]] * (16 * 12))
 
 
@@ -400,7 +392,7 @@ def test_steps_longer_than_the_limit_are_not_taken() -> None:
 
     def count(limit: int | None) -> int:
         options = TrackOptions(min_length=2, max_interval=limit, border=None)
-        return len(build_tracks(frames, options).offsets) - 1
+        return build_tracks(frames, options).num_tracks
 
     assert count(3) == count(None) == 16 * 12
     assert count(2) == 0
@@ -423,7 +415,7 @@ def test_largest_blocks_are_trusted_where_the_whole_frame_moves_evenly(
         for one in frames:
             one.skip[...] = uncoded
             one.mi_size[:detail] = BLOCK_16X16
-        return len(build_tracks(frames, replace(SMALL_PICTURES, smoothness=None)).offsets) - 1
+        return build_tracks(frames, replace(SMALL_PICTURES, smoothness=None)).num_tracks
 
     assert count(0) >= count(4) > 0.8 * 44 * 64
     assert count(6) <= 4 * 64
@@ -464,7 +456,7 @@ def test_the_second_list_is_used_where_the_first_finds_no_track() -> None:
         )
     )
     tracks = build_tracks(frames, replace(OPEN, min_length=5))
-    assert len(tracks.offsets) > 50
+    assert tracks.num_tracks > 50
     for shown, xy in split(tracks):
         np.testing.assert_array_equal(shown, [0, 1, 2, 3, 9])
         np.testing.assert_array_equal(np.diff(xy, axis=0), [[-1, 0]] * 4)
@@ -557,7 +549,7 @@ def test_squares_are_not_larger_than_those_of_seeding() -> None:
     frames = low_delay([(0.25, 0.5)] * 4)
     fine = build_tracks(frames, replace(OPEN, seeding=2))
     assert fine.xy.tobytes() == build_tracks(frames, replace(OPEN, seeding=2, cell=2)).xy.tobytes()
-    assert len(fine.offsets) > 3 * len(build_tracks(frames, OPEN).offsets)
+    assert fine.num_tracks > 3 * build_tracks(frames, OPEN).num_tracks
 
 
 @pytest.mark.parametrize(
@@ -651,22 +643,22 @@ def test_super_resolution_positions_are_in_the_upscaled_picture() -> None:
 
 def test_tracks_below_the_minimum_length_are_left_out() -> None:
     frames = low_delay([(0.0, 0.0)] * 3)
-    assert len(build_tracks(frames, TrackOptions(min_length=5, border=None)).offsets) == 1
-    assert len(build_tracks(frames, TrackOptions(min_length=4, border=None)).offsets) == 16 * 12 + 1
+    assert build_tracks(frames, TrackOptions(min_length=5, border=None)).num_tracks == 0
+    assert build_tracks(frames, TrackOptions(min_length=4, border=None)).num_tracks == 16 * 12
     empty = build_tracks(frames, TrackOptions(min_length=5, border=None))
     assert empty.frame.shape == (0,)
     assert empty.xy.shape == (0, 2)
-    assert len(build_tracks(frames[:3], TrackOptions(border=None)).offsets) == 1
+    assert build_tracks(frames[:3], TrackOptions(border=None)).num_tracks == 0
     short = build_tracks(frames[:3], TrackOptions(min_length=3, border=None))
-    assert len(short.offsets) == 16 * 12 + 1
+    assert short.num_tracks == 16 * 12
 
 
 def test_long_tracks_are_kept() -> None:
     frames = low_delay([(3.0, 0.0)] * 7)
     tracks = build_tracks(frames, TrackOptions(min_length=1, border=None))
-    assert set(np.diff(tracks.offsets)) > {1, 2, 8}
+    assert set(tracks.lengths) > {1, 2, 8}
     longer = build_tracks(frames, TrackOptions(min_length=4, border=None))
-    kept = keep_long_tracks(tracks, 4)
+    kept = tracks.keep_long(4)
     for name in ("offsets", "frame", "xy", "sigma"):
         assert np.array_equal(getattr(kept, name), getattr(longer, name))
 
@@ -717,7 +709,7 @@ def test_motion_at_the_edge_is_not_followed() -> None:
     tracks = build_tracks(frames, replace(OPEN, border=8.0))
     assert tracks.xy.min() >= 8
     assert np.all(tracks.xy <= np.array([tracks.width, tracks.height]) - 8)
-    assert len(tracks.offsets) - 1 == (16 - 4) * (12 - 4)
+    assert tracks.num_tracks == (16 - 4) * (12 - 4)
 
 
 def block_field(slope: float, jump: float = 0.0) -> list[FrameMotion]:
@@ -795,7 +787,7 @@ def shaking(seed: int = 0, frames: int = 20) -> list[FrameMotion]:
 def test_cosine_relative_to_the_dominant_motion_survives_shaking() -> None:
     def count(relative_to: Any, cosine: float | None = 0.9) -> int:
         options = replace(OPEN, min_length=8, cosine=cosine, cosine_relative_to=relative_to)
-        return len(build_tracks(shaking(), options).offsets) - 1
+        return build_tracks(shaking(), options).num_tracks
 
     free = count("none", None)
     assert free > 500
@@ -819,7 +811,7 @@ def test_cosine_ends_a_track_that_leaves_the_motion_around_it() -> None:
 
     assert steps_in_corner(free) > 100
     assert steps_in_corner(strict) < 0.2 * steps_in_corner(free)
-    assert len(strict.offsets) > 0.8 * len(free.offsets)
+    assert strict.num_tracks > 0.8 * free.num_tracks
 
 
 # real streams
@@ -835,7 +827,7 @@ def test_tracks_follow_the_decoded_pictures(shared: Path, name: str) -> None:
         images = [f.to_ndarray(format="gray") for f in container.decode(video=0)]
     assert tracks.num_frames == len(images)
 
-    ends = np.arange(1, len(tracks.frame))
+    ends = np.arange(1, tracks.num_observations)
     ends = ends[tracks.frame[1:] > tracks.frame[:-1]]
     ends = ends[~np.isin(ends, tracks.offsets)]
     ends = np.random.default_rng(0).choice(ends, 2000, replace=False)
@@ -951,7 +943,7 @@ def test_observations_of_some_frames_are_those_of_the_same_tracks(
         return
     frames = np.arange(1, len(motion) + 3, every, dtype=np.int32)
     tracks = build_tracks(motion, options)
-    seen = keep_long_tracks(keep_frames(tracks, frames[frames < tracks.num_frames]), 2)
+    seen = tracks.keep_frames(frames[frames < tracks.num_frames]).keep_long(2)
     some = build_tracks(motion, options, frames=frames)
     assert some.num_frames == tracks.num_frames
     for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
@@ -960,9 +952,9 @@ def test_observations_of_some_frames_are_those_of_the_same_tracks(
 
 def test_frames_alone_are_counted_through() -> None:
     tracks = build_tracks(low_delay([(1.0, 0.0)] * 8), OPEN)
-    alone = in_frames_alone(tracks, np.array([1, 4, 7], dtype=np.int32))
+    alone = tracks.subsample_frames(np.array([1, 4, 7], dtype=np.int32))
     assert alone.num_frames == 3
-    lasting = np.flatnonzero(np.diff(alone.offsets) == 3)[0]
+    lasting = np.flatnonzero(alone.lengths == 3)[0]
     own = slice(*alone.offsets[lasting : lasting + 2])
     assert alone.frame[own].tolist() == [0, 1, 2]
     np.testing.assert_allclose(np.diff(alone.xy[own], axis=0), [[-3, 0]] * 2, atol=1e-5)
@@ -984,20 +976,20 @@ def test_no_shown_frame_is_an_error() -> None:
     most=st.integers(1, 12),
 )
 @settings(deadline=None)
-def test_shorter_tracks_hold_all_observations(lengths: list[int], most: int) -> None:
+def test_tracks_split_to_a_length_hold_all_observations(lengths: list[int], most: int) -> None:
     total = sum(lengths)
     whole = replace(
-        no_tracks(40, (64, 64)),
+        Tracks.empty(40, (64, 64)),
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         frame=np.concatenate([np.empty(0), *(np.arange(n) for n in lengths)]).astype(np.int32),
         xy=np.arange(2.0 * total, dtype=np.float32).reshape(-1, 2),
         sigma=np.zeros(total, np.float32),
         confirmed=np.ones(total, np.bool_),
     )
-    short = shorter_tracks(whole, most)
+    short = whole.split_to_length(most)
     assert np.isin(whole.offsets, short.offsets).all()
     assert short.offsets[-1] == total
-    assert (np.diff(short.offsets) >= 1).all()
-    assert (np.diff(short.offsets) <= most).all()
-    assert len(short.offsets) - 1 <= sum(math.ceil(n / most) for n in lengths)
+    assert (short.lengths >= 1).all()
+    assert (short.lengths <= most).all()
+    assert short.num_tracks <= sum(math.ceil(n / most) for n in lengths)
     np.testing.assert_array_equal(short.xy, whole.xy)

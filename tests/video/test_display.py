@@ -19,7 +19,7 @@ from colmap_av1.match import match
 from colmap_av1.motion.info import inspect
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import CameraOptions, DensityOptions, ImageOptions, MatchOptions
-from colmap_av1.tracks.tracks import build_tracks, show_tracks
+from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import (
     Display,
@@ -135,7 +135,7 @@ def test_pictures_and_keypoints_are_where_ffmpeg_shows_them(
     assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
 
     tracks = build_tracks(read_motion(clip))
-    moved = show_tracks(tracks, display)
+    moved = tracks.as_displayed(display)
     np.testing.assert_array_equal(moved.offsets, tracks.offsets)
     # Tracks start between four pixels; these are the same before and after.
     starts = tracks.frame == 0
@@ -235,7 +235,7 @@ def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path)
 
     # Images are the frames that players show, but tracks began before.
     tracks = build_tracks(read_motion(clip))
-    shown = show_tracks(tracks, Display(), presented)
+    shown = tracks.as_displayed(Display(), presented)
     assert shown.num_frames == 11
     np.testing.assert_array_equal(shown.frame, tracks.frame[tracks.frame >= 5] - 5)
     for name, folder in (("new", "images"), ("cut", "cut")):

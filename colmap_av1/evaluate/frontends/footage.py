@@ -21,7 +21,6 @@ from colmap_av1.options import (
     PairOptions,
 )
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import keep_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import run_stage_in
@@ -179,7 +178,7 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     if options.camera.camera_params is None:
         return False
     tracks, chosen = prepared.tracks, prepared.chosen
-    seen = keep_frames(tracks, chosen.frames)
+    seen = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
     try:
         paired = pair_images(

@@ -50,7 +50,7 @@ def track_statistics(tracks: Tracks, frames: NDArray[np.integer] | None = None) 
     is_image[images] = True
     track = tracks.track
     seen = is_image[tracks.frame]
-    length = np.bincount(track[seen], minlength=len(tracks.offsets) - 1)
+    length = np.bincount(track[seen], minlength=tracks.num_tracks)
     # What a single image sees is no track.
     seen &= length[track] >= 2
     length = length[length >= 2]

@@ -18,7 +18,7 @@ from colmap_av1.poses.corners.seen_again import found_again
 from colmap_av1.poses.reconstruct_poses import FROM_PICTURES, PosedImages, triangulate_in
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.corners import CornerDensity, follow_corners
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.progress import progress_in
 
@@ -62,14 +62,14 @@ def _followed(
 ) -> Tracks:
     """Corners followed through each video's images, whose pictures are kept."""
     image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
-    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
+    found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.sources)):
         own = np.flatnonzero(placed.take == video)
         if len(own) == 0:
             continue
         first = int(placed.first_frame[video])
         mask_of = {int(placed.frames[i]) - first: masks[i] for i in own}
-        guide = keep_observations(tracks, np.isin(tracks.frame, placed.frames[own]))
+        guide = tracks.keep_observations(np.isin(tracks.frame, placed.frames[own]))
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
         decoded = decodable_frames(
@@ -87,7 +87,7 @@ def _followed(
         corners = follow_corners(
             *(guide, decoded, partial(_keeps, mask_of), report), density=density, keep=keep
         )
-        found = join_tracks(found, replace(corners, frame=corners.frame + np.int32(first)))
+        found = Tracks.concatenate(found, replace(corners, frame=corners.frame + np.int32(first)))
     return found
 
 

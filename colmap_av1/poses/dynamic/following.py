@@ -22,7 +22,7 @@ from colmap_av1.options import RefineOptions
 from colmap_av1.poses.reconstruct_poses import FOR_POSES, PosedImages
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.refine import refine_tracks
-from colmap_av1.tracks.tracks import Tracks, join_tracks, keep_observations, no_tracks
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.progress import no_progress, progress_in
 
@@ -62,7 +62,7 @@ def follow_behind(
         The tracks in these images, one for each point, without what disagrees with it.
     """
     masks = placed.masks_with(moving)
-    found = no_tracks(tracks.num_frames, (tracks.width, tracks.height))
+    found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.sources)):
         own = np.flatnonzero(placed.take == video)
         frames = placed.frames[own]
@@ -80,7 +80,9 @@ def follow_behind(
         expected, is_expected = expect_in_views(seen, view, points, views, frames)
         first_frame = int(placed.first_frame[video])
         corrected = _on_pictures(run, video, expected, is_expected, first_frame)
-        found = join_tracks(found, keep_observations(corrected, corrected.confirmed | ~is_expected))
+        found = Tracks.concatenate(
+            found, corrected.keep_observations(corrected.confirmed | ~is_expected)
+        )
     return found
 
 

@@ -20,7 +20,7 @@ from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
 from colmap_av1.poses.reconstruct_poses import PosedImages, read_posed_images
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, keep_frames, least_length
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -114,7 +114,7 @@ def _moving_in_video(
         wide_tracks=0,
     )
     seen, image = seen_in(
-        select_tracks(keep_frames(tracks, placed.frames[own]), spread), placed.frames[own]
+        select_tracks(tracks.keep_frames(placed.frames[own]), spread), placed.frames[own]
     )
     if len(image) == 0:
         return {}
