@@ -309,7 +309,7 @@ def _choose(
         existing=names,
         folder=folder,
         times=lambda: times_of_frames(source, tracks.num_frames),
-        decode=lambda: decoded_pictures(source, options),
+        decode=lambda: decoded_pictures(source, options.reading),
     )
 
 

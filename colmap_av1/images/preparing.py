@@ -161,7 +161,9 @@ def prepare_images(
         tracks = _tracks_that_count(tracked.tracks, source, fit, masks, options)
 
         def decode() -> Iterator[tuple[int, _Image]]:
-            pictures = decodable_frames(source.pictures, tracks.num_frames, options, display)
+            pictures = decodable_frames(
+                source.pictures, tracks.num_frames, options.reading, display
+            )
             for index, picture in pictures:
                 progress("looking", index + 1, tracks.num_frames)
                 yield index, picture

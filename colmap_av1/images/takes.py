@@ -164,7 +164,10 @@ def pictures_of(
             }
             if image_of:
                 decoded = decodable_frames(
-                    *(shown.video, max(image_of) + 1, options, shown.display),
+                    shown.video,
+                    max(image_of) + 1,
+                    options.reading,
+                    shown.display,
                     wanted=image_of,
                     use="pictures are looked at",
                     kept=shown.kept,

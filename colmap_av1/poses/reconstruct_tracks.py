@@ -188,7 +188,7 @@ def _track_and_choose(
                 existing=(),
                 folder=folder,
                 times=lambda: times_of_frames(source, tracked.tracks.num_frames),
-                decode=lambda: decoded_pictures(source, options),
+                decode=lambda: decoded_pictures(source, options.reading),
             )
     tracked = refine_in_images(
         tracked, source, chosen.frames, options, clock=clock, progress=progress

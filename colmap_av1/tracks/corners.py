@@ -150,7 +150,10 @@ def _follow(
     ) -> tuple[_Floats, NDArray[np.bool_]]:
         # OpenCV counts from the centre of the first pixel.
         found, ok, _ = cv2.calcOpticalFlowPyrLK(
-            *(source, target, p - 0.5, to - 0.5),
+            source,
+            target,
+            p - 0.5,
+            to - 0.5,
             winSize=_WINDOW,
             maxLevel=levels,
             criteria=_CRITERIA,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,8 +10,28 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks.presets import Limits, limits_of
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """The limits in force, see `DensityOptions`; 0 is none."""
+
+    max_tracks_per_image: int
+    spacing: float
+    min_images: int
+    max_sigma: float
+    wide_tracks: int
+
+
+# max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
+# as errors grow from step to step.
+PRESETS = {
+    # Poses need wide baselines; points do not, and long tracks take a mapper's time.
+    "sparse": _Limits(1500, spacing=12.0, min_images=3, max_sigma=0.8, wide_tracks=1000),
+    "default": _Limits(3500, spacing=7.5, min_images=3, max_sigma=0.8, wide_tracks=300),
+    "dense": _Limits(0, spacing=0.0, min_images=1, max_sigma=0.0, wide_tracks=0),
+}
 
 # Error in pixels that an observation has however accurate its motion is; keeps one sure
 # observation from outweighing many good ones.
@@ -42,7 +63,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         The same object where nothing is left out.
     """
     options = options if options is not None else DensityOptions()
-    limits = limits_of(options)
+    limits = _limits_of(options)
     if limits.min_images <= 1 and not (
         limits.max_sigma or limits.spacing or limits.max_tracks_per_image
     ):
@@ -65,10 +86,17 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
 
 def spread_observations(tracks: Tracks, options: DensityOptions) -> NDArray[np.bool_]:
     """Which observations `select_tracks` keeps where errors are not limited: bool [n]."""
-    return _spread(tracks, _variance_since_first(tracks), limits_of(options))
+    return _spread(tracks, _variance_since_first(tracks), _limits_of(options))
 
 
-def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: Limits) -> NDArray[np.bool_]:
+def _limits_of(options: DensityOptions) -> _Limits:
+    """The limits of the preset, with those of the options in place of its own."""
+    names = [field.name for field in fields(_Limits)]
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    return replace(PRESETS[options.preset], **given)
+
+
+def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: _Limits) -> NDArray[np.bool_]:
     """Which observations are kept so that tracks are long, accurate and spread; bool [n].
 
     Args:

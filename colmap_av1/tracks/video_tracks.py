@@ -21,10 +21,9 @@ from colmap_av1.errors import (
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, inspect
 from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import EncodeOptions, MatchOptions
+from colmap_av1.options import EncodeOptions, MatchOptions, ReadOptions
 from colmap_av1.tracks.overlays import remove_overlays
-from colmap_av1.tracks.refine import refine_tracks
-from colmap_av1.tracks.refine_spread import refine_spread_tracks
+from colmap_av1.tracks.refine import refine_spread_tracks, refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.progress import Clock, Progress
@@ -123,7 +122,8 @@ def open_source(
     if options.keep_stream is not None:
         with clock.measure("encoding"):
             made = stream_of(
-                *(video, options.keep_stream),
+                video,
+                options.keep_stream,
                 strict=strict,
                 options=how,
                 progress=progress,
@@ -133,7 +133,8 @@ def open_source(
     with _scratch(beside) as folder:
         with clock.measure("encoding"):
             made = encode(
-                *(video, folder / "stream.mp4"),
+                video,
+                folder / "stream.mp4",
                 strict=strict,
                 telemetry=False,  # the video itself is asked
                 options=how,
@@ -241,7 +242,8 @@ def track_video(
         if options.refine.refine != "none":
             with clock.measure("refinement"):
                 pictures = clock.iterate(
-                    "decoding", decodable_frames(source.pictures, tracks.num_frames, options)
+                    "decoding",
+                    decodable_frames(source.pictures, tracks.num_frames, options.reading),
                 )
                 tracks = refine_tracks(
                     tracks,
@@ -309,12 +311,12 @@ def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64]
     return None if times is None or len(times) < num_frames else times[:num_frames]
 
 
-def decoded_pictures(source: VideoSource, options: MatchOptions) -> Iterator[tuple[int, _Image]]:
+def decoded_pictures(source: VideoSource, options: ReadOptions) -> Iterator[tuple[int, _Image]]:
     """Index and picture (BGR) of every shown frame."""
     return decode_frames(
         source.pictures,
-        operating_point=options.read.operating_point,
-        num_threads=options.run.num_threads,
+        operating_point=options.operating_point,
+        num_threads=options.num_threads,
     )
 
 
@@ -350,7 +352,7 @@ def refine_in_images(
         wanted = frozenset(frames.tolist())
         num_frames = int(frames[-1]) + 1
         pictures = decodable_frames(
-            source.pictures, num_frames, options, wanted=wanted, kept=source.kept
+            source.pictures, num_frames, options.reading, wanted=wanted, kept=source.kept
         )
         tracks = refine_spread_tracks(
             tracked.tracks,
@@ -365,7 +367,7 @@ def refine_in_images(
 def decodable_frames(
     video: Video,
     num_frames: int,
-    options: MatchOptions,
+    options: ReadOptions,
     display: Display | None = None,
     *,
     wanted: Collection[int] | None = None,
@@ -378,8 +380,8 @@ def decodable_frames(
     """
     decoded = decode_frames(
         video,
-        operating_point=options.read.operating_point,
-        num_threads=options.run.num_threads,
+        operating_point=options.operating_point,
+        num_threads=options.num_threads,
         display=display,
         wanted=wanted,
         kept=kept,
@@ -393,7 +395,7 @@ def decodable_frames(
             if index + 1 >= num_frames:  # what is damaged beyond does no harm
                 return
     except BitstreamError as error:
-        if options.read.strict:
+        if options.strict:
             raise
         warnings.warn(f"{error}; {use} in {count} frames only", stacklevel=2)
     finally:

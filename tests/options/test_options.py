@@ -42,7 +42,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.options.fields import Options, declared_of, field_types, option
 from colmap_av1.options.images import IMAGE_EXTENSIONS
-from colmap_av1.tracks.presets import PRESETS
+from colmap_av1.tracks.selection import PRESETS
 from colmap_av1.video.encoders import ENCODERS
 
 KINDS = [

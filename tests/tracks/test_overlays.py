@@ -23,7 +23,9 @@ def make_tracks(paths: list[tuple[int, np.ndarray]], num_frames: int) -> Tracks:
     lengths = [len(xy) for _, xy in paths]
     total = sum(lengths)
     return Tracks(
-        *(num_frames, 640, 480),
+        num_frames=num_frames,
+        width=640,
+        height=480,
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         frame=np.concatenate([f + np.arange(len(xy)) for f, xy in paths]).astype(np.int32),
         xy=np.concatenate([xy for _, xy in paths]).astype(np.float32),
@@ -70,18 +72,7 @@ def test_the_way_between_kept_frames_counts() -> None:
 
 
 def test_no_tracks() -> None:
-    tracks = make_tracks([(0, moving(1, 2))], 2)
-    none = remove_overlays(
-        Tracks(
-            5,
-            640,
-            480,
-            np.zeros(1, np.int64),
-            *(a[:0] for a in (tracks.frame, tracks.xy)),
-            tracks.sigma[:0],
-            tracks.confirmed[:0],
-        )
-    )
+    none = remove_overlays(Tracks.empty(5, (640, 480)))
     assert none.offsets.tolist() == [0]
 
 

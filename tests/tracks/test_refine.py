@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import RefineOptions
-from colmap_av1.tracks.refine import refine_tracks
-from colmap_av1.tracks.refine_spread import refine_spread_tracks
+from colmap_av1.tracks.refine import refine_spread_tracks, refine_tracks
 from colmap_av1.tracks.texture import texture_at, texture_of
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.video.decoding import decode_frames

@@ -168,7 +168,11 @@ def test_stages_do_not_count_twice(clip: Path) -> None:
     told: list[tuple[str, int, int | None]] = []
     with clock.measure("all"):
         track_video(
-            *(opened(clip), lk), one_size=True, clock=clock, progress=lambda *w: told.append(w)
+            opened(clip),
+            lk,
+            one_size=True,
+            clock=clock,
+            progress=lambda *w: told.append(w),
         )
     whole = clock.seconds.pop("all")
     assert set(clock.seconds) == {"motion", "tracks", "decoding", "refinement"}
@@ -189,18 +193,18 @@ def hurt(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
 
 def test_pictures_end_before_the_damage(hurt: Path) -> None:
     with pytest.warns(UserWarning, match=r"cut\.ivf: .*; tracks are refined in (\d+) frames only"):
-        count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS)))
+        count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS.reading)))
     assert 4 < count < 16
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the frames that are asked for are whole
-        whole = list(decodable_frames(read_video(hurt), count, OPTIONS))
+        whole = list(decodable_frames(read_video(hurt), count, OPTIONS.reading))
     assert [index for index, _ in whole] == list(range(count))
     with pytest.raises(BitstreamError, match=r"cut\.ivf: cannot be decoded further"):
-        list(decodable_frames(read_video(hurt), 16, STRICT))
+        list(decodable_frames(read_video(hurt), 16, STRICT.reading))
 
 
 def test_pictures_are_those_of_the_frames_with_tracks(clip: Path) -> None:
-    asked = list(decodable_frames(read_video(clip), 3, OPTIONS))
+    asked = list(decodable_frames(read_video(clip), 3, OPTIONS.reading))
     assert [index for index, _ in asked] == [0, 1, 2]
     for (_, picture), (_, whole) in zip(asked, decode_frames(clip), strict=False):
         np.testing.assert_array_equal(picture, whole)

@@ -73,7 +73,9 @@ def _followed(
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
         decoded = decodable_frames(
-            *(run.sources[video].pictures, num_frames, run.options.match),
+            run.sources[video].pictures,
+            num_frames,
+            run.options.match.reading,
             wanted=mask_of,
             use="corners are followed",
             kept=run.sources[video].kept,

@@ -97,7 +97,7 @@ def _on_pictures(
     num_frames = max(wanted) + 1
     own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
     decoded = decodable_frames(
-        source.pictures, num_frames, run.options.match, wanted=wanted, kept=source.kept
+        source.pictures, num_frames, run.options.match.reading, wanted=wanted, kept=source.kept
     )
     report = progress_in(run.progress, "refinement", len(wanted))
     found = refine_tracks(own, decoded, _LK, report, expected=expected)
