@@ -17,8 +17,9 @@ from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
+from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
-from colmap_av1.poses.reconstruct_posed import mended_poses
+from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
     read_tracks,
@@ -26,6 +27,7 @@ from colmap_av1.poses.reconstruct_tracks import (
     track_stage,
 )
 from colmap_av1.splats.gaussians import check_gaussians_path, write_model_gaussians
+from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.arguments import checks_arguments
@@ -112,7 +114,7 @@ class ReconstructReport:
     focal_length: float
     mapper: str
     forward_motion: bool
-    links: dict[str, Any]
+    links: LinkReport
     gaussians: Path | None
     resumed: tuple[str, ...]
     seconds: dict[str, float]
@@ -239,80 +241,104 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
     positions = image_positions(takes, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
-    kept = {stage_of_video(run, video): tracked[video] for video in numbers}
     posed = mended_poses(run, videos, takes, tracked)
     del videos  # as large as the tracks that the poses agree with
-    assert posed.far_views is not None
-    kept |= {**posed.stages, "far_views": posed.far_views}
-    kept |= written_model(run, posed, takes)
+    placed, written = written_model(run, posed, takes)
     further, unplaced = further_models(run, posed, takes)
-    facts = {name: fact for stage in kept.values() for name, fact in stage.facts.items()}
-    facts = {"moving": None} | facts
-    facts |= {"num_images": len(takes.take), "masked": takes.masked}
-    facts["read_outs"] = tuple(stage.facts["read_out"] for stage in tracked)
-    facts |= {name: sum(t.facts[name] for t in tracked) for name in ("num_frames", "num_tracks")}
-    notes = [
-        *run.inputs.warnings,
-        *positions.warnings,
-        *run.inputs.with_names([stage.facts["warnings"] for stage in tracked]),
-        *facts["link_warnings"],
-        *facts["place_warnings"],
-        *_notes(facts, further, unplaced),
-    ]
-    reported: dict[str, Any] = {
-        f.name: facts[f.name] for f in dataclasses.fields(ReconstructReport) if f.name in facts
-    }
-    reported |= {"other_models": further, "warnings": tuple(notes)}
+    assert posed.far_views is not None
+    matches, poses, model = posed.matches.result, posed.last.result, written.result
+    long_range = posed.far_views.result
     return ReconstructReport(
         output=run.output,
         videos=tuple(source.pictures.path for source in run.sources),
         conversion=run.inputs.conversion([source.conversion for source in run.sources]),
         database=run.output / "database.db",
+        num_frames=sum(stage.result.num_frames for stage in tracked),
+        num_images=len(takes.take),
+        masked=takes.masked,
+        moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
+        num_key_images=len(matches.key_images),
+        num_registered=poses.num_registered,
+        registered=poses.registered,
+        other_models=further,
+        num_tracks=sum(stage.result.num_tracks for stage in tracked),
+        num_pose_tracks=matches.num_pose_tracks,
+        num_points=model.num_points,
+        num_observations=model.num_observations,
+        coverage=model.coverage,
+        mean_error=model.mean_error,
+        far_views=long_range.far_views,
+        far_views_largest=long_range.far_views_largest,
+        read_outs=tuple(stage.result.read_out for stage in tracked),
+        place=placed.result.place,
+        focal_length=model.focal_length,
+        mapper=posed.mapped.result.mapper,
+        forward_motion=matches.forward_motion,
+        links=matches.links,
         gaussians=None,
-        resumed=tuple(name for name, stage in kept.items() if stage.resumed),
+        resumed=(
+            *(stage_of_video(run, video) for video in numbers if tracked[video].resumed),
+            *posed.resumed,
+            *(["place"] if placed.resumed else []),
+            *(["model"] if written.resumed else []),
+        ),
         seconds=run.clock.seconds,
         cpu_seconds=run.clock.cpu_seconds,
-        **reported,
+        warnings=(
+            *run.inputs.warnings,
+            *positions.warnings,
+            *run.inputs.with_names([stage.result.warnings for stage in tracked]),
+            *matches.link_warnings,
+            *placed.result.place_warnings,
+            *_warnings(posed, model, len(takes.take), further, unplaced),
+        ),
     )
 
 
-def _notes(
-    facts: dict[str, Any], further: Sequence[FurtherModel], unplaced: Sequence[str]
+def _warnings(
+    posed: Posed,
+    model: ModelResult,
+    num_images: int,
+    further: Sequence[FurtherModel],
+    unplaced: Sequence[str],
 ) -> list[str]:
-    notes = []
+    """What the user should know of the poses and the model."""
+    matches, poses = posed.matches.result, posed.last.result
+    warnings = []
     if further:
-        notes.append(
-            f"nothing holds all images together: 'sparse/0' holds {facts['num_registered']} of "
-            f"{facts['num_images']}, {', '.join(map(str, further))}; each folder has its own "
+        warnings.append(
+            f"nothing holds all images together: 'sparse/0' holds {poses.num_registered} of "
+            f"{num_images}, {', '.join(map(str, further))}; each folder has its own "
             "'images' and 'sparse/0'"
         )
     if unplaced:
         names = ", ".join(f"'{name}'" for name in unplaced[:_NUM_NAMED])
         more = ", ..." if len(unplaced) > _NUM_NAMED else ""
-        notes.append(
-            f"{len(unplaced)} of {facts['num_images']} images have no pose and are left out: "
-            f"{names}{more}"
+        warnings.append(
+            f"{len(unplaced)} of {num_images} images have no pose and are left out: {names}{more}"
         )
-    left_out = [name for name, count in facts["registered"].items() if count == 0]
+    left_out = [name for name, count in poses.registered.items() if count == 0]
     if left_out and not further:
         names = ", ".join(f"'{name}'" for name in left_out)
-        notes.append(
+        warnings.append(
             f"the model holds no image of {names}: reconstruct what shows another scene apart"
         )
-    if facts["num_flat_pairs"] > _MANY_FLAT * facts["num_verified_pairs"]:
-        notes.append(
-            f"in {facts['num_flat_pairs']} of {facts['num_verified_pairs']} pairs the camera only "
+    if matches.num_flat_pairs > _MANY_FLAT * matches.num_verified_pairs:
+        warnings.append(
+            f"in {matches.num_flat_pairs} of {matches.num_verified_pairs} pairs the camera only "
             "rotates or the scene is flat: the depth of the points may be unreliable; film while "
             "moving sideways"
         )
-    told = (facts["far_views_warning"], facts.get("joints_warning"))
-    notes += [warning for warning in told if warning is not None]
-    if facts["agreeing"] < LEAST_AGREEING:
-        notes.append(
-            f"only {facts['agreeing']:.0%} of the tracks agree with the poses, which may be wrong: "
+    if posed.far_views is not None and posed.far_views.result.far_views_warning is not None:
+        warnings.append(posed.far_views.result.far_views_warning)
+    if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
+        warnings.append(posed.adjustment.result.seams_warning)
+    if model.agreeing < LEAST_AGREEING:
+        warnings.append(
+            f"only {model.agreeing:.0%} of the tracks agree with the poses, which may be wrong: "
             "try the other --mapper, or give --camera_params"
         )
-    return notes
+    return warnings
 
 
 def _write_report(report: ReconstructReport) -> None:

@@ -580,8 +580,8 @@ def test_pictures_that_contradict_the_poses(
     monkeypatch.setattr("colmap_av1.poses.long_range._FAR_APART", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
     found = reconstruct(SCENE, tmp_path / "out", options=options)
-    assert found.links["looked_again"] == (links == "auto")
-    assert (found.links["num_images"] > 0) == (links == "auto")
+    assert found.links.looked_again == (links == "auto")
+    assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
     told = next(note for note in found.warnings if "surfaces may be doubled there" in note)
     assert ("--links sift" in told) == (links == "none")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
-from colmap_av1.matching.links import gap_in_video
+from colmap_av1.matching.links import LinkReport, gap_in_video
 from colmap_av1.matching.shutter.of_video import VideoReadOut
 from colmap_av1.motion.info import StreamReport
 from colmap_av1.poses.long_range import FarViews
@@ -56,7 +55,7 @@ def match_rows(report: MatchReport) -> Rows:
         ("matches", str(report.num_matches)),
         ("inliers", f"{report.num_inliers}, {inlier_share:.1%} of the matches"),
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
-        *_link_rows(**dataclasses.asdict(report.links)),
+        *_link_rows(report.links),
     ]
     if report.focal_length is not None:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
@@ -111,7 +110,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("focal length", f"{report.focal_length:.2f} px"),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
-        *_link_rows(**report.links),
+        *_link_rows(report.links),
         *_gaussians_rows(report.gaussians),
     ]
     if report.resumed:
@@ -168,24 +167,18 @@ def _moving_row(moving: float | None) -> Rows:
     return [] if moving is None else [("moving by itself", f"{moving:.1%} of the images")]
 
 
-def _link_rows(
-    *,
-    num_images: int,
-    num_links: int,
-    num_revisits: int,
-    num_between: int,
-    weak_gaps: Sequence[Sequence[int]],
-    videos: Sequence[tuple[str, int]],
-    **_: object,
-) -> Rows:
-    """What connects images where motion does not; none where pictures were not needed."""
-    if num_images == 0:
+def _link_rows(links: LinkReport) -> Rows:
+    """What connects images where motion does not; no row where no pictures were matched."""
+    if links.num_images == 0:
         return []
-    shown = ", ".join(_named(gap, videos) for gap in weak_gaps[:_NUM_LISTED_GAPS])
-    more = ", ..." if len(weak_gaps) > _NUM_LISTED_GAPS else ""
-    gaps = f", weak gaps at frames {shown}{more}" if weak_gaps else ""
-    pairs = f"{num_links} pairs linked by {num_images} pictures, {num_revisits} seen again"
-    between = f", {num_between} of different videos or photos" if num_between else ""
+    shown = ", ".join(_named(gap, links.videos) for gap in links.weak_gaps[:_NUM_LISTED_GAPS])
+    more = ", ..." if len(links.weak_gaps) > _NUM_LISTED_GAPS else ""
+    gaps = f", weak gaps at frames {shown}{more}" if links.weak_gaps else ""
+    pairs = (
+        f"{links.num_links} pairs linked by {links.num_images} pictures, "
+        f"{links.num_revisits} seen again"
+    )
+    between = f", {links.num_between} of different videos or photos" if links.num_between else ""
     return [("links", f"{pairs}{between}{gaps}")]
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from colmap_av1.poses.long_range import FarViewCheck, FarViews
 from colmap_av1.poses.reconstruct_poses import (
     FOR_POSES,
     PosedImages,
+    PosesResult,
     read_posed_images,
     triangulate_in,
 )
@@ -27,9 +28,33 @@ from colmap_av1.util.stages import Kept, run_stage
 _NUM_TRACKS = 10_000
 
 
+@dataclass(frozen=True)
+class LongRangeResult:
+    """What `far_view_stage` found.
+
+    Attributes:
+        far_views: median distance in pixels of what the pictures of images ten and more apart show
+            in common from where the poses put it; None where no such images see the same.
+        far_views_largest: the 90 % quantile of it over such pairs of images.
+        far_views_warning: what the user should know of it.
+        apart: the pictures contradict the poses.
+    """
+
+    far_views: float | None
+    far_views_largest: float | None
+    far_views_warning: str | None
+    apart: bool
+
+
 def far_view_stage(
-    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], posed: Kept, *, linked: bool
-) -> Kept:
+    run: Run,
+    tracks: Tracks,
+    takes: Takes,
+    moving: Mapping[str, Mask],
+    posed: Kept[PosesResult],
+    *,
+    linked: bool,
+) -> Kept[LongRangeResult]:
     """Compare a few pictures that lie far apart in time, and by the poses show the same.
 
     Args:
@@ -41,18 +66,24 @@ def far_view_stage(
         linked: pictures of places seen again have been matched.
     """
 
-    def make(_: Path) -> dict[str, Any]:
+    def make(_: Path) -> LongRangeResult:
         placed = read_posed_images(run, posed, takes)
         far = _compared(run, tracks, takes, moving, placed)
-        return {
-            "far_views": far.median,
-            "far_views_largest": far.largest,
-            "far_views_warning": far.warning(linked=linked),
-            "apart": far.are_apart,
-        }
+        return LongRangeResult(
+            far_views=far.median,
+            far_views_largest=far.largest,
+            far_views_warning=far.warning(linked=linked),
+            apart=far.are_apart,
+        )
 
     return run_stage(
-        run.stages, "far_views", [posed.digest, linked], into=run.stages, products=[], make=make
+        run.stages,
+        "far_views",
+        [posed.digest, linked],
+        LongRangeResult,
+        into=run.stages,
+        products=[],
+        make=make,
     )
 
 

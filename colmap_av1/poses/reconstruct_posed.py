@@ -6,17 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.takes import Takes
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
-from colmap_av1.poses.dynamic.stage import moving_stage, read_moving, without_moving
-from colmap_av1.poses.long_range_stage import far_view_stage
-from colmap_av1.poses.reconstruct_poses import adjustment_stage, pose_stage, resection_stage
-from colmap_av1.poses.reconstruct_stages import match_stage, read_links
-from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks
+from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
+from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.reconstruct_poses import (
+    AdjustedResult,
+    MappedResult,
+    PosesResult,
+    adjustment_stage,
+    pose_stage,
+    resection_stage,
+)
+from colmap_av1.poses.reconstruct_stages import MatchesResult, match_stage, read_links
+from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -26,7 +32,11 @@ class Posed:
     """The stages that end in poses, and the tracks that agree with these.
 
     Attributes:
-        stages: what each of them kept, by its name, in order.
+        matches: the database of the key images, see `match_stage`; that of the first model.
+        mapped: the poses of the key images, see `pose_stage`.
+        resection: the poses of the images between these; None: all images are key images.
+        dynamic: what moves; None: it was not looked for.
+        adjustment: the adjusted poses; None: they are not adjusted.
         tracks: the tracks of all videos, cut where motion is not believed.
         links: links as tracks.
         moving: by the names of images, masks that leave out what moves by itself.
@@ -35,21 +45,55 @@ class Posed:
         far_views: the stage that held views from far apart against the poses; None: none did.
     """
 
-    stages: dict[str, Kept]
+    matches: Kept[MatchesResult]
+    mapped: Kept[MappedResult]
+    resection: Kept[PosesResult] | None
+    dynamic: Kept[DynamicResult] | None
+    adjustment: Kept[AdjustedResult] | None
     tracks: Tracks
     links: Tracks
     moving: dict[str, Mask]
     in_place: bool
-    far_views: Kept | None = None
+    far_views: Kept[LongRangeResult] | None = None
 
     @property
-    def last(self) -> Kept:
+    def last(self) -> Kept[PosesResult]:
         """The stage that holds the poses."""
-        return next(reversed(self.stages.values()))
+        return self.adjustment or self.resection or self.mapped
+
+    @property
+    def resumed(self) -> list[str]:
+        """Names of the stages that an earlier run had finished, in order."""
+        stages: dict[str, Kept[object] | None] = {
+            "matches": self.matches,
+            "poses": self.mapped,
+            "resection": self.resection,
+            "moving": self.dynamic,
+            "adjustment": self.adjustment,
+            "far_views": self.far_views,
+        }
+        return [name for name, stage in stages.items() if stage is not None and stage.resumed]
+
+
+@dataclass(frozen=True)
+class _ToMend:
+    """What shows that poses do not hold together.
+
+    Attributes:
+        doubted: frames after seams that few points join, and that no pictures were matched across.
+        apart: pictures far apart in time contradict the poses, and places seen again were not
+            looked for.
+    """
+
+    doubted: tuple[int, ...]
+    apart: bool
 
 
 def mended_poses(
-    run: Run, videos: Sequence[VideoTracks], takes: Takes, tracked: Sequence[Kept]
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept[TracksResult]],
 ) -> Posed:
     """Estimate poses; where they do not hold together, again with links.
 
@@ -58,13 +102,13 @@ def mended_poses(
     """
     first: list[Posed] = []
 
-    def make(_: Path) -> dict[str, Any]:
+    def make(_: Path) -> _ToMend:
         posed = _pose_stages(run, videos, takes, tracked, doubted=())
         first.append(posed)
-        return {
-            "doubted": _unlinked_joints(run, takes, posed.stages),
-            "apart": _are_unlinked_and_apart(run, posed),
-        }
+        return _ToMend(
+            doubted=tuple(_unlinked_seams(run, takes, posed)),
+            apart=_are_unlinked_and_apart(run, posed),
+        )
 
     options = run.options
     found = run_stage(
@@ -77,26 +121,22 @@ def mended_poses(
             options.match,
             options.mapping,
         ],
+        _ToMend,
         into=run.stages,
         products=[],
         make=make,
-    ).facts
-    if first and not found["doubted"] and not found["apart"]:
+    ).result
+    if first and not found.doubted and not found.apart:
         return first[0]
-    again = _with_all_links(run) if found["apart"] else run
-    return _pose_stages(again, videos, takes, tracked, doubted=found["doubted"])
+    again = _with_all_links(run) if found.apart else run
+    return _pose_stages(again, videos, takes, tracked, doubted=found.doubted)
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
     """Whether views far apart contradict the poses, and links of such have not been looked for."""
     assert posed.far_views is not None
-    looked = run.options.match.links.links != "auto" or _looked_again(posed.stages)
-    return bool(posed.far_views.facts["apart"]) and not looked
-
-
-def _looked_again(stages: dict[str, Kept]) -> bool:
-    """Whether places seen again have been looked for."""
-    return bool(stages["matches"].facts["links"]["looked_again"])
+    looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
+    return posed.far_views.result.apart and not looked
 
 
 def _with_all_links(run: Run) -> Run:
@@ -106,19 +146,19 @@ def _with_all_links(run: Run) -> Run:
     return replace(run, options=replace(run.options, match=match))
 
 
-def _unlinked_joints(run: Run, takes: Takes, stages: dict[str, Kept]) -> list[int]:
-    """Frames after joints that hold little, and that no pictures have been matched across."""
-    if "adjustment" not in stages or run.options.match.links.links == "none":
+def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
+    """Frames after seams that few points join, and that no pictures have been matched across."""
+    if posed.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
-    looked_at = stages["matches"].facts["links"]["weak_gaps"]
-    joints = [
+    looked_at = posed.matches.result.links.weak_gaps
+    seams = [
         (frame_of[first], frame_of[second])
-        for first, second in stages["adjustment"].facts["doubtful_joints"]
+        for first, second in posed.adjustment.result.doubtful_seams
     ]
     return [
         after
-        for before, after in joints
+        for before, after in seams
         if not any(first <= before and after <= second for first, second in looked_at)
     ]
 
@@ -127,19 +167,21 @@ def _pose_stages(
     run: Run,
     videos: Sequence[VideoTracks],
     takes: Takes,
-    tracked: Sequence[Kept],
+    tracked: Sequence[Kept[TracksResult]],
     *,
     doubted: Sequence[int],
 ) -> Posed:
     """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
     matched = match_stage(run, videos, takes, tracked, doubted)
-    keyed = takes.some(matched.facts["key_images"])
-    stages = {"matches": matched, "poses": pose_stage(run, matched, takes, keyed)}
+    keyed = takes.some(matched.result.key_images)
+    mapped = pose_stage(run, matched, takes, keyed)
     # Where no read-out is found nothing has been moved, whether one was looked for or not.
-    in_place = not any(stage.facts["read_out"] for stage in tracked)
+    in_place = not any(stage.result.read_out for stage in tracked)
     believed = believed_tracks(run, videos, takes)
-    posed = refined_poses(run, stages, believed, takes, keyed, in_place=in_place)
-    linked = _looked_again(stages)
+    posed = refined_poses(
+        run, matched, mapped, believed=believed, takes=takes, keyed=keyed, in_place=in_place
+    )
+    linked = matched.result.links.looked_again
     far_views = far_view_stage(run, posed.tracks, takes, posed.moving, posed.last, linked=linked)
     return replace(posed, far_views=far_views)
 
@@ -153,37 +195,55 @@ def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tu
 
 def refined_poses(
     run: Run,
-    stages: dict[str, Kept],
+    matched: Kept[MatchesResult],
+    mapped: Kept[MappedResult],
+    *,
     believed: tuple[Tracks, Tracks],
     takes: Takes,
     keyed: Takes,
-    *,
     in_place: bool,
 ) -> Posed:
     """Place what lies between the key images that a mapper placed, and adjust.
 
     Args:
         run: what every stage is given.
-        stages: those up to the mapper, which the further ones join.
+        matched: the database that was mapped.
+        mapped: the poses that the mapper found.
         believed: the tracks and links, see `believed_tracks`.
         takes: the images.
         keyed: those of them that were mapped.
         in_place: see `Posed`.
     """
-    (tracks, links), posed = believed, stages["poses"]
+    tracks, links = believed
+    resection = dynamic = adjustment = None
+    posed: Kept[PosesResult] = mapped
     if len(keyed.take) < len(takes.take):
-        stages["resection"] = posed = resection_stage(run, tracks, takes, keyed, posed)
+        posed = resection = resection_stage(run, tracks, takes, keyed, mapped)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        stages["moving"] = moving_stage(run, tracks, takes, posed)
+        dynamic = moving_stage(run, tracks, takes, posed)
         moving = read_moving(run.stages)
     tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
     if run.options.mapping.adjust:
         follows = in_place and (bool(moving) or has_moving_masks(takes))
-        stages["adjustment"] = adjustment_stage(
-            *(run, tracks, links, takes, posed),
-            moved=stages["moving"] if moving else None,
+        adjustment = adjustment_stage(
+            run,
+            tracks,
+            links,
+            takes,
+            posed,
+            moved=dynamic.digest if dynamic is not None and moving else None,
             follow=partial(follow_behind, run, moving) if follows else None,
             corners=partial(corners_in_images, run, moving) if in_place else None,
         )
-    return Posed(stages, tracks, links, moving, in_place)
+    return Posed(
+        matches=matched,
+        mapped=mapped,
+        resection=resection,
+        dynamic=dynamic,
+        adjustment=adjustment,
+        tracks=tracks,
+        links=links,
+        moving=moving,
+        in_place=in_place,
+    )

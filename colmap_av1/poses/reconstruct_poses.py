@@ -34,6 +34,7 @@ from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.images.takes import Takes
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
+from colmap_av1.poses.reconstruct_stages import MatchesResult
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.poses.seams import model_joints
 from colmap_av1.tracks.selection import select_tracks
@@ -74,16 +75,60 @@ _BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
 FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
-def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
+@dataclass(frozen=True)
+class PosesResult:
+    """What a stage found that ends in poses.
+
+    Attributes:
+        poses: file of the posed model, in the folder of the stages.
+        num_registered: images with a pose.
+        registered: those of each of several videos, by its name.
+    """
+
+    poses: str
+    num_registered: int
+    registered: dict[str, int]
+
+
+@dataclass(frozen=True)
+class MappedResult(PosesResult):
+    """What `pose_stage` found.
+
+    Attributes:
+        mapper: which of COLMAP's mappers found the poses.
+        other_models: files of further models, whose images nothing connects with the first.
+    """
+
+    mapper: str
+    other_models: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class AdjustedResult(PosesResult):
+    """What `adjustment_stage` found.
+
+    Attributes:
+        doubtful_seams: names of neighbouring images that few points join.
+        seams_warning: what the user should know of them.
+    """
+
+    doubtful_seams: tuple[tuple[str, str], ...]
+    seams_warning: str | None
+
+
+def pose_stage(
+    run: Run, matched: Kept[MatchesResult], takes: Takes, keyed: Takes
+) -> Kept[MappedResult]:
     """Estimate the poses of the key images, some of all, by COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
     mapping = options.mapping
-    forward = bool(matched.facts["forward_motion"])
+    found_before = matched.result
+    forward = found_before.forward_motion
     mapper = mapping.mapper
     if mapper == "auto":
-        mapper = "incremental" if matched.facts["guessed"] else "global"
-    links = matched.facts["links"]
-    hangs = links["num_between"] or links["broken_gaps"] or links["doubtful_gaps"]
+        mapper = "incremental" if found_before.guessed else "global"
+    links = found_before.links
+    hangs = links.num_between or links.broken_gaps or links.doubtful_gaps
     start_tracks = None if hangs else _START_TRACKS
     tolerance = _TOLERANCE if mapping.adjust and not hangs else None
     how = MapOptions(
@@ -94,7 +139,7 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
         num_threads=mapping.mapper_threads,
     )
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
             # pycolmap brings a database to its own layout.
             copy = partial / "mapped.db"
@@ -117,24 +162,25 @@ def pose_stage(run: Run, matched: Kept, takes: Takes, keyed: Takes) -> Kept:
                     if size >= LEAST_IMAGES
                 ]
         if not found:
-            raise ModelError(_why_no_start(matched.facts, mapper))
+            raise ModelError(_why_no_start(found_before, mapper))
         found = _largest_first(found, takes, keyed)
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
             write_posed_model(partial / file, model)
-        return {
-            "num_registered": len(found[0].images),
-            "other_models": files[1:],
-            "mapper": mapper,
-            "poses": files[0],
-            "registered": _registered(found[0], keyed),
-        }
+        return MappedResult(
+            poses=files[0],
+            num_registered=len(found[0].images),
+            registered=_registered(found[0], keyed),
+            mapper=mapper,
+            other_models=tuple(files[1:]),
+        )
 
     return run_stage(
         run.stages,
         "poses",
         [matched.digest, how, start_tracks, tolerance, pycolmap.__version__],
+        MappedResult,
         into=run.stages,
         products=["poses"],
         make=make,
@@ -176,24 +222,24 @@ def _refines_intrinsics(options: ReconstructOptions) -> bool:
     return options.match.camera.camera_params is None
 
 
-def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
+def _why_no_start(found: MatchesResult, mapper: str) -> str:
     """Why a mapper found no initial pair, and what to try."""
     no_start = f"COLMAP's {mapper} mapper finds no initial pair"
     other = "incremental" if mapper == "global" else "global"
-    most_agree = facts["num_verified_pairs"] >= facts["num_pairs"] / 2
-    if most_agree and facts["num_flat_pairs"] > facts["num_verified_pairs"] / 2:
+    most_agree = found.num_verified_pairs >= found.num_pairs / 2
+    if most_agree and found.num_flat_pairs > found.num_verified_pairs / 2:
         return (
-            f"{no_start}: too little parallax, in {facts['num_flat_pairs']} of "
-            f"{facts['num_verified_pairs']} pairs the camera only rotates or the scene is flat: "
+            f"{no_start}: too little parallax, in {found.num_flat_pairs} of "
+            f"{found.num_verified_pairs} pairs the camera only rotates or the scene is flat: "
             "film while moving sideways, or give a longer part of the video"
         )
-    if not most_agree or facts["keypoints_per_image"] < _FEW_TRACKS:
+    if not most_agree or found.keypoints_per_image < _FEW_TRACKS:
         return (
-            f"{no_start}: too few tracks, {facts['keypoints_per_image']:.0f} an image and "
-            f"{facts['num_verified_pairs']} of {facts['num_pairs']} pairs that agree with a rigid "
+            f"{no_start}: too few tracks, {found.keypoints_per_image:.0f} an image and "
+            f"{found.num_verified_pairs} of {found.num_pairs} pairs that agree with a rigid "
             "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
         )
-    if facts["guessed"]:
+    if found.guessed:
         return (
             f"{no_start}: the focal length is a guess and may be far off, or the parallax too "
             "little, as where the camera moves along its axis: "
@@ -205,25 +251,24 @@ def _why_no_start(facts: dict[str, Any], mapper: str) -> str:
     )
 
 
-def resection_stage(run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed: Kept) -> Kept:
+def resection_stage(
+    run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed: Kept[PosesResult]
+) -> Kept[PosesResult]:
     """Place the images between the key images by the points of tracks that they see."""
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> PosesResult:
         known = read_posed_images(run, posed, keyed)
         with run.clock.measure("resection"):
             placed = _resect(run, tracks, takes, known)
         model = PosedModel(known.cameras, placed)
         write_posed_model(partial / "placed.npz", model)
-        return {
-            "poses": "placed.npz",
-            "num_registered": len(placed),
-            "registered": _registered(model, takes),
-        }
+        return PosesResult("placed.npz", len(placed), _registered(model, takes))
 
     return run_stage(
         run.stages,
         "resection",
         [posed.digest, _RESECTED, run.options.match.run.seed],
+        PosesResult,
         into=run.stages,
         products=["placed.npz"],
         make=make,
@@ -281,12 +326,12 @@ def adjustment_stage(
     tracks: Tracks,
     links: Tracks,
     takes: Takes,
-    posed: Kept,
+    posed: Kept[PosesResult],
     *,
-    moved: Kept | None = None,
+    moved: str | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
-) -> Kept:
+) -> Kept[AdjustedResult]:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
     Links take part whole: without them places seen again would drift apart once more. Corners of
@@ -300,7 +345,7 @@ def adjustment_stage(
         links: links as tracks.
         takes: the images.
         posed: the stage that left the poses.
-        moved: the stage that found what moves, where tracks and links are without it.
+        moved: digest of the stage that found what moves, where tracks and links are without it.
         follow: corrects the chosen tracks in the images that have a pose.
         corners: looks for corners of these images' pictures, which take part whole, and corrects
             poses that these contradict.
@@ -308,7 +353,7 @@ def adjustment_stage(
     options = run.options
     refine = _refines_intrinsics(options)
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> AdjustedResult:
         placed = read_posed_images(run, posed, takes)
         # The long tracks of all images are several times as large as those chosen: they go at once.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
@@ -340,13 +385,13 @@ def adjustment_stage(
         joints = model_joints(adjusted)
         result = posed_model(adjusted, with_points=True)
         write_posed_model(partial / "adjusted.npz", result)
-        return {
-            "poses": "adjusted.npz",
-            "num_registered": len(result.images),
-            "registered": _registered(result, takes),
-            "doubtful_joints": [joints.pairs[i] for i in joints.doubtful],
-            "joints_warning": joints.warning,
-        }
+        return AdjustedResult(
+            poses="adjusted.npz",
+            num_registered=len(result.images),
+            registered=_registered(result, takes),
+            doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
+            seams_warning=joints.warning,
+        )
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
@@ -354,7 +399,8 @@ def adjustment_stage(
     return run_stage(
         run.stages,
         "adjustment",
-        [posed.digest, given, moved.digest if moved is not None else None],
+        [posed.digest, given, moved],
+        AdjustedResult,
         into=run.stages,
         products=["adjusted.npz"],
         make=make,
@@ -415,9 +461,9 @@ class PosedImages:
         ]
 
 
-def read_posed_images(run: Run, posed: Kept, takes: Takes) -> PosedImages:
+def read_posed_images(run: Run, posed: Kept[PosesResult], takes: Takes) -> PosedImages:
     """The images with the poses that a stage left."""
-    poses = read_posed_model(run.stages / posed.facts["poses"])
+    poses = read_posed_model(run.stages / posed.result.poses)
     posed_by_name = poses.by_name
     names = takes.images.names
     index = [i for i, name in enumerate(names) if name in posed_by_name]

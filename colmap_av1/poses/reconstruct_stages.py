@@ -5,9 +5,8 @@ Each stage leaves what the next one, and a later run, resume from.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import (
-    MatchedImages,
     NewCameras,
     PairedImages,
     new_cameras,
@@ -26,12 +24,13 @@ from colmap_av1.matching.image_matches import (
     shape_of,
     verify_images,
 )
-from colmap_av1.matching.links import LinkedImages, link_images
+from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
+    TracksResult,
     VideoTracks,
     key_images_of_video,
     pose_tracks,
@@ -42,6 +41,35 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
+
+
+@dataclass(frozen=True)
+class MatchesResult:
+    """What `match_stage` found beside the database and the links it keeps.
+
+    Attributes:
+        links: what connects images where motion does not.
+        link_warnings: what the user should know of cameras and links.
+        key_images: index of the images that are mapped.
+        num_pose_tracks: tracks that the poses come from.
+        guessed: the focal length of some video is a guess.
+        forward_motion: the camera moves along its axis, see `MatchReport`.
+        num_pairs: image pairs.
+        num_flat_pairs: pairs that a homography explains.
+        num_verified_pairs: pairs with a two-view geometry.
+        keypoints_per_image: their mean number.
+    """
+
+    links: LinkReport
+    link_warnings: tuple[str, ...]
+    key_images: tuple[int, ...]
+    num_pose_tracks: int
+    guessed: bool
+    forward_motion: bool
+    num_pairs: int
+    num_flat_pairs: int
+    num_verified_pairs: int
+    keypoints_per_image: float
 
 
 def _write_links(folder: Path, linked: LinkedImages) -> None:
@@ -61,9 +89,9 @@ def match_stage(
     run: Run,
     videos: Sequence[VideoTracks],
     takes: Takes,
-    tracked: Sequence[Kept],
+    tracked: Sequence[Kept[TracksResult]],
     doubted: Sequence[int],
-) -> Kept:
+) -> Kept[MatchesResult]:
     """Write the database of the tracks that the poses come from, and of links.
 
     Args:
@@ -81,7 +109,7 @@ def match_stage(
     ]
     density = _pose_density(run)
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> MatchesResult:
         with clock.measure("pairs"):
             index = _key_images(run, videos, takes)
         keyed = takes.some(index)
@@ -98,15 +126,20 @@ def match_stage(
             )
         _write_links(partial / run.stages.name, linked)
         of_videos = cameras[: keyed.images_of(len(videos)).start]
-        return {
-            "links": dataclasses.asdict(linked.report),
-            "link_warnings": [*made.warnings, *linked.report.warnings],
-            "key_images": index,
-            "num_key_images": len(index),
-            "num_pose_tracks": len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
-            "guessed": not all(camera.has_prior_focal_length for camera in of_videos),
-            **_pair_facts(matched),
-        }
+        configs = [geometry.config for geometry in matched.geometries]
+        num_keypoints = sum(len(k.xy) for k in matched.keypoints)
+        return MatchesResult(
+            links=linked.report,
+            link_warnings=(*made.warnings, *linked.report.warnings),
+            key_images=tuple(index),
+            num_pose_tracks=len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
+            guessed=not all(camera.has_prior_focal_length for camera in of_videos),
+            forward_motion=matched.forward_motion,
+            num_pairs=len(configs),
+            num_flat_pairs=configs.count(TwoViewConfig.PLANAR_OR_PANORAMIC),
+            num_verified_pairs=len(configs) - configs.count(TwoViewConfig.DEGENERATE),
+            keypoints_per_image=num_keypoints / len(matched.keypoints),
+        )
 
     match = options.match
     given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
@@ -118,6 +151,7 @@ def match_stage(
             *(takes.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
             run.positions.digest if run.positions is not None else None,
         ],
+        MatchesResult,
         into=run.output,
         products=["database.db", f"{run.stages.name}/{_LINKS}"],
         make=make,
@@ -214,15 +248,3 @@ def _match_images(
         clock=clock,
         progress=progress,
     )
-
-
-def _pair_facts(matched: MatchedImages) -> dict[str, Any]:
-    """Facts of the pairs that explain why a mapper finds no initial pair."""
-    configs = [geometry.config for geometry in matched.geometries]
-    return {
-        "forward_motion": matched.forward_motion,
-        "num_pairs": len(configs),
-        "num_flat_pairs": configs.count(TwoViewConfig.PLANAR_OR_PANORAMIC),
-        "num_verified_pairs": len(configs) - configs.count(TwoViewConfig.DEGENERATE),
-        "keypoints_per_image": sum(len(k.xy) for k in matched.keypoints) / len(matched.keypoints),
-    }

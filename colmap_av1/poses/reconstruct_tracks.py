@@ -120,13 +120,31 @@ class VideoTracks:
         return replace(self, inter_share=share)
 
 
+@dataclass(frozen=True)
+class TracksResult:
+    """What `track_stage` found beside the tracks it keeps.
+
+    Attributes:
+        num_frames: shown frames of the video.
+        num_tracks: tracks of the video.
+        read_out: read-out time in milliseconds of the shutter that tracks were corrected for; None:
+            they were not.
+        warnings: what the user should know of the video.
+    """
+
+    num_frames: int
+    num_tracks: int
+    read_out: float | None
+    warnings: tuple[str, ...]
+
+
 def stage_of_video(run: Run, video: int) -> str:
     """Name of the stage that makes the tracks of a video."""
     label = run.inputs.labels[video]
     return f"tracks_{label}" if label else "tracks"
 
 
-def track_stage(run: Run, video: int) -> Kept:
+def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     """Chain the motion of a video into tracks and choose the frames that are images."""
     source, clock = run.sources[video], run.clock
     options = chaining_for_points(
@@ -134,7 +152,7 @@ def track_stage(run: Run, video: int) -> Kept:
     )
     name, shown = stage_of_video(run, video), source.pictures
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> TracksResult:
         tracked, chosen, is_long = _track_and_choose(run, video, options, partial)
         tracks, read_out = without_shutter(
             tracked.tracks, shown.display, shown.frame_rate, options, clock
@@ -144,12 +162,7 @@ def track_stage(run: Run, video: int) -> Kept:
         _check_chosen(run, chosen, tracks.num_frames)
         _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
         check_unchanged(*source.files)
-        return {
-            "num_frames": tracks.num_frames,
-            "num_tracks": tracks.num_tracks,
-            "read_out": read_out,
-            "warnings": list(tracked.warnings),
-        }
+        return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
 
     mapping = run.options.mapping
     choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
@@ -161,6 +174,7 @@ def track_stage(run: Run, video: int) -> Kept:
         run.stages,
         name,
         [[file_digest(file.path) for file in source.files], given, listed, masked],
+        TracksResult,
         into=run.stages,
         products=[f"{name}.npz"],
         make=make,

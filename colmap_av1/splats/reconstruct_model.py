@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from colmap_av1.images.takes import Takes
 from colmap_av1.poses.dynamic.short_tracks import surely_still
 from colmap_av1.poses.reconstruct_poses import (
     PosedImages,
+    PosesResult,
     check_agreement,
     read_posed_images,
     triangulate_in,
@@ -209,9 +210,34 @@ def _write_masks(
         write_image(file, np.where(kept, np.uint8(255), np.uint8(0)))
 
 
+@dataclass(frozen=True)
+class ModelResult:
+    """What `model_stage` found beside the model and the images it writes.
+
+    Attributes:
+        num_points: 3D points.
+        num_observations: observations of all points.
+        coverage: share of the images' cells of 16x16 pixels that visible points project into.
+        mean_error: mean reprojection error of the points in pixels.
+        focal_length: of the first camera, in pixels.
+        agreeing: share of the tracks that agree with the poses.
+    """
+
+    num_points: int
+    num_observations: int
+    coverage: float
+    mean_error: float
+    focal_length: float
+    agreeing: float
+
+
 def model_stage(
-    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], posed: Kept
-) -> Kept:
+    run: Run,
+    tracks: Tracks,
+    takes: Takes,
+    moving: Mapping[str, Mask],
+    posed: Kept[PosesResult],
+) -> Kept[ModelResult]:
     """Triangulate all tracks and write the images and the model that trainers open.
 
     Args:
@@ -224,7 +250,7 @@ def model_stage(
     options, clock = run.options, run.clock
     masked = run.inputs.masks is not None or options.moving == "mask"
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> ModelResult:
         placed = read_posed_images(run, posed, takes)
         cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
         images = placed.images
@@ -250,20 +276,21 @@ def model_stage(
             if masked:
                 shown = counting if options.moving == "mask" else given
                 _write_masks(partial / _MASKS, images, cameras, shown)
-        return {
-            "num_points": len(cloud.xyz),
-            "num_observations": len(cloud.image),
-            "coverage": covered,
-            "mean_error": mean_error(cloud),
-            "focal_length": float(views[0].camera.params[0]),
-            "agreeing": agreeing,
-        }
+        return ModelResult(
+            num_points=len(cloud.xyz),
+            num_observations=len(cloud.image),
+            coverage=covered,
+            mean_error=mean_error(cloud),
+            focal_length=float(views[0].camera.params[0]),
+            agreeing=agreeing,
+        )
 
     how = (options.triangulate, options.match.images.image_name, options.moving)
     kept = run_stage(
         run.stages,
         "model",
         [posed.digest, how],
+        ModelResult,
         into=run.output,
         products=["images", "sparse", *([_MASKS] if masked else [])],
         make=make,

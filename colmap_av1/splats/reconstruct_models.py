@@ -6,16 +6,15 @@ import shutil
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.takes import Takes
-from colmap_av1.poses.placing.stage import place_stage
+from colmap_av1.poses.placing.stage import PlaceResult, place_stage
 from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_poses
-from colmap_av1.poses.reconstruct_poses import read_posed_images
+from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
-from colmap_av1.splats.reconstruct_model import model_stage
+from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, run_stage
@@ -50,12 +49,14 @@ class FurtherModel:
         )
 
 
-def written_model(run: Run, posed: Posed, takes: Takes) -> dict[str, Kept]:
+def written_model(
+    run: Run, posed: Posed, takes: Takes
+) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
     """Place the model in the world, and write it with all points."""
     assert run.positions is not None
     placed = place_stage(run, takes, posed.last, run.positions)
     tracks = Tracks.concatenate(posed.tracks, posed.links)
-    return {"place": placed, "model": model_stage(run, tracks, takes, posed.moving, placed)}
+    return placed, model_stage(run, tracks, takes, posed.moving, placed)
 
 
 def further_models(
@@ -72,27 +73,43 @@ def further_models(
     """
     placed = read_posed_images(run, first.last, takes).images
     left = set(takes.images.names) - {image.name for image in placed}
-    mapped = first.stages["poses"]
-    keyed = takes.some(first.stages["matches"].facts["key_images"])
+    mapped = first.mapped
+    keyed = takes.some(first.matches.result.key_images)
     found: list[FurtherModel] = []
-    for poses in mapped.facts["other_models"]:
+    for poses in mapped.result.other_models:
         known = set(read_posed_model(run.stages / poses).by_name)
         if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
             continue
         own = _run_of_model(run, len(found) + 1)
-        stages = {"poses": _poses_of_model(run, own, mapped, poses)}
+        own_poses = _poses_of_model(run, own, mapped, poses)
         some, key = _named(takes, known | left), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
         believed = believed_tracks(run, videos, takes)
-        posed = refined_poses(own, stages, believed, some, key, in_place=first.in_place)
+        posed = refined_poses(
+            own,
+            first.matches,
+            own_poses,
+            believed=believed,
+            takes=some,
+            keyed=key,
+            in_place=first.in_place,
+        )
         new = _named(takes, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
         if len(images) < LEAST_IMAGES:
             continue
         left -= set(images)
-        facts = written_model(own, posed, new)["model"].facts
-        figures = (facts["num_points"], facts["mean_error"])
-        found.append(FurtherModel(own.output, len(images), images[0], images[-1], *figures))
+        model = written_model(own, posed, new)[1].result
+        found.append(
+            FurtherModel(
+                output=own.output,
+                num_registered=len(images),
+                first=images[0],
+                last=images[-1],
+                num_points=model.num_points,
+                mean_error=model.mean_error,
+            )
+        )
     _remove_further_models(run, len(found) + 1)
     return tuple(found), [name for name in takes.images.names if name in left]
 
@@ -115,7 +132,9 @@ def _run_of_model(run: Run, number: int) -> Run:
     return own
 
 
-def _poses_of_model(run: Run, own: Run, posed: Kept, poses: str) -> Kept:
+def _poses_of_model(
+    run: Run, own: Run, posed: Kept[MappedResult], poses: str
+) -> Kept[MappedResult]:
     """Hand the poses of a further model of the mapper to that model's own stages.
 
     Args:
@@ -125,14 +144,16 @@ def _poses_of_model(run: Run, own: Run, posed: Kept, poses: str) -> Kept:
         poses: folder of the model among what that stage made.
     """
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> MappedResult:
         shutil.copyfile(run.stages / poses, partial / "mapped.npz")
-        return {"poses": "mapped.npz"}
+        count = len(read_posed_model(partial / "mapped.npz").images)
+        return MappedResult("mapped.npz", count, {}, posed.result.mapper, ())
 
     return run_stage(
         own.stages,
         "poses",
         [posed.digest, poses],
+        MappedResult,
         into=own.stages,
         products=["mapped.npz"],
         make=make,

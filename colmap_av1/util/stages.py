@@ -1,7 +1,7 @@
 """Stages of a long run that are kept in a folder, so that a later run resumes after them.
 
-A stage's record is written when all it makes is there: a key of what the result depends on, facts,
-and the digests of the products. A later run takes over the stage where the key is the
+A stage's record is written when all it makes is there: a key of what the result depends on, the
+result, and the digests of the products. A later run takes over the stage where the key is the
 same and the products are as recorded. All else is made again, damaged records and products too.
 The key holds options and inputs by their content, and this package's code and version.
 """
@@ -16,7 +16,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+import cattrs
 
 from colmap_av1.errors import ModelError, OptionError, cannot_write
 from colmap_av1.util.digests import (
@@ -32,18 +34,21 @@ from colmap_av1.util.memory import give_back_free_memory
 _FOLDER = ".stages"
 WHOLE_PACKAGE = (".",)
 
+_Result = TypeVar("_Result")
+_Found_co = TypeVar("_Found_co", covariant=True)
+
 
 @dataclass(frozen=True)
-class Kept:
+class Kept(Generic[_Found_co]):
     """A finished stage.
 
     Attributes:
-        facts: what the stage found, as JSON holds it.
-        digest: identifies its result, products included: what stages after it depend on.
-        resumed: it was finished by an earlier run.
+        result: what the stage found.
+        digest: identifies the result and the products: what later stages depend on.
+        resumed: an earlier run finished the stage.
     """
 
-    facts: dict[str, Any]
+    result: _Found_co
     digest: str
     resumed: bool
 
@@ -93,11 +98,12 @@ def run_stage(
     stages: Path,
     name: str,
     depends_on: Sequence[Any],
+    kind: type[_Result],
     *,
     into: Path,
     products: Sequence[str],
-    make: Callable[[Path], dict[str, Any]],
-) -> Kept:
+    make: Callable[[Path], _Result],
+) -> Kept[_Result]:
     """Run a stage, unless an earlier run finished it with the same input.
 
     What it makes appears under its name when it is complete, never in part; what was there until
@@ -107,16 +113,18 @@ def run_stage(
         stages: the folder of the stages.
         name: name of the stage.
         depends_on: everything the result depends on but the code, see `digest_of`.
+        kind: the dataclass of the result; its fields are of types that JSON can hold, or such
+            dataclasses.
         into: folder that gets the products.
         products: files and folders that the stage makes.
-        make: makes the products in the given folder and returns facts that JSON can hold.
+        make: makes the products in the given folder and returns the result.
 
     Raises:
         ModelError: something cannot be written.
     """
     key = _stage_key(depends_on)
     record = stages / f"{name}.json"
-    finished = _finished(record, key, into)
+    finished = _finished(record, key, into, kind)
     if finished is not None:
         return finished
     partial = stages / f"{name}.partial"
@@ -124,12 +132,13 @@ def run_stage(
         _remove(partial)
         partial.mkdir()
         give_back_free_memory()  # what earlier stages had
-        facts = make(partial)
+        result = make(partial)
         _remove(record)
         for product in products:
             _remove(into / product)
             (partial / product).replace(into / product)
-        return _record(record, key, facts, into, [into / product for product in products])
+        made = [into / product for product in products]
+        return _record(record, key, result, kind, into=into, products=made)
     except OSError as error:
         if error.filename is not None and stages.parent not in Path(error.filename).parents:
             raise  # of what is read
@@ -149,7 +158,7 @@ def run_stage_in(
     products: Sequence[Path],
     made_by: Sequence[str] = WHOLE_PACKAGE,
     timed: bool = False,
-) -> Kept:
+) -> Kept[dict[str, Any]]:
     """Run a stage that has a folder to itself, unless an earlier run finished it.
 
     What it makes is made in its place, for programs that write down where their output lies.
@@ -157,23 +166,23 @@ def run_stage_in(
     Args:
         folder: emptied before the stage is run; gets `result.json` beside what the stage leaves.
         depends_on: everything the result depends on but the code, see `digest_of`.
-        make: makes the products and returns facts that JSON can hold.
+        make: makes the products and returns a result that JSON can hold.
         products: files and folders that later stages read, in the folder or elsewhere.
         made_by: folders of this package whose code changes the result, see `code_digest`: where
             other programs make it, not those that only make what it depends on.
-        timed: the facts tell how long it took, so that the number of threads counts.
+        timed: the result says how long it took, so that the number of threads counts.
 
     Raises:
         OSError: something cannot be written.
     """
     key = _stage_key(depends_on, made_by=made_by, timed=timed)
     record = folder / "result.json"
-    finished = _finished(record, key, folder)
+    finished = _finished(record, key, folder, dict[str, Any])
     if finished is not None:
         return finished
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    return _record(record, key, make(), folder, products)
+    return _record(record, key, make(), dict[str, Any], into=folder, products=products)
 
 
 def _stage_key(
@@ -185,7 +194,7 @@ def _stage_key(
     return digest_of([code, *depends_on], timed=timed)
 
 
-def _finished(record: Path, key: str, into: Path) -> Kept | None:
+def _finished(record: Path, key: str, into: Path, kind: type[_Result]) -> Kept[_Result] | None:
     """The stage as recorded; None where it is another, or the record or a product is damaged."""
     try:
         body = json.loads(record.read_text())
@@ -197,12 +206,18 @@ def _finished(record: Path, key: str, into: Path) -> Kept | None:
         return None
     if not all(is_as_recorded(into / name, file) for name, file in body["files"].items()):
         return None
-    return _kept(body, resumed=True)
+    return _kept(body, kind, resumed=True)
 
 
 def _record(
-    record: Path, key: str, facts: dict[str, Any], into: Path, products: Sequence[Path]
-) -> Kept:
+    record: Path,
+    key: str,
+    result: _Result,
+    kind: type[_Result],
+    *,
+    into: Path,
+    products: Sequence[Path],
+) -> Kept[_Result]:
     files = {
         path.relative_to(into).as_posix() if path.is_relative_to(into) else str(path.absolute()): (
             file_record(path)
@@ -210,11 +225,12 @@ def _record(
         for product in products
         for path in _files_of(product)
     }
-    # As a later run reads them: JSON knows no tuples.
-    body = json.loads(json.dumps({"key": key, "facts": facts, "files": files}))
+    # Read back, so that this run goes on from what a later run will read.
+    plain = {"key": key, "result": cattrs.unstructure(result), "files": files}
+    body = json.loads(json.dumps(plain))
     with whole_file(record) as partial:
         partial.write_text(json.dumps({**body, "digest": _json_digest(body)}, indent=1))
-    return _kept(body, resumed=False)
+    return _kept(body, kind, resumed=False)
 
 
 def _files_of(product: Path) -> list[Path]:
@@ -223,10 +239,10 @@ def _files_of(product: Path) -> list[Path]:
     return sorted(path for path in product.rglob("*") if path.is_file())
 
 
-def _kept(body: dict[str, Any], *, resumed: bool) -> Kept:
+def _kept(body: dict[str, Any], kind: type[_Result], *, resumed: bool) -> Kept[_Result]:
     contents = {name: file["digest"] for name, file in body["files"].items()}
-    result = {"key": body["key"], "facts": body["facts"], "contents": contents}
-    return Kept(body["facts"], _json_digest(result), resumed)
+    identity = {"key": body["key"], "result": body["result"], "contents": contents}
+    return Kept(cattrs.structure(body["result"], kind), _json_digest(identity), resumed)
 
 
 def _json_digest(body: Any) -> str:

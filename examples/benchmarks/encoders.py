@@ -179,7 +179,7 @@ def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path,
 
     given = (file_digest(source), setting)
     made_by = ("video",)
-    facts = run_stage_in(folder, given, make, products=[stream], made_by=made_by, timed=True).facts
+    facts = run_stage_in(folder, given, make, products=[stream], made_by=made_by, timed=True).result
     return stream, facts["cpu_seconds"]
 
 
@@ -213,7 +213,7 @@ def modelled(
         return facts
 
     given = (file_digest(source), file_digest(stream), images, camera)
-    facts = run_stage_in(folder, given, make, products=[]).facts
+    facts = run_stage_in(folder, given, make, products=[]).result
     facts.pop("message", None)
     return facts
 

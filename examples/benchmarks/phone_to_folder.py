@@ -207,7 +207,7 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
     converted = None
     if not is_av1:
         kept = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True)
-        converted = kept.facts
+        converted = kept.result
     keep_stream = None if is_av1 else stream
     match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
     options = ReconstructOptions(match=match)
@@ -217,7 +217,7 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
         return taken(run_measured(run_reconstruct, clip.video, output, options, log=log))
 
     given = [source, clip.images, clip.camera]
-    made = run_stage_in(output.parent, given, make, products=[output], timed=True).facts
+    made = run_stage_in(output.parent, given, make, products=[output], timed=True).result
     return converted, made, output
 
 
@@ -262,9 +262,9 @@ def sift_of(
         return {"features": taken(extracted), "matches": taken(matched)}
 
     given = [file_digest(clip.video), names]
-    written = run_stage_in(images.parent, given, write, products=[images], timed=True).facts
+    written = run_stage_in(images.parent, given, write, products=[images], timed=True).result
     given = [*given, clip.camera, pycolmap.__version__]
-    matching = run_stage_in(database.parent, given, match, products=[database], timed=True).facts
+    matching = run_stage_in(database.parent, given, match, products=[database], timed=True).result
     steps = {"frames": written, **matching}
     if not mapped:
         return steps, None, images

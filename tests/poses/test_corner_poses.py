@@ -21,7 +21,7 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.takes import Takes
 from colmap_av1.options import MapperOptions
 from colmap_av1.poses.corners.in_images import place_anew
-from colmap_av1.poses.reconstruct_poses import PosedImages, adjustment_stage
+from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, adjustment_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.util.stages import Kept
@@ -126,10 +126,16 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
         placed.masks,
     )
     adjusted = adjustment_stage(
-        *(cast(Any, run), tracks, links, takes, Kept({"poses": "placed.npz"}, "", resumed=False)),
+        *(
+            cast(Any, run),
+            tracks,
+            links,
+            takes,
+            Kept(PosesResult("placed.npz", NUM_IMAGES, {}), "", resumed=False),
+        ),
         corners=lambda _, known: (tracks, known),
     )
-    found = read_posed_model(tmp_path / adjusted.facts["poses"]).by_name
+    found = read_posed_model(tmp_path / adjusted.result.poses).by_name
     centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))
     steps = np.diff(centres, axis=0)
     usual = np.median(steps, axis=0)

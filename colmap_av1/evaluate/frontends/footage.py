@@ -151,7 +151,7 @@ def choose_footage(
         digest_if_there(options.images.frame_list),
         [file_digest(images / n) for n in existing_images(images, options.images.image_name)],
     ]
-    facts = run_stage_in(folder, depends_on, make, products=[images]).facts
+    facts = run_stage_in(folder, depends_on, make, products=[images]).result
     for name in ("frames", "size", "warnings"):
         facts[name] = tuple(facts[name])
     return Footage(video=video.path, image_path=images, camera=options.camera, **facts)

@@ -94,7 +94,7 @@ def run_measured_frontend(
         made_by=frontend.made_by,
         timed=True,
     )
-    return FrontendRun(name, database, **finished.facts)
+    return FrontendRun(name, database, **finished.result)
 
 
 def camera_model(footage: Footage) -> str:

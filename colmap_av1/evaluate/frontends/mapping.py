@@ -76,10 +76,10 @@ def measure_mapper(
         [file_digest(database), options, pycolmap.__version__],
         make,
         products=[model],
-        made_by=(*OF_OTHERS, "model"),
+        made_by=(*OF_OTHERS, "geometry", "poses"),
         timed=True,
     )
-    return MapperRun(model / "0" if finished.facts["num_models"] else None, **finished.facts)
+    return MapperRun(model / "0" if finished.result["num_models"] else None, **finished.result)
 
 
 def densify_model(
@@ -120,7 +120,7 @@ def densify_model(
     anywhere = replace(options, match=replace(options.match, keep_stream=None))
     given = (inputs, footage.names, footage.frames, anywhere)
     return MapperRun(
-        output, **run_stage_in(folder, given, make, products=[output], timed=True).facts
+        output, **run_stage_in(folder, given, make, products=[output], timed=True).result
     )
 
 

@@ -197,11 +197,11 @@ def train(
 
     depends_on = (trainer, given, iterations, stops)
     finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
-    states = tuple(_milestone(state) for state in finished.facts["states"])
+    states = tuple(_milestone(state) for state in finished.result["states"])
     last = renders / str(iterations) if states else renders
     files = match_renders(last, references)
     metrics = states[-1].metrics if states else rendering_metrics(files, references)
-    seconds = finished.facts["seconds"]
+    seconds = finished.result["seconds"]
     if states and not math.isnan(states[-1].seconds):
         seconds = states[-1].seconds
     return Training(seconds, states, names, references, files, metrics)
@@ -290,7 +290,7 @@ def _kept_gsplat(
     finished = run_stage_in(
         *(folder, (GSPLAT, *key), make), products=[folder / "output"], made_by=_CODE
     )
-    states = tuple(_milestone(state) for state in finished.facts["states"])
+    states = tuple(_milestone(state) for state in finished.result["states"])
     return states[-1].seconds, states
 
 

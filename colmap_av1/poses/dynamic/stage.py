@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from colmap_av1.images.takes import Takes
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
 from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
-from colmap_av1.poses.reconstruct_poses import PosedImages, read_posed_images
+from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
@@ -32,10 +32,23 @@ _USUAL_WIDTH = 960
 _FEWEST_IMAGES = 4
 
 
-def moving_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
+@dataclass(frozen=True)
+class DynamicResult:
+    """What `moving_stage` found beside the masks it keeps.
+
+    Attributes:
+        moving: share of the images' pixels that move by themselves.
+    """
+
+    moving: float
+
+
+def moving_stage(
+    run: Run, tracks: Tracks, takes: Takes, posed: Kept[PosesResult]
+) -> Kept[DynamicResult]:
     """Find the regions of each image that move by themselves."""
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> DynamicResult:
         placed = read_posed_images(run, posed, takes)
         found: dict[str, Mask] = {}
         with run.clock.measure("moving"):
@@ -46,12 +59,13 @@ def moving_stage(run: Run, tracks: Tracks, takes: Takes, posed: Kept) -> Kept:
                 run.progress("moving", video + 1, len(takes.videos))
         _write(partial / _FILE, found)
         left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
-        return {"moving": left_out, "poses": posed.facts["poses"]}
+        return DynamicResult(left_out)
 
     return run_stage(
         run.stages,
         "moving",
         [posed.digest],
+        DynamicResult,
         into=run.stages,
         products=[_FILE],
         make=make,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,27 @@ from colmap_av1.poses.placing.placement import (
     write_place,
 )
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
-from colmap_av1.poses.reconstruct_poses import PosedImages, read_posed_images
+from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.util.stages import Kept, run_stage
 
 
-def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) -> Kept:
+@dataclass(frozen=True)
+class PlaceResult(PosesResult):
+    """What `place_stage` found.
+
+    Attributes:
+        place: where the model lies in the world, as in `place.json`.
+        place_warnings: what the user should know of it.
+    """
+
+    place: dict[str, Any]
+    place_warnings: tuple[str, ...]
+
+
+def place_stage(
+    run: Run, takes: Takes, posed: Kept[PosesResult], positions: ImagePositions
+) -> Kept[PlaceResult]:
     """Place the posed images where positions, gravity and a known distance say.
 
     Args:
@@ -40,7 +55,7 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
     options, seed = run.options.place, run.options.match.run.seed
     file = f"{run.stages.name}/in_place.npz"
 
-    def make(partial: Path) -> dict[str, Any]:
+    def make(partial: Path) -> PlaceResult:
         placed = read_posed_images(run, posed, takes)
         with run.clock.measure("place"):
             # Marks are in pictures as the model's folder holds them.
@@ -53,16 +68,19 @@ def place_stage(run: Run, takes: Takes, posed: Kept, positions: ImagePositions) 
             images = _moved_images(images, found.similarity.apply_to_poses)
         (partial / file).parent.mkdir()
         write_posed_model(partial / file, PosedModel(placed.cameras, images))
-        return {
-            "poses": Path(file).name,
-            "place": found.facts,
-            "place_warnings": list(found.warnings),
-        }
+        return PlaceResult(
+            poses=Path(file).name,
+            num_registered=posed.result.num_registered,
+            registered=posed.result.registered,
+            place=found.facts,
+            place_warnings=tuple(found.warnings),
+        )
 
     return run_stage(
         run.stages,
         "place",
         [posed.digest, options, positions.digest, seed],
+        PlaceResult,
         into=run.output,
         products=[PLACE_FILE, file],
         make=make,
