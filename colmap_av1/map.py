@@ -21,7 +21,7 @@ from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_writ
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
+from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import FarViews, model_far_views
 from colmap_av1.poses.mapper import is_mapper_log, map_poses
@@ -167,13 +167,11 @@ def map_database(
     )
 
 
-def _about_joints(
-    model: Any, database: Path, thin_gaps: Sequence[ThinGap]
-) -> tuple[str | None, ...]:
+def _about_joints(model: Any, database: Path, thin_gaps: Sequence[Gap]) -> tuple[str | None, ...]:
     """What the user should know of a model whose parts hardly hold together, or wrongly."""
     told = (model_joints(model).warning, model_crossings(model, database).warning)
     # What the model itself shows says more than what it is made of.
-    return told if any(told) else (thin_gap_warning(thin_gaps),)
+    return told if any(told) else (few_matches_warning(thin_gaps),)
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
@@ -219,7 +217,7 @@ def _place(
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[ThinGap, ...]]:
+def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]]:
     """Refuse what a mapper would stop at; returns the number of images, and thin gaps."""
     checked = check(database)
     stops = [f.text for f in checked.findings if f.severity == "error"]

@@ -31,8 +31,8 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.names import video_of
+from colmap_av1.matching.gaps import Gap, few_match_gaps
 from colmap_av1.matching.two_view_geometry import config_name
-from colmap_av1.matching.weak_gaps import ThinGap, thin_gaps
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.graphs import connected_components
 
@@ -85,7 +85,7 @@ class CheckReport:
     configs: dict[str, int]
     num_connected_images: int
     parallax: Parallax | None
-    thin_gaps: tuple[ThinGap, ...]
+    thin_gaps: tuple[Gap, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -136,7 +136,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
     videos = list(map(video_of, images.camera_ids, images.names))
-    thin = thin_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
+    thin = few_match_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
     findings = [
         *image_findings(images, cameras),
         *value_findings(images, pairs, cameras),

@@ -11,6 +11,7 @@ import pycolmap
 from colmap_av1.check.contents import Images, Pairs, Parallax
 from colmap_av1.check.finding import Finding, some
 from colmap_av1.database.layout import columns
+from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
     INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
@@ -18,7 +19,6 @@ from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
-from colmap_av1.matching.weak_gaps import ThinGap, thin_gap_warning
 
 # Share of keypoints without a match that is worth a line.
 _NOTED_SHARE = 0.01
@@ -207,9 +207,9 @@ def motion_findings(
         )
 
 
-def gap_findings(gaps: Sequence[ThinGap]) -> Iterator[Finding]:
+def gap_findings(gaps: Sequence[Gap]) -> Iterator[Finding]:
     """Gaps between images of a video that few matches cross, in one finding."""
-    text = thin_gap_warning(gaps)
+    text = few_matches_warning(gaps)
     if text is not None:
         yield Finding("warning", text)
 

@@ -37,10 +37,10 @@ _MUCH_WORSE = 1.5
 _SHARE = 0.9
 
 
-def bar_false_starts(
-    matched: MatchedImages, cameras: Sequence[pycolmap.Camera], *, clock: Clock
+def demote_bad_initial_pairs(
+    matched: MatchedImages, cameras: Sequence[pycolmap.Camera], clock: Clock
 ) -> MatchedImages:
-    """Leave pairs with which a model would begin wrongly fewer matches than a first pair needs.
+    """Limit the inliers of pairs that would make a bad initial pair.
 
     COLMAP's mapper takes a pair's pose from its homography wherever that explains most of the
     matches (`EstimateTwoViewGeometryPose`). Where the matches themselves deny this pose, or the

@@ -1,67 +1,114 @@
-"""Links: matches of pictures where motion does not connect images that see the same.
+"""SIFT links: matches of SIFT features where motion does not connect images of the same place.
 
-Motion vectors link neighbours in time. Where a camera jerks, a picture is blurred or a place is
-seen again, a few pictures get light SIFT features. What these say of a gap decides, too, whether
-the motion across it is believed.
+Motion vectors connect neighbours in time. At gaps (a camera jerks, a picture is blurred) and at
+loop closures, a few pictures get SIFT features. The features across a gap also decide whether the
+motion across it is kept.
+
+The steps: plan which pictures are examined and which pairs are tried; match their features; compare
+the motion across gaps with them; merge them with the matches of tracks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
+from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.takes import Pictures, Takes
 from colmap_av1.matching.features.overlays import without_overlays
-from colmap_av1.matching.features.sift import Features
-from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
-from colmap_av1.matching.link_matches import (
-    Links,
-    broken_gaps,
-    extract_features,
-    match_pairs,
-    same_videos,
-    supported_links,
+from colmap_av1.matching.features.retrieval import similar_images
+from colmap_av1.matching.features.sift import (
+    FeatureExtractor,
+    Features,
+    masked_features,
+    match_features,
 )
-from colmap_av1.matching.link_merging import (
-    connected_images,
-    links_as_tracks,
-    merge_links,
+from colmap_av1.matching.gaps import (
+    Gap,
+    GapReason,
+    SuspectGaps,
+    low_inter_gaps,
+    probed_gaps,
+    suspect_gaps,
 )
-from colmap_av1.matching.link_plan import (
-    Plan,
-    groups_of_takes,
-    pairs_beside,
-    pairs_between,
-    places_of,
-    plan_anywhere,
-    plan_links,
-    revisit_pairs,
-    thorough_plan,
-    weak_and_probed_gaps,
-)
-from colmap_av1.options import MatchOptions
+from colmap_av1.matching.image_matches import MatchedImages, connected_images, nothing_to_match
+from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
+from colmap_av1.matching.verify import agreeing_matches, verify_pairs
+from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.cpus import one_blas_thread
+from colmap_av1.util.graphs import connected_components
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.spread import evenly_spread
 
-# Inliers across a gap from which on mappers take it: they register an image by 30 points of its,
-# of which matches of two images give a part.
-_SURE_INLIERS = 100
-# Share of the usual inliers between neighbours from which on motion that agrees with the pictures
-# carries over a gap by itself.
-_ENOUGH_OF_USUAL = 0.3
-# Gaps of a video that are probed and contradicted by pictures, which prove its motion wrong.
-_NUM_BROKEN_PROBES = 2
-# Features of a picture below which it shows nothing: others have hundreds.
+# --- Which pictures are examined.
+# Images on either side of a gap, by their distance from it. The nearest see most in common, the
+# others give the scale.
+_AROUND_GAP = (0, 1, 2, 4, 7)
+# Images that a first look compares with the motion: most suspect gaps are ordinary.
+_FIRST_LOOK = (0, 2)
+# Loops are looked for in images whose distance is this share of the span that tracks reach ...
+_LOOP_SHARE = 0.2
+# ... in videos that are longer than tracks reach by this factor, and have this many images.
+_LONG = 8
+_LEAST_IMAGES = 120
+# Least distance of these images, which bounds the time; and their least number in each of several
+# videos.
+_LEAST_STEP = 3
+_LEAST_LOOP_IMAGES = 12
+# Up to this many pairs, all are matched: retrieval takes no less time.
+_MOST_OF_ALL = 200
+# Images of each video, and photos, that get all of SIFT's features, which takes five times as long.
+_MOST_THOROUGH = 12
+# An image that is linked to another video is also matched with this many neighbours, which gives
+# its features depth.
+_NEIGHBOURS = 2
+# Distance between videos in the order that `_supported` uses; larger than `_SUPPORT_REACH`.
+_APART = 100
+# If the images of a video without any motion have fewer features than this, they show nothing:
+# others have hundreds. Number of images that are examined for this.
 _FEW_FEATURES = 20
-# Images of a video without any motion whose pictures are looked at, to tell whether they show
-# anything.
 _NUM_GLANCED = 3
-# Gaps that a warning names.
+
+# --- Which links and which motion are kept.
+# Least inliers across a gap. A loop needs more, as nothing else shows that the camera was there.
+_MIN_GAP_INLIERS = 20
+_MIN_LOOP_INLIERS = 25
+# A loop is confirmed by another one between neighbours up to this distance.
+_SUPPORT_REACH = 2
+# Two videos are the same if this many of the examined pictures, and this share of them, have their
+# features in the same place, in pixels. A second camera comes this near for one or two pictures.
+_FEWEST_SAME = 3
+_SAME_SHARE = 0.3
+_SAME_PLACE = 1.0
+# The motion across a gap is kept if this share of its matches agrees with the geometry of the
+# pictures within this many pixels: 98 to 100 % of true motion does, at most three quarters of what
+# only compresses well.
+_MIN_AGREEING = 0.85
+_MAX_ERROR = 3.0
+# Mappers register an image by 30 points, of which matches of two images give a part: with this many
+# inliers across a gap they always do.
+_SURE_INLIERS = 100
+# Motion that agrees with the pictures is enough at this share of the usual inliers of neighbours.
+_ENOUGH_OF_USUAL = 0.3
+# If this many probed gaps of a video are contradicted by pictures, all its motion is wrong.
+_NUM_WRONG_PROBES = 2
+
+# --- Merging.
+# A feature within this many pixels of a track's keypoint is the same keypoint.
+_JOIN_DISTANCE = 1.0
+# Expected error of a feature in pixels.
+_SIGMA = 0.5
+
+# Gaps and photos that a warning names.
 _NUM_NAMED = 4
 
 
@@ -69,22 +116,16 @@ _NUM_NAMED = 4
 class LinkReport:
     """What linking found.
 
-    Frames of several videos are counted through.
-
     Attributes:
-        num_images: images whose pictures were looked at.
-        looked_again: places seen again were looked for.
+        num_images: images whose pictures were examined.
+        looked_again: loops were looked for.
         num_tried: pairs whose features were matched.
         num_links: pairs that were linked.
-        num_revisits: those of them that see a place again.
-        num_between: those of different videos, or of photos.
-        weak_gaps: (frame, frame) on either side of gaps that motion does not carry over.
-        broken_gaps: those whose motion contradicts the pictures, or is not confirmed by them: its
-            matches are left out.
-        doubtful_gaps: those that few matches of any kind cross: a mapper may part the images there.
-        open_gaps: those across which neither motion nor pictures connect the images.
-        videos: (name, first frame) of each video where there are several.
-        parts: the videos, by groups that are connected, where nothing connects them all.
+        num_revisits: those of them that close a loop.
+        num_between: those between different videos or photos.
+        gaps: gaps that motion does not bridge, in order.
+        videos: (name, first frame) of each video if there are several; frames are counted through.
+        parts: the names of the videos in each connected group, if there are several groups.
         unlinked_photos: names of photos that nothing connects with a video.
         same_videos: (name, name) of videos that show the same pictures.
     """
@@ -95,42 +136,42 @@ class LinkReport:
     num_links: int = 0
     num_revisits: int = 0
     num_between: int = 0
-    weak_gaps: tuple[tuple[int, int], ...] = ()
-    broken_gaps: tuple[tuple[int, int], ...] = ()
-    doubtful_gaps: tuple[tuple[int, int], ...] = ()
-    open_gaps: tuple[tuple[int, int], ...] = ()
+    gaps: tuple[Gap, ...] = ()
     videos: tuple[tuple[str, int], ...] = ()
     parts: tuple[tuple[str, ...], ...] = ()
     unlinked_photos: tuple[str, ...] = ()
     same_videos: tuple[tuple[str, str], ...] = ()
 
+    def frames_of_gaps(self, reason: GapReason = "low inter share") -> list[tuple[int, int]]:
+        """Frames on either side of the gaps with a reason; all gaps have the default one."""
+        return [gap.frames for gap in self.gaps if gap.frames and reason in gap.reasons]
+
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know: images that nothing connects, videos that are the same."""
+        """Warnings about images that nothing connects and about videos that are the same."""
         same = (
             f"'{first}' and '{second}' show the same pictures, as encodings of one video do: give "
             "one of them, the other adds nothing but time"
             for first, second in self.same_videos
         )
-        return (*self._open_gaps(), *self._parts(), *self._unlinked_photos(), *same)
+        return (*self._gap_warnings(), *self._part_warnings(), *self._photo_warnings(), *same)
 
-    def _open_gaps(self) -> tuple[str, ...]:
-        if not self.open_gaps:
+    def _gap_warnings(self) -> tuple[str, ...]:
+        gaps = self.frames_of_gaps("no overlap")
+        if not gaps:
             return ()
-        shown = ", ".join(self._frames(gap) for gap in self.open_gaps[:_NUM_NAMED])
-        more = len(self.open_gaps) - _NUM_NAMED
+        shown = []
+        for gap in gaps[:_NUM_NAMED]:
+            name, before, after = gap_in_video(gap, self.videos)
+            shown.append(f"{before} and {after} of '{name}'" if name else f"{before} and {after}")
+        more = f" and {len(gaps) - _NUM_NAMED} more pairs" if len(gaps) > _NUM_NAMED else ""
         return (
-            f"nothing connects frames {shown}{f' and {more} more pairs' if more > 0 else ''}: the "
+            f"nothing connects frames {', '.join(shown)}{more}: the "
             "camera jerks, or the pictures are blurred or cut there, and show nothing in common; "
             "the images on either side become separate models",
         )
 
-    def _frames(self, gap: tuple[int, int]) -> str:
-        """The frames of a gap, counted in their own video."""
-        name, before, after = gap_in_video(gap, self.videos)
-        return f"{before} and {after} of '{name}'" if name else f"{before} and {after}"
-
-    def _parts(self) -> tuple[str, ...]:
+    def _part_warnings(self) -> tuple[str, ...]:
         if not self.parts:
             return ()
         if self.num_images == 0:
@@ -142,7 +183,7 @@ class LinkReport:
             "models; film what both see, or match videos of different scenes apart",
         )
 
-    def _unlinked_photos(self) -> tuple[str, ...]:
+    def _photo_warnings(self) -> tuple[str, ...]:
         if not self.unlinked_photos:
             return ()
         names = ", ".join(f"'{name}'" for name in self.unlinked_photos[:_NUM_NAMED])
@@ -154,7 +195,7 @@ class LinkReport:
 
 
 def gap_in_video(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> tuple[str, int, int]:
-    """The frames of a gap counted in their own video, after its name; '' where there is one."""
+    """Name of the video of a gap and the two frames counted in it; '' for a single video."""
     name, first = next((v for v in reversed(videos) if v[1] <= gap[0]), ("", 0))
     return name, gap[0] - first, gap[1] - first
 
@@ -164,8 +205,8 @@ class LinkedImages:
     """Images matched along tracks and by links.
 
     Attributes:
-        matched: the images with all their keypoints and verified matches.
-        tracks: the links as tracks, through the frames of the images that have features.
+        matched: the images with all keypoints and verified matches.
+        tracks: the links as tracks through the frames of the images that have features.
         report: what was found.
     """
 
@@ -177,221 +218,757 @@ class LinkedImages:
 def link_images(
     takes: Takes,
     matched: MatchedImages,
-    cameras: Sequence[Any],
+    cameras: Sequence[pycolmap.Camera],
     inter_share: NDArray[np.float32],
     pictures: Pictures,
     *,
+    pairs: PairOptions,
+    verify: VerifyOptions,
+    links: LinkOptions,
+    context: RunContext,
     name: str,
     images_apart: float = 1.0,
-    options: MatchOptions,
-    clock: Clock,
-    progress: Progress,
 ) -> LinkedImages:
-    """Link images by their pictures where motion does not connect them.
+    """Link images by SIFT features where motion does not connect them.
 
-    No picture is decoded where motion connects all images, as it may those of one video.
+    If motion connects all images, which is possible for a single video only, no picture is decoded.
 
     Args:
         takes: the images of videos and photos.
         matched: the images, matched along tracks.
-        cameras: the camera of each image; images share one where it is the same object.
+        cameras: the camera of each image; images share a camera if it is the same object.
         inter_share: float32 [num_frames], see `TrackedVideo`; any numbers for photos.
         pictures: gives the pictures of images.
+        pairs: fewest matches of a pair, for the message.
+        verify: how links are verified.
+        links: whether and where links are wanted.
+        context: its clock gets the stage "links", its progress "links" and "link matches".
         name: what messages call the videos.
-        images_apart: images that each of these stands for, where they are a choice of many.
-        options: those of links, verification and reading are used.
-        clock: gets the stage "links".
-        progress: called for the stage "links".
+        images_apart: number of images that each of these stands for, if they are a selection.
 
     Raises:
         VideoError: neither motion nor pictures connect any two images.
     """
     found: dict[str, dict[int, Features]] = {"light": {}, "full": {}}
 
-    def look_at(wanted: Iterable[int], effort: Literal["light", "full"]) -> dict[int, Features]:
+    def features_of(wanted: Iterable[int], effort: Literal["light", "full"]) -> dict[int, Features]:
         known = found[effort]
         missing = sorted(set(wanted) - known.keys())
-        with clock.measure("links"):
+        with context.clock.measure("links"):
             known |= extract_features(
-                *(missing, pictures, cameras, takes.masks, options.links),
-                effort=effort,
-                progress=progress,
+                missing, pictures, cameras, takes.masks, links, effort=effort, context=context
             )
         return {image: known[image] for image in wanted if image in known}
 
     def link(plan: Plan) -> LinkedImages:
-        features = look_at(plan.wanted, plan.effort)
-        with clock.measure("links"):
+        features = features_of(plan.wanted, plan.effort)
+        with context.clock.measure("links"):
             features = without_overlays(features, cameras)
             return _link(
-                *(plan, takes, matched, cameras, features), options=options, progress=progress
+                plan,
+                takes,
+                matched,
+                cameras,
+                features,
+                verify=verify,
+                options=links,
+                context=context,
             )
 
-    weak, maybe, probes = weak_and_probed_gaps(takes, matched, inter_share, options.links)
-    plan = plan_links(takes, matched, weak, images_apart, options.links)
-    if options.links.links != "none" and (maybe.any() or probes):
-        first = Plan.of_first_look(np.flatnonzero(maybe), probes, takes)
-        look_at([*first.wanted, *plan.wanted], "light")  # the videos are decoded once
-        weak |= _proved_weak(link(first).report, maybe, probes, matched, takes)
-        plan = plan_links(takes, matched, weak, images_apart, options.links)
+    suspect = suspect_gaps(takes, matched, inter_share, links)
+    gaps = suspect.certain
+    plan = plan_links(takes, matched, gaps, images_apart, links)
+    if links.links != "none" and (suspect.maybe.any() or suspect.probes):
+        first = _first_look(suspect, takes)
+        features_of([*first.wanted, *plan.wanted], "light")  # decode the videos once
+        gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, takes)
+        plan = plan_links(takes, matched, gaps, images_apart, links)
     if plan.wanted:
         linked = link(plan)
     else:
-        nothing = Tracks.empty(takes.num_frames, _largest(cameras))
-        linked = LinkedImages(matched, nothing, LinkReport(**_take_report(matched, takes)))
-    if linked.report.doubtful_gaps and not plan.key:
-        plan = plan_anywhere(plan, takes, matched, images_apart)
+        nothing = Tracks.empty(takes.num_frames, _largest_size(cameras))
+        linked = LinkedImages(matched, nothing, _with_parts(LinkReport(), matched, takes))
+    if linked.report.frames_of_gaps("few tracks") and not plan.loop:
+        # What lies on either side of a cut may continue anywhere in the videos.
+        plan = replace(plan, loop=_spread_over_videos(takes, matched, images_apart))
         linked = link(plan)
-    if plan.wanted and (linked.report.doubtful_gaps or linked.report.parts):
+    if plan.wanted and (linked.report.frames_of_gaps("few tracks") or linked.report.parts):
         linked = link(thorough_plan(plan, takes))
     if len(linked.matched.pairs) == 0:
-        if options.links.links != "none" and not found["light"]:
-            look_at(np.linspace(0, len(takes.take) - 1, _NUM_GLANCED).round().astype(int), "light")
+        if links.links != "none" and not found["light"]:
+            features_of(evenly_spread(len(takes.take), _NUM_GLANCED, rounded=True), "light")
         sizes = [len(features.xy) for features in found["light"].values()]
         if sizes and np.median(sizes) < _FEW_FEATURES:
             raise VideoError(
                 f"{name}: its pictures show hardly any detail, {np.median(sizes):.0f} features "
                 "each, so there is nothing to match: film what has texture, in light and in focus"
             )
-        raise nothing_to_match(name, options)
-    looked_at = found["light"].keys() | found["full"].keys()
-    return replace(linked, report=replace(linked.report, num_images=len(looked_at)))
+        raise nothing_to_match(name, pairs)
+    examined = found["light"].keys() | found["full"].keys()
+    return replace(linked, report=replace(linked.report, num_images=len(examined)))
 
 
-def _proved_weak(
-    report: LinkReport,
-    maybe: NDArray[np.bool_],
-    probes: list[int],
-    matched: MatchedImages,
-    takes: Takes,
+# --- Planning: which pictures are examined.
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which pictures are examined.
+
+    Attributes:
+        gaps: int64 [n] gaps that motion does not bridge, by the image before each.
+        around: the images whose pictures are matched across each.
+        loop: images in which loops are looked for.
+        between: images that are compared with those of other videos and photos.
+        effort: effort of the search for features.
+    """
+
+    gaps: NDArray[np.int64]
+    around: list[list[int]]
+    loop: list[int]
+    between: list[int]
+    effort: Literal["light", "full"] = "light"
+
+    @property
+    def wanted(self) -> list[int]:
+        """All images whose pictures are needed, ascending."""
+        return sorted(
+            {image for images in [*self.around, self.loop, self.between] for image in images}
+        )
+
+
+def images_to_link(
+    inter_share: NDArray[np.float32], frames: NDArray[np.int32], options: LinkOptions
 ) -> NDArray[np.bool_]:
-    """The gaps whose motion a look at few pictures does not bear out, or where it is little.
-
-    All gaps of a video are weak where several of its probes are wrong.
+    """Images of a video whose pictures are needed at suspect gaps, before any are matched.
 
     Args:
-        report: of the look.
-        maybe: bool [num_images - 1] gaps that may be weak.
-        probes: other gaps that stand for all of them.
+        inter_share: see `TrackedVideo`.
+        frames: int32 [num_images] frame of each image.
+        options: whether links are wanted.
+
+    Returns:
+        bool [num_images]; all if any motion has to be probed.
+    """
+    chosen = np.zeros(len(frames), dtype=np.bool_)
+    low = low_inter_gaps(inter_share, frames)
+    certain = low_inter_gaps(inter_share, frames, certain=True)
+    if options.links != "none":
+        for gap in np.flatnonzero(low).tolist():
+            around = _AROUND_GAP if certain[gap] else _FIRST_LOOK
+            chosen[_images_around(gap, range(len(frames)), around)] = True
+    if probed_gaps(inter_share, low, options):
+        chosen[:] = True
+    return chosen
+
+
+def _images_around(gap: int, images: range, distances: Sequence[int] = _AROUND_GAP) -> list[int]:
+    """Images of a video whose pictures are matched across a gap."""
+    found = {gap - d for d in distances} | {gap + 1 + d for d in distances}
+    return sorted(found & set(images))
+
+
+def _first_look(suspect: SuspectGaps, takes: Takes) -> Plan:
+    """A look at few images on either side of suspect gaps: do they confirm the motion?"""
+    around = {
+        gap: _images_around(gap, takes.images_of(int(takes.take[gap])), _FIRST_LOOK)
+        for gap in np.flatnonzero(suspect.maybe).tolist()
+    }
+    around |= {gap: [gap, gap + 1] for gap in suspect.probes if gap not in around}
+    gaps = sorted(around)
+    return Plan(np.array(gaps, np.int64), [around[gap] for gap in gaps], [], [])
+
+
+def _confirmed_gaps(
+    report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, takes: Takes
+) -> NDArray[np.bool_]:
+    """Suspect gaps whose motion the first look contradicts, or that few tracks cross.
+
+    If several probes of a video are contradicted, all its gaps count.
+
+    Args:
+        report: of the first look.
+        suspect: the gaps that were examined.
         matched: the images, matched along tracks.
         takes: the images.
+
+    Returns:
+        bool [num_images - 1].
     """
-    wrong = {frame for frame, _ in report.broken_gaps}
-    is_wrong = np.isin(takes.images.frames[:-1], sorted(wrong))
-    across = np.zeros(len(maybe))
+    wrong = sorted({frame for frame, _ in report.frames_of_gaps("contradicted")})
+    is_wrong = np.isin(takes.images.frames[:-1], wrong)
+    across = np.zeros(len(suspect.maybe))
     for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
         if j == i + 1:
             across[i] = len(geometry.inlier_matches)
     enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * float(np.median(across)))
-    proved = maybe & (is_wrong | (across < enough))
-    broken = [int(takes.take[gap]) for gap in probes if is_wrong[gap]]
-    for take, count in enumerate(np.bincount(broken, minlength=takes.num_takes).tolist()):
-        if count >= _NUM_BROKEN_PROBES:
+    confirmed = suspect.maybe & (is_wrong | (across < enough))
+    wrong_probes = [int(takes.take[gap]) for gap in suspect.probes if is_wrong[gap]]
+    for take, count in enumerate(np.bincount(wrong_probes, minlength=takes.num_takes).tolist()):
+        if count >= _NUM_WRONG_PROBES:
             images = takes.images_of(take)
-            proved[images.start : images.stop - 1] = True
-    return proved
+            confirmed[images.start : images.stop - 1] = True
+    return confirmed
 
 
-def _largest(cameras: Sequence[Any]) -> tuple[int, int]:
-    """(width, height) that holds the pictures of all cameras."""
-    return max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
+def plan_links(
+    takes: Takes,
+    matched: MatchedImages,
+    gaps: NDArray[np.bool_],
+    images_apart: float,
+    options: LinkOptions,
+) -> Plan:
+    """Choose the pictures at gaps, for loops in long videos, and between videos.
+
+    Args:
+        takes: the images.
+        matched: the images, matched along tracks.
+        gaps: bool [num_images - 1] gaps that motion does not bridge.
+        images_apart: see `link_images`.
+        options: whether and where links are wanted.
+    """
+    if options.links == "none":
+        return Plan(np.empty(0, np.int64), [], [], [])
+    chosen = np.flatnonzero(gaps)
+    around = [_images_around(gap, takes.images_of(int(takes.take[gap]))) for gap in chosen.tolist()]
+    loop: list[int] = []
+    for video in range(len(takes.videos)):
+        images = takes.images_of(video)
+        least = max(_LONG * _reach(matched, images), _LEAST_IMAGES / images_apart)
+        if options.links != "auto" or len(images) >= least:
+            loop += _spread_images(takes, matched, video, images_apart)
+    between: list[int] = []
+    if takes.num_takes > 1:
+        between = _spread_over_videos(takes, matched, images_apart)
+        between += range(takes.images_of(len(takes.videos)).start, len(takes.take))
+    return Plan(chosen, around, loop, between)
+
+
+def thorough_plan(plan: Plan, takes: Takes) -> Plan:
+    """The plan with all of SIFT's features in fewer images, for what few links connect."""
+    firsts = [takes.images_of(video).start for video in range(len(takes.videos) + 1)]
+    between: list[int] = []
+    for first, last in pairwise([*firsts, len(takes.take)]):
+        own = [image for image in plan.between if first <= image < last]
+        between += own[:: max(1, -(-len(own) // _MOST_THOROUGH))]
+    return replace(plan, between=between, effort="full")
+
+
+def _spread_over_videos(takes: Takes, matched: MatchedImages, images_apart: float) -> list[int]:
+    """`_spread_images` of every video."""
+    return [
+        image
+        for video in range(len(takes.videos))
+        for image in _spread_images(takes, matched, video, images_apart)
+    ]
+
+
+def _spread_images(
+    takes: Takes, matched: MatchedImages, video: int, images_apart: float
+) -> list[int]:
+    """Images of a video at such a distance that tracks reach over several of them."""
+    images = takes.images_of(video)
+    least = round(_LEAST_STEP / images_apart)
+    step = max(1, least, round(_LOOP_SHARE * _reach(matched, images)))
+    if takes.num_takes > 1:
+        step = min(step, max(1, len(images) // _LEAST_LOOP_IMAGES))
+    return list(images[step // 2 :: step])
+
+
+def _reach(matched: MatchedImages, images: range) -> int:
+    """The span in images that the tracks of half of the images of a video reach."""
+    reach = np.ones(len(images), dtype=np.int64)
+    for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
+        if i in images and len(geometry.inlier_matches):
+            reach[i - images.start] = max(reach[i - images.start], j - i)
+    # The last third of the images may reach the end of the video.
+    return max(1, int(np.median(reach[: max(1, 2 * len(reach) // 3)])))
+
+
+# --- Matching the features of the planned pictures.
+
+
+@dataclass(frozen=True)
+class Links:
+    """Verified matches of features.
+
+    Attributes:
+        pairs: int32 [m, 2] indices of images, first < second, ascending.
+        geometries: the two-view geometry of each pair; its inliers are indices of features.
+    """
+
+    pairs: NDArray[np.int32]
+    geometries: list[TwoViewGeometry]
+
+    def joined(self, other: Links) -> Links:
+        """These links and those of other pairs."""
+        pairs = np.concatenate([self.pairs, other.pairs])
+        geometries = [*self.geometries, *other.geometries]
+        order = np.lexsort((pairs[:, 1], pairs[:, 0])).tolist()
+        return Links(pairs[order], [geometries[k] for k in order])
 
 
 def _link(
     plan: Plan,
     takes: Takes,
     matched: MatchedImages,
-    cameras: Sequence[Any],
+    cameras: Sequence[pycolmap.Camera],
     features: dict[int, Features],
     *,
-    options: MatchOptions,
-    progress: Progress,
+    verify: VerifyOptions,
+    options: LinkOptions,
+    context: RunContext,
 ) -> LinkedImages:
     """Link the images of a plan by their features, see `link_images`."""
-    gaps = plan.gaps
 
     def matched_pairs(pairs: set[tuple[int, int]]) -> Links:
-        return match_pairs(
-            np.array(sorted(pairs), dtype=np.int32).reshape(-1, 2),
-            features,
-            cameras=cameras,
-            verify=options.verify,
-            run=options.run,
-            progress=progress,
-        )
+        ordered = np.array(sorted(pairs), dtype=np.int32).reshape(-1, 2)
+        return match_pairs(ordered, features, cameras, verify, context)
 
-    gap_pairs = {(i, j) for images in plan.around for i in images for j in images if i < j}
-    revisits = revisit_pairs(takes, matched, plan.key, features, options) - gap_pairs
-    between = pairs_between(plan.between, features, takes, options)
-    place = places_of(sorted({*plan.key, *plan.between}), takes)
-    photos = set(range(takes.images_of(len(takes.videos)).start, len(takes.take)))
-    tried = gap_pairs | revisits | between
-    links = supported_links(matched_pairs(tried), revisits | between, place, photos)
+    across = {(i, j) for images in plan.around for i in images for j in images if i < j}
+    loops = _loop_pairs(takes, matched, plan.loop, features, options, seed=context.seed) - across
+    between = _pairs_between(plan.between, features, takes, options, seed=context.seed)
+    tried = across | loops | between
+    links = _supported(
+        matched_pairs(tried), loops | between, sorted({*plan.loop, *plan.between}), takes
+    )
     found = {tuple(pair) for pair in links.pairs.tolist()}
-    beside = pairs_beside(links, plan.between, takes) - tried
+    beside = _pairs_beside(links, plan.between, takes) - tried
     if beside:
         links = links.joined(matched_pairs(beside))
-    broken = broken_gaps(gaps, links, matched, cameras)
-    merged = merge_links(matched, links, features, broken)
-    same = same_videos(links, features, cameras, takes)
+    contradicted = contradicted_gaps(plan.gaps, links, matched, cameras)
+    merged = merge_links(matched, links, features, contradicted)
     report = LinkReport(
         num_images=len(plan.wanted),
-        looked_again=bool(plan.key),
+        looked_again=bool(plan.loop),
         num_tried=len(tried | beside),
         num_links=len(links.pairs),
-        num_revisits=len(revisits & found),
+        num_revisits=len(loops & found),
         num_between=len(between & found),
-        same_videos=tuple((takes.videos[a], takes.videos[b]) for a, b in same),
-        **_gap_report(gaps, broken, merged, takes),
-        **_take_report(merged, takes),
+        gaps=_gaps_after_linking(plan.gaps, contradicted, merged, takes),
+        same_videos=_same_videos(links, features, cameras, takes),
     )
-    frames = takes.images.frames
-    tracks = links_as_tracks(links, features, frames, takes.num_frames, _largest(cameras))
-    return LinkedImages(merged, tracks, report)
+    tracks = links_as_tracks(
+        links, features, takes.images.frames, takes.num_frames, _largest_size(cameras)
+    )
+    return LinkedImages(merged, tracks, _with_parts(report, merged, takes))
 
 
-def _gap_report(
-    gaps: NDArray[np.int64], broken: Sequence[int], merged: MatchedImages, takes: Takes
-) -> dict[str, Any]:
-    """The attributes of `LinkReport` that are about gaps."""
-    frames = takes.images.frames
-    group = connected_images(merged)
+def extract_features(
+    wanted: list[int],
+    pictures: Pictures,
+    cameras: Sequence[pycolmap.Camera],
+    masks: Sequence[Mask | None],
+    options: LinkOptions,
+    *,
+    effort: Literal["light", "full"],
+    context: RunContext,
+) -> dict[int, Features]:
+    """Features of the pictures of images outside masked pixels, in pixels of the images."""
+    extractor = FeatureExtractor(options.max_link_features, effort)
+    found: dict[int, Features] = {}
+    for image, picture in pictures(wanted):
+        features = masked_features(extractor.extract(picture), picture, masks[image])
+        width, height = int(cameras[image].width), int(cameras[image].height)
+        scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
+        found[image] = replace(features, xy=features.xy * scale)
+        context.progress("links", len(found), len(wanted))
+    return found
 
-    def between(which: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        return tuple((int(frames[g]), int(frames[g + 1])) for g in which)
 
-    every = gaps.tolist()
+def _loop_pairs(
+    takes: Takes,
+    matched: MatchedImages,
+    loop: list[int],
+    features: dict[int, Features],
+    options: LinkOptions,
+    *,
+    seed: int,
+) -> set[tuple[int, int]]:
+    """Pairs of images of one video that look alike and that tracks do not connect."""
+    pairs: set[tuple[int, int]] = set()
+    for video in range(len(takes.videos)):
+        images = takes.images_of(video)
+        present = [image for image in loop if image in images and image in features]
+        if len(present) < 2:
+            continue
+        index = np.array(present)
+        similar = similar_images(
+            [features[i] for i in present],
+            np.abs(index[:, None] - index) > _reach(matched, images),
+            options.link_candidates,
+            seed=seed,
+        )
+        pairs |= {(present[a], present[b]) for a, b in similar.tolist()}
+    return pairs
+
+
+def _pairs_between(
+    images: Sequence[int],
+    features: dict[int, Features],
+    takes: Takes,
+    options: LinkOptions,
+    *,
+    seed: int,
+) -> set[tuple[int, int]]:
+    """Pairs of images of different videos or photos: all if these are few, else similar ones."""
+    present = np.array([image for image in images if image in features], dtype=np.int64)
+    if len(present) < 2:
+        return set()
+    take = takes.take[present]
+    allowed = take[:, None] != take
+    pairs = np.argwhere(np.triu(allowed)).tolist()
+    if len(pairs) > _MOST_OF_ALL:
+        pairs = similar_images(
+            [features[i] for i in present.tolist()], allowed, options.link_candidates, seed=seed
+        ).tolist()
+    return {(int(present[a]), int(present[b])) for a, b in pairs}
+
+
+def _pairs_beside(links: Links, images: Sequence[int], takes: Takes) -> set[tuple[int, int]]:
+    """Pairs of neighbours in a video that are both linked to other videos.
+
+    A feature that is linked to a single image of another video would have no depth there.
+    """
+    take = takes.take
+    between = [pair for pair in links.pairs.tolist() if take[pair[0]] != take[pair[1]]]
+    linked = {image for pair in between for image in pair}
+    there = [image for image in images if image in linked]
     return {
-        "weak_gaps": between(every),
-        "broken_gaps": between(broken),
-        "doubtful_gaps": between([gap for gap in every if _is_doubtful(gap, merged, takes)]),
-        "open_gaps": between([gap for gap in every if group[gap] != group[gap + 1]]),
+        (a, b)
+        for index, a in enumerate(there)
+        for b in there[index + 1 : index + 1 + _NEIGHBOURS]
+        if take[a] == take[b]
     }
 
 
-def _take_report(merged: MatchedImages, takes: Takes) -> dict[str, Any]:
-    """The attributes of `LinkReport` that are about several videos and photos."""
+def match_pairs(
+    pairs: NDArray[np.int32],
+    features: dict[int, Features],
+    cameras: Sequence[pycolmap.Camera],
+    verify: VerifyOptions,
+    context: RunContext,
+) -> Links:
+    """Match the features of image pairs and keep what agrees with a rigid scene.
+
+    Pairs with an image that has no entry in `features` are left out.
+    """
+    nothing = np.empty((0, 2), np.float32)
+    xy = [features[i].xy if i in features else nothing for i in range(len(cameras))]
+    # Verification uses neither frames nor tracks.
+    views = [ImageKeypoints(0, own, np.arange(len(own), dtype=np.int64)) for own in xy]
+    there = [i in features and j in features for i, j in pairs.tolist()]
+    pairs = pairs[np.array(there, dtype=np.bool_)]
+    matches = []
+    with one_blas_thread():
+        for i, j in pairs.tolist():
+            matches.append(match_features(features[i], features[j]))
+            context.progress("link matches", len(matches), len(pairs))
+    options = replace(verify, min_num_inliers=max(verify.min_num_inliers, _MIN_GAP_INLIERS))
+    geometries = verify_pairs(
+        views,
+        pairs,
+        matches,
+        cameras,
+        options,
+        num_threads=context.num_threads,
+        seed=context.seed,
+    )
+    kept = [k for k, g in enumerate(geometries) if len(g.inlier_matches) > 0]
+    return Links(pairs[kept], [geometries[k] for k in kept])
+
+
+def _supported(
+    links: Links, loops: set[tuple[int, int]], images: Sequence[int], takes: Takes
+) -> Links:
+    """The links without loops that no neighbouring loop confirms.
+
+    Args:
+        links: the links.
+        loops: pairs of images that close a loop or connect videos.
+        images: the images of these, ascending; those near each other in the list see nearly the
+            same.
+        takes: the video of each image. Photos have no neighbours: a third image that is linked to
+            both confirms theirs.
+    """
+    place = {image: k + _APART * int(takes.take[image]) for k, image in enumerate(images)}
+    photos = set(range(takes.images_of(len(takes.videos)).start, len(takes.take)))
+    pairs = [(i, j) for i, j in links.pairs.tolist()]
+    sure = {
+        (i, j)
+        for (i, j), g in zip(pairs, links.geometries, strict=True)
+        if (i, j) in loops and len(g.inlier_matches) >= _MIN_LOOP_INLIERS
+    }
+    places = {(place[i], place[j]) for i, j in sure}
+    around = range(-_SUPPORT_REACH, _SUPPORT_REACH + 1)
+    linked: dict[int, set[int]] = {}
+    for i, j in sure:
+        linked.setdefault(i, set()).add(j)
+        linked.setdefault(j, set()).add(i)
+
+    def is_supported(i: int, j: int) -> bool:
+        a, b = place[i], place[j]
+        beside = ((a + da, b + db) in places for da in around for db in around if da or db)
+        return any(beside) or bool({i, j} & photos and linked[i] & linked[j])
+
+    supported = {pair for pair in sure if is_supported(*pair)}
+    kept = [k for k, pair in enumerate(pairs) if pair not in loops or pair in supported]
+    return Links(links.pairs[kept], [links.geometries[k] for k in kept])
+
+
+# --- What the links show of gaps and videos.
+
+
+def contradicted_gaps(
+    gaps: NDArray[np.int64],
+    links: Links,
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+) -> list[int]:
+    """Gaps whose motion the pictures contradict or do not confirm."""
+    of_pair = {pair: k for k, pair in enumerate(map(tuple, matched.pairs.tolist()))}
+    contradicted = []
+    for gap in gaps.tolist():
+        num_matches = num_agreeing = 0
+        crossing = np.flatnonzero((links.pairs[:, 0] <= gap) & (links.pairs[:, 1] > gap))
+        for k in crossing.tolist():
+            i, j = links.pairs[k].tolist()
+            if (i, j) not in of_pair:
+                continue
+            matches = matched.matches[of_pair[i, j]]
+            num_matches += len(matches)
+            agrees = agreeing_matches(
+                links.geometries[k],
+                matched.keypoints[i].xy[matches[:, 0]],
+                matched.keypoints[j].xy[matches[:, 1]],
+                (cameras[i], cameras[j]),
+                max_error=_MAX_ERROR,
+            )
+            num_agreeing += int(np.count_nonzero(agrees))
+        if num_agreeing < _MIN_AGREEING * num_matches or num_matches == 0:
+            contradicted.append(gap)
+    return contradicted
+
+
+def _gaps_after_linking(
+    gaps: NDArray[np.int64], contradicted: Sequence[int], merged: MatchedImages, takes: Takes
+) -> tuple[Gap, ...]:
+    """The gaps of a plan with their reasons."""
+    group = connected_images(merged)
+    take = takes.take[merged.pairs]
+    found = []
+    for gap in gaps.tolist():
+        reasons: list[GapReason] = ["low inter share"]
+        crossing = (merged.pairs[:, 0] <= gap) & (merged.pairs[:, 1] > gap)
+        crossing &= take[:, 0] == take[:, 1]
+        inliers = [len(merged.geometries[k].inlier_matches) for k in np.flatnonzero(crossing)]
+        if max(inliers, default=0) < _SURE_INLIERS:
+            reasons.append("few tracks")
+        if gap in contradicted:
+            reasons.append("contradicted")
+        if group[gap] != group[gap + 1]:
+            reasons.append("no overlap")
+        names, frames = takes.images.names, takes.images.frames
+        between = int(frames[gap]), int(frames[gap + 1])
+        found.append(Gap(names[gap], names[gap + 1], tuple(reasons), between))
+    return tuple(found)
+
+
+def _same_videos(
+    links: Links,
+    features: dict[int, Features],
+    cameras: Sequence[pycolmap.Camera],
+    takes: Takes,
+) -> tuple[tuple[str, str], ...]:
+    """Pairs of videos that show the same pictures, as encodings of one video do."""
+    alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
+        pair = int(takes.take[i]), int(takes.take[j])
+        if pair[0] == pair[1] or max(pair) >= len(takes.videos):
+            continue
+        a, b = geometry.inlier_matches.T
+        scale = cameras[i].width / cameras[j].width
+        apart = np.hypot(*(features[i].xy[a] - features[j].xy[b] * scale).T)
+        if np.median(apart) <= _SAME_PLACE:
+            alike.setdefault(pair, []).append((i, j))
+    num_examined = np.bincount(takes.take[sorted(features)], minlength=takes.num_takes)
+    found = []
+    for pair, images in sorted(alike.items()):
+        num_same = [len(set(own)) for own in zip(*images, strict=True)]
+        share = max(same / num_examined[take] for same, take in zip(num_same, pair, strict=True))
+        if min(num_same) >= _FEWEST_SAME and share >= _SAME_SHARE:
+            found.append((takes.videos[pair[0]], takes.videos[pair[1]]))
+    return tuple(found)
+
+
+def _with_parts(report: LinkReport, merged: MatchedImages, takes: Takes) -> LinkReport:
+    """The report with what is connected of several videos and photos."""
     if takes.num_takes == 1:
-        return {}
+        return report
     num_videos = len(takes.videos)
-    groups = groups_of_takes(merged, takes)
+    groups = _connected_takes(merged, takes)
     parts = [tuple(takes.videos[take] for take in g if take < num_videos) for g in groups]
     parts = [part for part in parts if part]
-    alone = [take for g in groups if min(g) >= num_videos for take in g]
+    alone = sorted(take for g in groups if min(g) >= num_videos for take in g)
     first = takes.first_frame.tolist()
-    return {
-        "videos": tuple(zip(takes.videos, first, strict=False)) if num_videos > 1 else (),
-        "parts": tuple(parts) if len(parts) > 1 else (),
-        "unlinked_photos": tuple(
-            takes.images.names[takes.images_of(take).start] for take in sorted(alone)
+    return replace(
+        report,
+        videos=tuple(zip(takes.videos, first, strict=False)) if num_videos > 1 else (),
+        parts=tuple(parts) if len(parts) > 1 else (),
+        unlinked_photos=tuple(takes.images.names[takes.images_of(take).start] for take in alone),
+    )
+
+
+def _connected_takes(matched: MatchedImages, takes: Takes) -> list[list[int]]:
+    """The videos and photos that pairs of images connect, largest group of images first."""
+    count = takes.num_takes
+    # A take and a component of images are connected if they have an image in common.
+    edges = np.column_stack([takes.take, count + connected_images(matched)])
+    label = connected_components(count + len(takes.take), edges)[:count]
+    parts = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+    size = np.bincount(takes.take, minlength=count)
+    return sorted(parts, key=lambda part: (-int(size[part].sum()), part))
+
+
+def _largest_size(cameras: Sequence[pycolmap.Camera]) -> tuple[int, int]:
+    """(width, height) that holds the pictures of all cameras."""
+    return max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
+
+
+# --- Merging the links with the matches of tracks.
+
+
+def merge_links(
+    matched: MatchedImages,
+    links: Links,
+    features: dict[int, Features],
+    contradicted: Sequence[int],
+) -> MatchedImages:
+    """Add linked features and their matches; leave out motion across contradicted gaps."""
+    used: dict[int, set[int]] = {}
+    for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
+        used.setdefault(i, set()).update(geometry.inlier_matches[:, 0].tolist())
+        used.setdefault(j, set()).update(geometry.inlier_matches[:, 1].tolist())
+    num_tracks = max((int(k.track.max()) + 1 for k in matched.keypoints if k.track.size), default=0)
+    keypoints = list(matched.keypoints)
+    place: dict[int, NDArray[np.int64]] = {}
+    for image, indices in used.items():
+        keypoints[image], place[image] = _with_features(
+            keypoints[image], features[image].xy, sorted(indices), num_tracks
+        )
+        num_tracks += len(indices)
+    rows: dict[tuple[int, int], tuple[NDArray[np.uint32], TwoViewGeometry]] = {}
+    gap = np.array(contradicted, dtype=np.int64)
+    for k, (i, j) in enumerate(matched.pairs.tolist()):
+        if not np.any((i <= gap) & (gap < j)):
+            rows[i, j] = matched.matches[k], matched.geometries[k]
+    for k, (i, j) in enumerate(links.pairs.tolist()):
+        geometry = links.geometries[k]
+        inliers = np.column_stack(
+            [place[i][geometry.inlier_matches[:, 0]], place[j][geometry.inlier_matches[:, 1]]]
+        ).astype(np.uint32)
+        own = replace(geometry, inlier_matches=inliers)
+        if (i, j) in rows:
+            rows[i, j] = _both(*rows[i, j], inliers, own)
+        else:
+            rows[i, j] = inliers, own
+    order = sorted(rows)
+    return replace(
+        matched,
+        keypoints=keypoints,
+        pairs=np.array(order, dtype=np.int32).reshape(-1, 2),
+        matches=[rows[pair][0] for pair in order],
+        geometries=[rows[pair][1] for pair in order],
+    )
+
+
+def _with_features(
+    keypoints: ImageKeypoints, xy: NDArray[np.float32], indices: list[int], first_track: int
+) -> tuple[ImageKeypoints, NDArray[np.int64]]:
+    """Add some features to keypoints; also return the index of each feature, -1 if not added.
+
+    A feature that lies on a track's keypoint joins it; the nearest if there are several.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
+
+    place = np.full(len(xy), -1, dtype=np.int64)
+    taken: dict[int, tuple[float, int]] = {}
+    if len(keypoints.xy):
+        distance, nearest = cKDTree(keypoints.xy).query(xy[indices])
+        for index, d, k in zip(indices, distance.tolist(), nearest.tolist(), strict=True):
+            if d <= _JOIN_DISTANCE and d < taken.get(k, (np.inf, 0))[0]:
+                taken[k] = d, index
+    for k, (_, index) in taken.items():
+        place[index] = k
+    new = [index for index in indices if place[index] < 0]
+    place[new] = len(keypoints.xy) + np.arange(len(new))
+    return (
+        replace(
+            keypoints,
+            xy=np.concatenate([keypoints.xy, xy[new]]).astype(np.float32),
+            track=np.concatenate([keypoints.track, first_track + np.arange(len(new))]),
         ),
-    }
+        place,
+    )
 
 
-def _is_doubtful(gap: int, matched: MatchedImages, takes: Takes) -> bool:
-    """Whether no pair of images across a gap has the inliers that a mapper is sure of."""
-    take = takes.take[matched.pairs]
-    crossing = (matched.pairs[:, 0] <= gap) & (matched.pairs[:, 1] > gap)
-    crossing &= take[:, 0] == take[:, 1]
-    inliers = [len(matched.geometries[k].inlier_matches) for k in np.flatnonzero(crossing)]
-    return max(inliers, default=0) < _SURE_INLIERS
+def _both(
+    matches: NDArray[np.uint32],
+    geometry: TwoViewGeometry,
+    link_matches: NDArray[np.uint32],
+    link: TwoViewGeometry,
+) -> tuple[NDArray[np.uint32], TwoViewGeometry]:
+    """A pair's matches along tracks and by its link, with the geometry that has more inliers."""
+
+    def joined(a: NDArray[np.uint32], b: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        # A keypoint has one match in an image; that of its track goes first.
+        free = ~np.isin(b[:, 0], a[:, 0]) & ~np.isin(b[:, 1], a[:, 1])
+        return np.concatenate([a, b[free]])
+
+    leading = geometry if len(geometry.inlier_matches) >= len(link.inlier_matches) else link
+    if geometry.config == TwoViewConfig.DEGENERATE:
+        leading = link
+    inliers = joined(geometry.inlier_matches, link.inlier_matches)
+    return joined(matches, link_matches), replace(leading, inlier_matches=inliers)
+
+
+def links_as_tracks(
+    links: Links,
+    features: dict[int, Features],
+    frames: NDArray[np.int32],
+    num_frames: int,
+    size: tuple[int, int],
+) -> Tracks:
+    """The links as tracks: connected features, without those seen twice in a frame."""
+    images = sorted(features)
+    counts = [len(features[i].xy) for i in images]
+    first = dict(zip(images, np.concatenate([[0], np.cumsum(counts)])[:-1].tolist(), strict=True))
+    total = int(sum(counts))
+    ends = [
+        geometry.inlier_matches.astype(np.int64) + np.array([first[i], first[j]])
+        for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True)
+    ]
+    if not ends:
+        return Tracks.empty(num_frames, size)
+    label = connected_components(total, np.concatenate(ends))
+    frame = np.repeat(frames[images], counts)
+    size_of = np.bincount(label, minlength=label.max() + 1)
+    order = np.lexsort((frame, label))
+    order = order[size_of[label[order]] >= 2]
+    twice = (np.diff(label[order]) == 0) & (np.diff(frame[order]) == 0)
+    ambiguous = np.unique(label[order][1:][twice])
+    order = order[~np.isin(label[order], ambiguous)]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(label[order]) != 0]))
+    if len(order) == 0:
+        return Tracks.empty(num_frames, size)
+    xy = np.concatenate([features[i].xy for i in images])
+    return Tracks(
+        num_frames=num_frames,
+        width=size[0],
+        height=size[1],
+        offsets=np.append(starts, len(order)).astype(np.int64),
+        frame=frame[order].astype(np.int32),
+        xy=xy[order].astype(np.float32),
+        sigma=np.full(len(order), _SIGMA, np.float32),
+        confirmed=np.ones(len(order), np.bool_),
+    )

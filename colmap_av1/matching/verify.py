@@ -31,7 +31,7 @@ from colmap_av1.matching.two_view_models import (
     spread_points,
     transfer_inliers,
 )
-from colmap_av1.options import RunOptions, VerifyOptions
+from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.digests import seed_of
@@ -54,7 +54,8 @@ def verify_pairs(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
     options: VerifyOptions | None = None,
     *,
-    run: RunOptions | None = None,
+    num_threads: int | None = None,
+    seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[TwoViewGeometry]:
     """Find the two-view geometry of every pair.
@@ -70,18 +71,18 @@ def verify_pairs(
         cameras: the camera of all images, or one for each; images share a camera where theirs
             are the same object.
         options: thresholds and effort; the defaults of VerifyOptions if None.
-        run: threads and seed; the defaults of RunOptions if None.
+        num_threads: threads; None: one per CPU that the process may use.
+        seed: seed of the robust estimators.
         progress: called with the number of pairs done so far, from this thread, in order.
 
     Returns:
         One geometry per pair, in the order of `pairs`. The result depends on the input and
-        `run.seed` only, not on the number of threads.
+        `seed` only, not on the number of threads.
 
     Raises:
         OptionError: a camera is not a perspective one.
     """
     options = options if options is not None else VerifyOptions()
-    run = run if run is not None else RunOptions()
     if isinstance(cameras, pycolmap.Camera):
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):
@@ -93,15 +94,14 @@ def verify_pairs(
         found = views.get(image)
         if found is None:
             # Where two threads make it at a time, both make the same.
-            seed = seed_of(run.seed, image)
-            found = views[image] = _view(keypoints[image], cameras[image], seed)
+            found = views[image] = _view(keypoints[image], cameras[image], seed_of(seed, image))
         return found
 
     def verify(some: range) -> list[TwoViewGeometry]:
         found = []
         for index in some:
             i, j = pairs[index].tolist()
-            search = Search(options, seed_of(run.seed, i, j))
+            search = Search(options, seed_of(seed, i, j))
             found.append(_verify_pair(view(i), view(j), matches[index], search))
         return found
 
@@ -109,7 +109,7 @@ def verify_pairs(
     # Threads that hand over every pair by itself would be busy with that.
     indices = range(len(pairs))
     parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
-    num_threads = min(threads_or_cpus(run.num_threads), 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
+    num_threads = min(threads_or_cpus(num_threads), 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
     # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:

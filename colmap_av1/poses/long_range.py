@@ -18,10 +18,11 @@ from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, masked_features, quick_features
-from colmap_av1.matching.link_matches import match_pairs
+from colmap_av1.matching.links import match_pairs
 from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
-from colmap_av1.options import RunOptions, VerifyOptions
+from colmap_av1.options import VerifyOptions
 from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 
 _Floats = NDArray[np.float64]
 _Image = NDArray[np.uint8]
@@ -148,10 +149,9 @@ class FarViewCheck:
         found = match_pairs(
             self._pairs,
             features,
-            cameras=self._cameras,
-            verify=VerifyOptions(),
-            run=RunOptions(),
-            progress=no_progress,
+            self._cameras,
+            VerifyOptions(),
+            RunContext(),
         )
         names, errors = [], []
         for (i, j), geometry in zip(found.pairs.tolist(), found.geometries, strict=True):

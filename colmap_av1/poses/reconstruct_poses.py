@@ -128,7 +128,8 @@ def pose_stage(
     if mapper == "auto":
         mapper = "incremental" if found_before.guessed else "global"
     links = found_before.links
-    hangs = links.num_between or links.broken_gaps or links.doubtful_gaps
+    reasons = {reason for gap in links.gaps for reason in gap.reasons}
+    hangs = links.num_between or reasons & {"contradicted", "few tracks"}
     start_tracks = None if hangs else _START_TRACKS
     tolerance = _TOLERANCE if mapping.adjust and not hangs else None
     how = MapOptions(

@@ -20,7 +20,7 @@ from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
-from colmap_av1.matching.link_plan import images_to_link
+from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
 from colmap_av1.options import (
     MatchOptions,

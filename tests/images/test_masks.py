@@ -122,7 +122,7 @@ def test_masks_of_frames_end_tracks_between_images(
     assert crossing[0] == []
     assert crossing[1] != []
     report = match(tmp_path / "c.db", clip, options=options(tmp_path / "masks", every=2))
-    assert report.links.weak_gaps == ((6, 8),)
+    assert report.links.frames_of_gaps() == [(6, 8)]
 
 
 def test_masks_of_other_pixels_change_nothing(

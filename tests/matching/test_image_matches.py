@@ -11,17 +11,13 @@ from walking_camera import FOCAL, HEIGHT, NUM_FRAMES, WIDTH, seen_by, walk
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.matching.image_matches import (
-    PairedImages,
-    pair_images,
-    shared_focal_length,
-    verify_images,
-)
-from colmap_av1.options import CameraOptions, MatchOptions, PairOptions, TrackOptions
+from colmap_av1.matching.cameras import shared_focal_length
+from colmap_av1.matching.image_matches import PairedImages, pair_images, verify_images
+from colmap_av1.options import CameraOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.run_context import RunContext
 
-OPTIONS = MatchOptions()
+CONTEXT = RunContext()
 KNOWN = CameraOptions("SIMPLE_RADIAL", CAMERA_PARAMS)
 
 
@@ -30,10 +26,14 @@ def every_frame(tracks: Tracks) -> ChosenImages:
     return ChosenImages([f"{i}.png" for i in frames], frames)
 
 
-def paired(tracks: Tracks, options: MatchOptions = OPTIONS) -> PairedImages:
-    chosen = every_frame(tracks)
+def paired(tracks: Tracks, **options: int) -> PairedImages:
     return pair_images(
-        Path("walk.mp4"), tracks, chosen, options, clock=Clock(), progress=no_progress
+        Path("walk.mp4"),
+        tracks,
+        every_frame(tracks),
+        PairOptions(min_matches=options.get("min_matches", 15)),
+        min_length=options.get("min_length", 3),
+        context=CONTEXT,
     )
 
 
@@ -44,42 +44,37 @@ def approach() -> Tracks:
     return seen_by(ahead, np.zeros((NUM_FRAMES, 3)))
 
 
-def test_pairs_are_told_as_they_are_matched() -> None:
+def test_pairs_match_keypoints_of_the_same_track() -> None:
     tracks = make_scene(num_frames=6).tracks
-    told: list[tuple[str, int, int | None]] = []
-    clock = Clock()
+    steps: list[tuple[str, int, int | None]] = []
     found = pair_images(
         Path("walk.mp4"),
         tracks,
         every_frame(tracks),
-        replace(OPTIONS, pairs=PairOptions(offsets=(1,), growth=1.0)),
-        clock=clock,
-        progress=lambda *words: told.append(words),
+        PairOptions(offsets=(1,), growth=1.0),
+        min_length=3,
+        context=replace(CONTEXT, progress=lambda *step: steps.append(step)),
     )
     assert found.pairs.tolist() == [[i, i + 1] for i in range(5)]
-    assert told == [("pairs", i, 5) for i in range(1, 6)]
-    assert list(clock.seconds) == ["pairs"]
+    assert steps[-1] == ("pairs", 5, 5)
     for (i, j), matches in zip(found.pairs, found.matches, strict=True):
         a, b = (found.keypoints[k].track[matches[:, s]] for s, k in enumerate((i, j)))
         np.testing.assert_array_equal(a, b)
 
 
-def test_too_little_to_match_says_what_to_do() -> None:
+def test_too_little_to_match_is_an_error() -> None:
     tracks = make_scene(num_frames=5).tracks
-    longer = replace(OPTIONS, tracks=TrackOptions(min_length=6))
-    with pytest.raises(VideoError, match=r"walk\.mp4: tracks are of 6 frames or more, .* has 5"):
-        paired(tracks, longer)
-    many = replace(OPTIONS, pairs=PairOptions(min_matches=10**4))
-    with pytest.raises(VideoError, match=r"no two images share 10000 tracks, .* --reencode 1"):
-        paired(tracks, many)
+    with pytest.raises(VideoError, match="--min_length"):
+        paired(tracks, min_length=6)
+    with pytest.raises(VideoError, match="10000 tracks"):
+        paired(tracks, min_matches=10**4)
 
 
 def test_a_focal_length_is_looked_for_where_none_is_given() -> None:
     images = paired(walk())
 
     def found(camera: CameraOptions) -> float | None:
-        options = replace(OPTIONS, camera=camera)
-        return shared_focal_length(images, (WIDTH, HEIGHT), 1.0, options, clock=Clock())
+        return shared_focal_length(images, (WIDTH, HEIGHT), 1.0, camera, CONTEXT)
 
     assert found(CameraOptions()) == pytest.approx(FOCAL, rel=0.1)
     assert found(CameraOptions("PINHOLE")) == found(CameraOptions())
@@ -91,13 +86,8 @@ def test_forward_motion_is_told_by_pairs_with_known_intrinsics() -> None:
     aside, ahead = paired(make_scene(num_frames=8).tracks), paired(approach())
 
     def is_forward(images: PairedImages, camera: CameraOptions) -> bool:
-        return verify_images(
-            images,
-            make_camera(camera, WIDTH, HEIGHT),
-            OPTIONS,
-            clock=Clock(),
-            progress=no_progress,
-        ).forward_motion
+        of_all = make_camera(camera, WIDTH, HEIGHT)
+        return verify_images(images, of_all, VerifyOptions(), CONTEXT).forward_motion
 
     assert is_forward(ahead, KNOWN)
     assert not is_forward(aside, KNOWN)

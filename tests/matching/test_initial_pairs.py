@@ -11,7 +11,7 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import bar_false_starts
+from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
@@ -62,9 +62,9 @@ def verified(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> Tw
     return verify_pairs(keypoints, PAIR, [matches], CAMERA)[0]
 
 
-def barred(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
+def demoted(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
     matched = MatchedImages(keypoints, PAIR, [geometry.inlier_matches], [geometry], False)
-    return bar_false_starts(matched, [CAMERA] * 2, clock=Clock()).geometries[0]
+    return demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock()).geometries[0]
 
 
 def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> float:
@@ -87,7 +87,7 @@ def test_parallax_taken_for_noise() -> None:
         geometry = verified(keypoints, matches)
         assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
         assert angle_of_mapper(keypoints, geometry.inlier_matches) > 1.4 * ANGLE
-        found = barred(keypoints, geometry)
+        found = demoted(keypoints, geometry)
         own, kept = (set(map(tuple, g.inlier_matches.tolist())) for g in (geometry, found))
         assert kept < own
         assert len(kept) == len(found.inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
@@ -103,14 +103,14 @@ def test_plane() -> None:
         geometry = verified(keypoints, matches)
         assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
         assert 10 < angle_of_mapper(keypoints, geometry.inlier_matches) < 18
-        assert barred(keypoints, geometry) is geometry
+        assert demoted(keypoints, geometry) is geometry
 
 
 @pytest.mark.parametrize("count", [0, 15, 49])
 def test_pairs_that_cannot_start(count: int) -> None:
     keypoints, matches = two_views(1.2, np.random.default_rng(2), count)
     geometry = verified(keypoints, matches)
-    assert barred(keypoints, geometry) is geometry
+    assert demoted(keypoints, geometry) is geometry
 
 
 def test_unknown_focal_length() -> None:
@@ -118,7 +118,7 @@ def test_unknown_focal_length() -> None:
     unknown = make_camera(CameraOptions(), WIDTH, HEIGHT)
     geometry = verify_pairs(keypoints, PAIR, [matches], unknown)[0]
     assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
-    assert barred(keypoints, geometry) is geometry
+    assert demoted(keypoints, geometry) is geometry
 
 
 def test_camera_adjusted_far_off() -> None:
@@ -128,7 +128,7 @@ def test_camera_adjusted_far_off() -> None:
     """
     rng = np.random.default_rng(4)
     better = turned_views(0.25, 0.3, 400, rng)
-    num_barred = 0
+    num_demoted = 0
     for _ in range(10):
         narrow = turned_views(0.1, 0.02, 120, rng)
         pairs = [narrow, better]
@@ -137,11 +137,13 @@ def test_camera_adjusted_far_off() -> None:
         assert len(geometries[0].inlier_matches) >= INITIAL_MIN_INLIERS
         both = np.array([[0, 1], [2, 3]], dtype=np.int32)
         matched = MatchedImages(keypoints, both, [m for _, m in pairs], geometries, False)
-        found = bar_false_starts(matched, [GUESSED] * 4, clock=Clock()).geometries
+        found = demote_bad_initial_pairs(matched, [GUESSED] * 4, Clock()).geometries
         assert found[1] is geometries[1]
         if found[0] is not geometries[0]:
-            num_barred += 1
+            num_demoted += 1
             assert len(found[0].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
         alone = replace(matched, keypoints=narrow[0], pairs=PAIR, geometries=geometries[:1])
-        assert bar_false_starts(alone, [GUESSED] * 2, clock=Clock()).geometries[0] is geometries[0]
-    assert num_barred > 5
+        assert (
+            demote_bad_initial_pairs(alone, [GUESSED] * 2, Clock()).geometries[0] is geometries[0]
+        )
+    assert num_demoted > 5

@@ -9,7 +9,7 @@ from conftest import Ffmpeg
 
 from colmap_av1 import CameraOptions, MatchOptions, match
 from colmap_av1.database.reading import read_cameras
-from colmap_av1.matching.image_matches import Shape, _focal_length_of
+from colmap_av1.matching.cameras import Shape, _initial_focal_length
 from colmap_av1.video.metadata.lens import doubtful_lens, said_focal_length
 
 TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
@@ -42,17 +42,17 @@ def test_a_focal_length_of_no_lens_is_told(
     assert not camera.has_prior_focal_length
 
 
-def test_which_of_both_wins() -> None:
+def test_tracks_go_before_the_container() -> None:
     shape = Shape((1920, 1080), 1.0, 1300.0)
-    assert _focal_length_of(1400.0, shape, None) == (1400.0, [])
-    used, (told,) = _focal_length_of(1800.0, shape, None)
+    assert _initial_focal_length(1400.0, shape, None) == (1400.0, [])
+    used, (warning,) = _initial_focal_length(1800.0, shape, None)
     assert used == 1800.0
-    assert told.startswith("the focal length is 1800 px by the tracks, 1300 px by the container:")
-    used, (told,) = _focal_length_of(None, shape, "RADIAL")
+    assert "1300 px by the container" in warning
+    used, (warning,) = _initial_focal_length(None, shape, "RADIAL")
     assert used == 1300.0
-    assert "it starts from 1300 px, which the container says" in told
-    assert _focal_length_of(None, shape, "OPENCV_FISHEYE") == (None, [])
-    assert _focal_length_of(None, Shape((1920, 1080), 1.0, None), None) == (None, [])
+    assert "1300 px" in warning
+    assert _initial_focal_length(None, shape, "OPENCV_FISHEYE") == (None, [])
+    assert _initial_focal_length(None, Shape((1920, 1080), 1.0, None), None) == (None, [])
 
 
 def test_where_motion_does_not_determine_it(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:

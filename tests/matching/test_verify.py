@@ -18,7 +18,7 @@ from colmap_av1.matching import verify
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
-from colmap_av1.options import CameraOptions, RunOptions, VerifyOptions
+from colmap_av1.options import CameraOptions, VerifyOptions
 
 SHELFBOX = SHARED / "sequences/shelfbox/frames"
 UNKNOWN = make_camera(CameraOptions(), WIDTH, HEIGHT)
@@ -181,8 +181,8 @@ def test_bytes_do_not_depend_on_threads_but_on_the_seed(monkeypatch: pytest.Monk
     keypoints, pairs, matches = prepare(make_scene(num_points=2500), outliers=0.2)
 
     def run(**changes: int) -> list[tuple[object, ...]]:
-        options, how = VerifyOptions(max_samples=100), RunOptions(**changes)
-        found = verify_pairs(keypoints, pairs, matches, UNKNOWN, options, run=how)
+        options = VerifyOptions(max_samples=100)
+        found = verify_pairs(keypoints, pairs, matches, UNKNOWN, options, **changes)
         return [as_bytes(g) for g in found]
 
     assert run(num_threads=1) == run(num_threads=3)

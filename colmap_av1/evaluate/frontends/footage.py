@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,10 @@ from colmap_av1.options import (
     PairOptions,
 )
 from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import least_length
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.unchanged import unchanged
@@ -180,16 +182,16 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     tracks, chosen = prepared.tracks, prepared.chosen
     seen = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
+    context = RunContext.of(options.run)
     try:
         paired = pair_images(
             video,
             select_tracks(seen, DensityOptions(preset="sparse")),
             chosen,
-            replace(options, pairs=PairOptions(offsets=(1,), growth=1.0)),
-            clock=Clock(),
-            progress=no_progress,
+            PairOptions(offsets=(1,), growth=1.0),
+            min_length=least_length(options.tracks),
+            context=context,
         )
     except VideoError:  # no two images share tracks; other front-ends may still match them
         return False
-    matched = verify_images(paired, camera, options, clock=Clock(), progress=no_progress)
-    return matched.forward_motion
+    return verify_images(paired, camera, options.verify, context).forward_motion

@@ -1,0 +1,205 @@
+"""Cameras of images that have none yet: given, or estimated from tracks and metadata."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from colmap_av1.geometry.cameras import (
+    check_pixel_aspect,
+    is_fisheye,
+    is_nearly_pinhole,
+    make_camera,
+)
+from colmap_av1.images.photos import Photo
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.focal import estimate_focal_length
+from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.options import CameraOptions
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.video.facts import Video
+from colmap_av1.video.metadata.lens import said_focal_length
+
+# Focal lengths of tracks and of containers that differ by less than this factor agree.
+_AGREE = 1.2
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Size and lens of the pictures of a video.
+
+    Attributes:
+        size: (width, height) of the images in pixels.
+        pixel_aspect: width of a pixel over its height.
+        focal_length: in pixel heights, from the container; None if it has none.
+    """
+
+    size: tuple[int, int]
+    pixel_aspect: float
+    focal_length: float | None
+
+
+def shape_of(video: Video, size: tuple[int, int], pixel_aspect: float) -> Shape:
+    """The shape of images of a video."""
+    return Shape(size, pixel_aspect, said_focal_length(video.tags, size, pixel_aspect))
+
+
+@dataclass(frozen=True)
+class ImageCameras:
+    """Cameras of images.
+
+    Attributes:
+        of_images: the camera of each image; images share a camera if it is the same object.
+        focal_length: estimated focal length of the first video, in pixel heights; None if it was
+            not estimated.
+        warnings: warnings about the cameras.
+    """
+
+    of_images: list[pycolmap.Camera]
+    focal_length: float | None
+    warnings: tuple[str, ...]
+
+
+def new_cameras(
+    paired: PairedImages,
+    takes: Takes,
+    shapes: Sequence[Shape],
+    photos: Sequence[Photo],
+    options: CameraOptions,
+    *,
+    context: RunContext,
+) -> ImageCameras:
+    """Make a camera for each video, and for the photos of each camera and size.
+
+    Given intrinsics apply to videos. Otherwise the focal length of a video is estimated from its
+    tracks, or taken from its container; that of photos is taken from EXIF.
+
+    Args:
+        paired: the images.
+        takes: the video of each image, or its photo.
+        shapes: the shape of each video.
+        photos: the photos.
+        options: camera model, given intrinsics and sharing.
+        context: its clock gets the stage "focal length".
+
+    Raises:
+        OptionError: given parameters do not fit the pixels.
+    """
+    of_images: dict[int, pycolmap.Camera] = {}
+    estimated: list[float | None] = []
+    notes: dict[str, None] = {}
+    for shared in _takes_by_camera(len(shapes), photos, options):
+        given, aspect = options, 1.0
+        if shared[0] < len(shapes):
+            shape = shapes[shared[0]]
+            size, aspect = shape.size, shape.pixel_aspect
+            of_videos = [i for t in shared if t < len(shapes) for i in takes.images_of(t)]
+            own = _some_images(paired, of_videos)
+            focal_length = shared_focal_length(own, size, aspect, options, context)
+            estimated.append(focal_length)
+            if given.camera_params is None:
+                focal_length, words = _initial_focal_length(focal_length, shape, given.camera_model)
+                notes |= dict.fromkeys(words)
+        else:
+            photo = photos[shared[0] - len(shapes)]
+            size, focal_length = photo.size, photo.focal_length
+            given = replace(given, camera_params=None)
+        camera = make_camera(given, *size, aspect, focal_length)
+        notes |= dict.fromkeys(
+            check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
+        )
+        for image in (image for take in shared for image in takes.images_of(take)):
+            of_images[image] = copy.copy(camera) if given.single_camera is False else camera
+    in_order = [of_images[image] for image in range(len(takes.take))]
+    return ImageCameras(in_order, estimated[0], tuple(notes))
+
+
+def shared_focal_length(
+    paired: PairedImages,
+    size: tuple[int, int],
+    pixel_aspect: float,
+    options: CameraOptions,
+    context: RunContext,
+) -> float | None:
+    """Estimate the focal length of a camera with unknown intrinsics from tracks.
+
+    Args:
+        paired: the images, all of one camera.
+        size: (width, height) of the images in pixels.
+        pixel_aspect: width of a pixel over its height.
+        options: camera model and given intrinsics.
+        context: its clock gets the stage "focal length".
+
+    Returns:
+        The focal length in pixel heights; None if parameters are given or the focal length is not
+        observable.
+    """
+    fisheye = is_fisheye(options.camera_model)
+    if options.camera_params is not None:
+        return None
+    if not (fisheye or is_nearly_pinhole(options.camera_model)):
+        return None
+    with context.clock.measure("focal length"):
+        return estimate_focal_length(
+            paired.keypoints,
+            paired.pairs,
+            paired.matches,
+            size,
+            pixel_aspect=pixel_aspect,
+            fisheye=fisheye,
+            seed=context.seed,
+        )
+
+
+def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
+    """Some of the images, ascending, with the pairs among them."""
+    if len(images) == len(paired.keypoints):
+        return paired
+    place = np.full(len(paired.keypoints), -1, dtype=np.int32)
+    place[list(images)] = np.arange(len(images))
+    pairs = place[paired.pairs]
+    kept = np.flatnonzero((pairs >= 0).all(axis=1))
+    return PairedImages(
+        [paired.keypoints[i] for i in images], pairs[kept], [paired.matches[k] for k in kept]
+    )
+
+
+def _initial_focal_length(
+    estimated: float | None, shape: Shape, model: str | None
+) -> tuple[float | None, list[str]]:
+    """The focal length that a camera starts from, and warnings about it.
+
+    Tracks show the focal length of the pictures themselves. The container states that of the lens,
+    but the pictures may have been cropped for stabilization.
+    """
+    stated = shape.focal_length
+    if stated is None or not is_nearly_pinhole(model):
+        return estimated, []
+    if estimated is None:
+        return stated, [
+            f"the motion does not determine the focal length: it starts from {stated:.0f} px, "
+            "which the container says"
+        ]
+    if abs(math.log(estimated / stated)) <= math.log(_AGREE):
+        return estimated, []
+    return estimated, [
+        f"the focal length is {estimated:.0f} px by the tracks, {stated:.0f} px by the container: "
+        "that of the tracks is used, as the other does not know of crops"
+    ]
+
+
+def _takes_by_camera(
+    num_videos: int, photos: Sequence[Photo], options: CameraOptions
+) -> list[list[int]]:
+    """The videos and photos of each camera."""
+    if options.single_camera:
+        return [list(range(num_videos + len(photos)))]
+    of_photos: dict[object, list[int]] = {}
+    for take, photo in enumerate(photos, start=num_videos):
+        of_photos.setdefault((photo.size, photo.camera, photo.focal_length), []).append(take)
+    return [*([video] for video in range(num_videos)), *of_photos.values()]

@@ -1,0 +1,284 @@
+"""Gaps: neighbouring images of a video that motion connects badly, and why.
+
+Before images are matched, the share of inter coded units shows where an encoder found no motion.
+After that, the number of matches across a gap shows how well it is connected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from colmap_av1.images.names import natural_order
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.image_matches import MatchedImages, used_pairs
+from colmap_av1.options import LinkOptions
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.spread import evenly_spread
+
+# Frames on either side that a frame is compared with.
+_NEIGHBOURS = 8
+# A frame has a low inter share if it is below the first value, or below the second value times the
+# median of its neighbours. Where a camera jerks or a picture is blurred, an encoder finds no motion
+# and codes the picture anew: 2 to 24 % inter units where the frames around have 45 to 95 %, or half
+# of their share where it finds what merely compresses well. Nearly all ordinary frames have more.
+# Nearly no ordinary frame is below the third value times the median.
+_LEAST_INTER_SHARE = 0.25
+_LEAST_OF_NEIGHBOURS = 0.55
+_CERTAINLY_LESS = 0.4
+# At this median share of inter units, motion is trusted. 85 % is usual; a drive has 50 to 60 %.
+_HIGH_INTER_SHARE = 0.6
+# Gaps that are probed below that.
+_NUM_PROBES = 6
+# The motion of a video needs no probes if neighbouring images have this many matches and this share
+# of inliers (medians). A drive has 2,000 and 99.8 %. Where a camera is too fast for an encoder's
+# search, there are 20 matches, or 150 with 90 % inliers.
+_RIGID_MATCHES = 300
+_RIGID_SHARE = 0.98
+# Few matches cross a gap if there are fewer than this share of the usual number. Where a camera
+# jerks it is 5 to 37 %; on clips without jerks 53 % and more, matched along motion or by SIFT.
+# Models that COLMAP's mappers bent at a jerk by 0.7 to 1 % of their extent had 5 to 25 %.
+_FEW = 0.4
+# The usual number is that of up to this many gaps before and after.
+_NEARBY = 10
+# Gaps that a warning names.
+_NUM_NAMED = 3
+
+GapReason = Literal["low inter share", "few tracks", "contradicted", "no overlap"]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Two neighbouring images of a video that motion connects badly.
+
+    Attributes:
+        before: name of the last image before the gap.
+        after: name of the first image after it.
+        reasons: why. low inter share: the encoder found little motion. contradicted: the pictures
+            contradict the motion or do not confirm it, so its matches are left out. few tracks: a
+            mapper may split the images there. no overlap: nothing connects the two images.
+        frames: the frames of both images, counted through all videos; None if not known.
+        share: matches across the gap over the usual number nearby; 1 if not measured.
+    """
+
+    before: str
+    after: str
+    reasons: tuple[GapReason, ...]
+    frames: tuple[int, int] | None = None
+    share: float = 1.0
+
+
+def low_inter_frames(
+    inter_share: NDArray[np.float32], *, certain: bool = False
+) -> NDArray[np.bool_]:
+    """Find frames whose motion is doubtful because few units are inter coded.
+
+    Args:
+        inter_share: float32 [num_frames] share of inter units of each shown frame, in display
+            order.
+        certain: leave out frames that may be ordinary.
+
+    Returns:
+        bool [num_frames]; False for the first frame, which has no motion.
+    """
+    low = np.zeros(len(inter_share), dtype=np.bool_)
+    if len(low) < 2:
+        return low
+    share = _CERTAINLY_LESS if certain else _LEAST_OF_NEIGHBOURS
+    own = inter_share[1:]
+    around = sliding_window_view(
+        np.pad(own, _NEIGHBOURS, constant_values=np.nan), 2 * _NEIGHBOURS + 1
+    )
+    usual = np.nanmedian(around, axis=1).astype(np.float64)
+    low[1:] = own < np.maximum(_LEAST_INTER_SHARE, share * usual).astype(own.dtype)
+    return low
+
+
+def low_inter_gaps(
+    inter_share: NDArray[np.float32], frames: NDArray[np.int32], *, certain: bool = False
+) -> NDArray[np.bool_]:
+    """Find gaps between images that contain a frame with a low inter share.
+
+    Args:
+        inter_share: as for `low_inter_frames`.
+        frames: int32 [num_images] display index of each image, ascending.
+        certain: as for `low_inter_frames`.
+
+    Returns:
+        bool [num_images - 1] for the gap between image i and image i + 1.
+    """
+    so_far = np.concatenate([[0], np.cumsum(low_inter_frames(inter_share, certain=certain))])
+    return np.asarray(so_far[frames[1:] + 1] > so_far[frames[:-1] + 1])
+
+
+def may_link(
+    inter_share: NDArray[np.float32],
+    frames: NDArray[np.int32],
+    tracks: Tracks,
+    links: LinkOptions,
+    min_length: int,
+) -> bool:
+    """Whether pictures are examined if no two images share enough tracks.
+
+    They may connect the images, or show why there are no tracks. A video that is shorter than
+    `min_length`, the fewest frames of a track, needs no pictures for that.
+    """
+    lacks_tracks = tracks.num_tracks == 0 and tracks.num_frames >= min_length
+    return links.links == "sift" or (
+        links.links == "auto" and (lacks_tracks or bool(low_inter_gaps(inter_share, frames).any()))
+    )
+
+
+def probed_gaps(
+    inter_share: NDArray[np.float32], low: NDArray[np.bool_], options: LinkOptions
+) -> list[int]:
+    """Gaps whose motion is compared with pictures to decide whether to trust the whole video's.
+
+    Empty if most units are inter coded. Where a camera is too fast for an encoder's search, the
+    encoder takes what compresses well, and that need not be motion.
+    """
+    if options.links == "none" or len(inter_share) < 2:
+        return []
+    if float(np.median(inter_share[1:])) >= _HIGH_INTER_SHARE:
+        return []
+    others = np.flatnonzero(~low)
+    return [int(gap) for gap in others[evenly_spread(len(others), _NUM_PROBES, rounded=True)]]
+
+
+@dataclass(frozen=True)
+class SuspectGaps:
+    """Gaps between images of all videos whose motion may be wrong.
+
+    Attributes:
+        certain: bool [num_images - 1] gaps with a low inter share.
+        maybe: bool [num_images - 1] gaps with a lowered inter share that may be ordinary.
+        probes: other gaps, that stand for all gaps of their video.
+    """
+
+    certain: NDArray[np.bool_]
+    maybe: NDArray[np.bool_]
+    probes: list[int]
+
+
+def suspect_gaps(
+    takes: Takes, matched: MatchedImages, inter_share: NDArray[np.float32], options: LinkOptions
+) -> SuspectGaps:
+    """Find the gaps whose motion may be wrong. No motion crosses from one video to another."""
+    certain = np.zeros(max(len(takes.take) - 1, 0), dtype=np.bool_)
+    maybe, probes = np.zeros_like(certain), list[int]()
+    for video in range(len(takes.videos)):
+        share = inter_share[takes.first_frame[video] : takes.first_frame[video + 1]]
+        images, frames = takes.images_of(video), takes.of_video(video).frames
+        low, own = low_inter_gaps(share, frames), slice(images.start, images.stop - 1)
+        certain[own] = low_inter_gaps(share, frames, certain=True)
+        maybe[own] = low & ~certain[own]
+        if not _is_rigid(matched, images):
+            probes += [images.start + gap for gap in probed_gaps(share, low, options)]
+    return SuspectGaps(certain, maybe, probes)
+
+
+def _is_rigid(matched: MatchedImages, images: range) -> bool:
+    """Whether the motion between neighbouring images of a video is that of a rigid scene."""
+    counts = [
+        (len(matches), len(geometry.inlier_matches))
+        for (i, j), matches, geometry in zip(
+            matched.pairs.tolist(), matched.matches, matched.geometries, strict=True
+        )
+        if i in images and j == i + 1
+    ]
+    if 2 * len(counts) < len(images):
+        return False
+    num_matches, num_inliers = np.array(counts).T
+    share = np.median(num_inliers / np.maximum(num_matches, 1))
+    return bool(np.median(num_matches) >= _RIGID_MATCHES and share >= _RIGID_SHARE)
+
+
+def few_match_gaps(
+    pairs: NDArray[np.integer],
+    num_inliers: NDArray[np.integer],
+    names: Sequence[str],
+    videos: Sequence[Hashable],
+) -> tuple[Gap, ...]:
+    """Find gaps that far fewer matches cross than the gaps before and after.
+
+    Gaps that nothing crosses are left out: there the images become separate models.
+
+    Args:
+        pairs: integers [m, 2] indices of images, of the pairs that mappers use.
+        num_inliers: integers [m] their verified matches.
+        names: names of the images; their natural order is the order in time.
+        videos: for each image what identifies its video, see `video_of`.
+    """
+    rows: dict[Hashable, list[int]] = {}
+    for i in natural_order(names):
+        rows.setdefault(videos[i], []).append(i)
+    # Videos one after the other, so that no pair of one video crosses a gap of another.
+    order = [i for own in rows.values() for i in own]
+    place, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
+    place[order] = np.arange(len(order))
+    row[order] = np.repeat(np.arange(len(rows)), [len(own) for own in rows.values()])
+    inside = row[pairs[:, 0]] == row[pairs[:, 1]]
+    ends = np.sort(place[pairs[inside]], axis=1)
+    change = np.zeros(len(names), dtype=np.int64)
+    np.add.at(change, ends[:, 0], num_inliers[inside])
+    np.subtract.at(change, ends[:, 1], num_inliers[inside])
+    across = np.cumsum(change)
+    found: list[Gap] = []
+    for own in rows.values():
+        share = _share_of_usual(across[place[own[0]] : place[own[-1]]])
+        for is_few, gaps in groupby(range(len(share)), key=lambda g: share[g] < _FEW):
+            if is_few:
+                together = list(gaps)
+                first, last = own[together[0]], own[together[-1] + 1]
+                least = float(share[together].min())
+                found.append(Gap(names[first], names[last], ("few tracks",), share=least))
+    return tuple(found)
+
+
+def _share_of_usual(across: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Matches across each gap over those across gaps nearby, on the side where these are fewer.
+
+    A gap that nothing crosses ends the comparison, as another model begins there. Its own share
+    is 1.
+    """
+    share = np.ones(len(across))
+    joined = np.flatnonzero(across)
+    for run in np.split(joined, np.flatnonzero(np.diff(joined) > 1) + 1):
+        counts = across[run]
+        for k, gap in enumerate(run.tolist()):
+            before = counts[max(0, k - _NEARBY) : k + 1].max()
+            after = counts[k : k + _NEARBY + 1].max()
+            share[gap] = counts[k] / min(before, after)
+    return share
+
+
+def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
+    """The warning about gaps that few matches cross; None if there are none."""
+    if not gaps:
+        return None
+    shown = ", ".join(f"'{gap.before}' and '{gap.after}'" for gap in gaps[:_NUM_NAMED])
+    more = len(gaps) - _NUM_NAMED
+    others = f" and at {more} more {'place' if more == 1 else 'places'}" if more > 0 else ""
+    least = min(gap.share for gap in gaps)
+    return (
+        f"few matches, down to {least:.0%} of the usual number, cross between {shown}{others}, "
+        "where the camera jerks or frames are missing: COLMAP's mappers may bend the model there "
+        "by one per cent of its extent without any other sign; run reconstruct instead, which "
+        "uses the pictures, or film more slowly"
+    )
+
+
+def matching_warnings(matched: MatchedImages, takes: Takes) -> list[str]:
+    """Warnings about gaps between images of a video that few matches cross."""
+    used, counts = used_pairs(matched)
+    gaps = few_match_gaps(
+        matched.pairs[used], counts[used], takes.images.names, takes.take.tolist()
+    )
+    warning = few_matches_warning(gaps)
+    return [warning] if warning is not None else []

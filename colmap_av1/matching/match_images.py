@@ -1,0 +1,163 @@
+"""The step from tracks to matches: pair images, choose cameras, verify, link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.images.takes import Pictures, Takes
+from colmap_av1.matching.cameras import ImageCameras
+from colmap_av1.matching.gaps import may_link
+from colmap_av1.matching.image_matches import (
+    MatchedImages,
+    PairedImages,
+    join_videos,
+    pair_images,
+    verify_images,
+)
+from colmap_av1.matching.links import LinkReport, link_images
+from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.run_context import RunContext
+
+
+@dataclass(frozen=True)
+class SelectedTracks:
+    """The tracks of a video along which its images are matched.
+
+    Attributes:
+        path: the file that messages name.
+        tracks: the selected tracks.
+        inter_share: float32 [num_frames], see `TrackedVideo`.
+    """
+
+    path: Path
+    tracks: Tracks
+    inter_share: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ImageMatchOptions:
+    """The options of matching.
+
+    Attributes:
+        pairs: which images are paired.
+        verify: how pairs are verified.
+        links: where images are linked by their pictures.
+        min_length: fewest frames of a track.
+    """
+
+    pairs: PairOptions
+    verify: VerifyOptions
+    links: LinkOptions
+    min_length: int
+
+
+@dataclass(frozen=True)
+class ImageMatches:
+    """Verified matches of all images.
+
+    Attributes:
+        cameras: the camera of each image; images share a camera if it is the same object.
+        focal_length: estimated focal length, see `ImageCameras`.
+        matched: keypoints, matches and two-view geometries, those of links included.
+        links: what linking found.
+        link_tracks: the links as tracks.
+        num_tracks: number of tracks of the videos that the images are matched along.
+        warnings: warnings about the cameras and the links.
+    """
+
+    cameras: list[pycolmap.Camera]
+    focal_length: float | None
+    matched: MatchedImages
+    links: LinkReport
+    link_tracks: Tracks
+    num_tracks: int
+    warnings: tuple[str, ...]
+
+
+def match_images(
+    takes: Takes,
+    videos: Sequence[SelectedTracks],
+    no_motion: NDArray[np.float32],
+    cameras: Callable[[PairedImages], ImageCameras],
+    pictures: Pictures,
+    *,
+    options: ImageMatchOptions,
+    context: RunContext,
+    name: str,
+    images_apart: float = 1.0,
+) -> ImageMatches:
+    """Match images along their tracks, verify the matches, and link what motion does not connect.
+
+    Args:
+        takes: the images.
+        videos: the tracks of each video.
+        no_motion: float32 [num_photos] the inter shares of the photos.
+        cameras: returns the cameras of the images, that may depend on their matches.
+        pictures: gives the pictures of images, for links.
+        options: options of pairs, verification and links.
+        context: its clock gets the stages "pairs", "verification" and "links".
+        name: what messages call the videos.
+        images_apart: number of images that each of these stands for, if they are a selection.
+
+    Raises:
+        VideoError: nothing connects any two images.
+    """
+    paired = pair_videos(takes, videos, options, context)
+    made = cameras(paired)
+    matched = verify_images(paired, made.of_images, options.verify, context)
+    linked = link_images(
+        takes,
+        matched,
+        made.of_images,
+        np.concatenate([*(video.inter_share for video in videos), no_motion]),
+        pictures,
+        pairs=options.pairs,
+        verify=options.verify,
+        links=options.links,
+        context=context,
+        name=name,
+        images_apart=images_apart,
+    )
+    return ImageMatches(
+        cameras=made.of_images,
+        focal_length=made.focal_length,
+        matched=linked.matched,
+        links=linked.report,
+        link_tracks=linked.tracks,
+        num_tracks=paired.num_tracks,
+        warnings=(*made.warnings, *linked.report.warnings),
+    )
+
+
+def pair_videos(
+    takes: Takes,
+    videos: Sequence[SelectedTracks],
+    options: ImageMatchOptions,
+    context: RunContext,
+) -> PairedImages:
+    """Match the images of each video along its tracks, see `match_images`."""
+    paired = []
+    for number, video in enumerate(videos):
+        chosen = takes.of_video(number)
+        linked_anyway = may_link(
+            video.inter_share, chosen.frames, video.tracks, options.links, options.min_length
+        )
+        paired.append(
+            pair_images(
+                video.path,
+                video.tracks,
+                chosen,
+                options.pairs,
+                min_length=options.min_length,
+                context=context,
+                needed=takes.num_takes == 1 and not linked_anyway,
+            )
+        )
+    return join_videos(paired, takes)

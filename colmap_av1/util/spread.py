@@ -1,0 +1,17 @@
+"""Indices that are evenly spread over a sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def evenly_spread(count: int, most: int, *, rounded: bool = False) -> list[int]:
+    """At most `most` indices below `count`, evenly spread, from the first to the last.
+
+    Args:
+        count: length of the sequence.
+        most: number of indices, at most.
+        rounded: round positions to the nearest index; otherwise down.
+    """
+    place = np.linspace(0, count - 1, max(min(most, count), 0))
+    return sorted(set((place.round() if rounded else place).astype(int).tolist()))

@@ -1,0 +1,116 @@
+"""Gaps between the images of a video that motion connects badly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_av1.matching.gaps import (
+    Gap,
+    few_match_gaps,
+    few_matches_warning,
+    low_inter_frames,
+    low_inter_gaps,
+)
+
+NUM_IMAGES = 30
+REACH = 6
+
+
+def chain(thin: dict[int, float]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of a video and their matches, where only shares of these cross some gaps."""
+    pairs = np.array(
+        [(i, j) for i in range(NUM_IMAGES) for j in range(i + 1, min(i + REACH, NUM_IMAGES))]
+    )
+    count = np.full(len(pairs), 1000)
+    for gap, share in thin.items():
+        across = (pairs[:, 0] <= gap) & (pairs[:, 1] > gap)
+        count[across] = np.rint(share * count[across])
+    return pairs, count
+
+
+def names_of(folder: str) -> list[str]:
+    # '9' comes after '10' in the order of letters.
+    return [f"{folder}{i}.png" for i in range(NUM_IMAGES)]
+
+
+def test_gaps_that_few_matches_cross() -> None:
+    names, rows = names_of(""), [0] * NUM_IMAGES
+    assert few_match_gaps(*chain({}), names, rows) == ()
+    assert few_match_gaps(*chain({9: 0.7}), names, rows) == ()
+    (gap,) = few_match_gaps(*chain({9: 0.1}), names, rows)
+    assert (gap.before, gap.after) == ("9.png", "10.png")
+    assert gap.share < 0.15
+    # Beside a gap that nothing crosses images become separate models, which is said elsewhere.
+    assert few_match_gaps(*chain({9: 0.0}), names, rows) == ()
+
+
+def test_a_warning_names_gaps_and_the_least_share() -> None:
+    assert few_matches_warning(()) is None
+    gaps = [
+        Gap(f"{i}.png", f"{i + 1}.png", ("few tracks",), share=0.3 - 0.05 * i) for i in range(5)
+    ]
+    warning = few_matches_warning(gaps)
+    assert warning is not None
+    assert "10%" in warning
+    assert "'0.png' and '1.png'" in warning
+    assert "2 more" in warning
+    assert "\n" not in warning
+
+
+@given(st.randoms(use_true_random=False), st.integers(8, 20))
+def test_gaps_are_those_of_each_video_in_any_order_of_images(random: object, gap: int) -> None:
+    """Images are numbered as a database happens to list them."""
+    names = names_of("a/") + names_of("b/")
+    rows = [name[0] for name in names]
+    first, second = chain({gap: 0.1}), chain({})
+    pairs = np.concatenate([first[0], second[0] + NUM_IMAGES])
+    count = np.concatenate([first[1], second[1]])
+    expected = few_match_gaps(pairs, count, names, rows)
+    assert len(expected) == 1
+    assert expected[0].before.startswith("a/")
+    order = list(range(len(names)))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    place = np.argsort(order)
+    shuffled = [names[i] for i in order]
+    found = few_match_gaps(place[pairs][:, ::-1], count, shuffled, [rows[i] for i in order])
+    assert found == expected
+
+
+def test_low_inter_frames_are_those_without_motion_among_others() -> None:
+    usual = np.full(30, 0.85, np.float32)
+    usual[0] = 0
+    assert not low_inter_frames(usual).any()
+    jerk = usual.copy()
+    jerk[12] = 0.18
+    assert np.flatnonzero(low_inter_frames(jerk)).tolist() == [12]
+    # A drive: half of the units are inter coded everywhere, a slow frame has a third.
+    drive = np.full(30, 0.5, np.float32)
+    drive[[0, 8, 20]] = 0, 0.33, 0.15
+    assert np.flatnonzero(low_inter_frames(drive)).tolist() == [20]
+    # Where the camera is always too fast, no motion is to be trusted.
+    # What only compresses well is found across a jerk, too.
+    half = np.full(40, 0.94, np.float32)
+    half[17], half[30] = 0.47, 0.62
+    assert np.flatnonzero(low_inter_frames(half)).tolist() == [17]
+    assert low_inter_frames(np.full(9, 0.04, np.float32))[1:].all()
+
+
+@pytest.mark.parametrize("num_frames", [0, 1, 2, 9, 50])
+def test_inter_share_is_compared_with_the_median_of_frames_around(num_frames: int) -> None:
+    share = np.random.default_rng(num_frames).random(num_frames, np.float32)
+    usual = [np.median(share[max(1, i - 8) : i + 9]) for i in range(1, num_frames)]
+    for certain, least in ((False, 0.55), (True, 0.4)):
+        low = [own < max(0.25, least * x) for own, x in zip(share[1:], usual, strict=True)]
+        found = low_inter_frames(share, certain=certain)
+        assert found.tolist() == [False, *low][:num_frames]
+
+
+def test_low_inter_gaps_lie_between_images() -> None:
+    share = np.full(20, 0.9, np.float32)
+    share[[7, 13]] = 0.05
+    gaps = low_inter_gaps(share, np.array([0, 3, 6, 9, 12, 15, 18]))
+    assert np.flatnonzero(gaps).tolist() == [2, 4]
