@@ -21,26 +21,25 @@ from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_chosen
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
-from colmap_av1.matching.image_matches import (
-    MatchedImages,
-    PairedImages,
-    new_cameras,
-    pair_images,
-    pairs_of_takes,
-    shape_of,
-    verify_images,
+from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
+from colmap_av1.matching.gaps import matching_warnings
+from colmap_av1.matching.image_matches import MatchedImages, PairedImages
+from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
+from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.match_images import (
+    ImageMatches,
+    ImageMatchOptions,
+    SelectedTracks,
+    match_images,
 )
-from colmap_av1.matching.initial_pairs import bar_false_starts
-from colmap_av1.matching.link_merging import about_thin_gaps
-from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.shutter.correct import without_shutter
-from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.unchanged import unchanged
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -206,10 +205,9 @@ def match(
             clock=clock,
             progress=progress,
         )
-        cameras, linked = _match_images(
-            images, database, listed, options, clock=clock, progress=progress
-        )
-        written = bar_false_starts(linked.matched, cameras.of_images, clock=clock)
+        context = RunContext.of(options.run, clock, progress)
+        found = _match_images(images, database, listed, options, context)
+        written = demote_bad_initial_pairs(found.matched, found.cameras, clock)
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -222,15 +220,15 @@ def match(
     with clock.measure("database"):
         positions = image_positions(images.takes, inputs.videos, inputs.photos)
         write_matched_images(
-            *(database, images.takes.images.names, cameras.new, written),
+            *(database, images.takes.images.names, None if listed else found.cameras, written),
             on_existing=options.on_existing,
             places=positions.places,
         )
     videos = images.videos
     notes = inputs.with_names([own.tracked.warnings for own in videos])
-    notes += (*positions.warnings, *cameras.warnings, *linked.report.warnings)
+    notes += (*positions.warnings, *found.warnings)
     if options.on_existing != "append":  # what a database holds already may join the images, too
-        notes += about_thin_gaps(written, images.takes)
+        notes += matching_warnings(written, images.takes)
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),
@@ -242,10 +240,10 @@ def match(
         num_coded_frames=sum(own.tracked.num_coded_frames for own in videos),
         num_written_images=num_written,
         masked=images.takes.masked,
-        focal_length=cameras.focal_length,
+        focal_length=found.focal_length,
         read_outs=tuple(own.tracked.read_out for own in videos),
         seconds=clock.seconds,
-        links=linked.report,
+        links=found.links,
         warnings=(*inputs.warnings, *notes, *blurred),
         **_figures([own.tracks for own in videos], written),
     )
@@ -304,41 +302,39 @@ def _match_images(
     database: Path,
     listed: Sequence[DatabaseImage],
     options: MatchOptions,
-    *,
-    clock: Clock,
-    progress: Progress,
-) -> tuple[_Cameras, LinkedImages]:
-    """Match the images along their tracks, verify that, and link what motion does not connect."""
+    context: RunContext,
+) -> ImageMatches:
+    """Match the images; their cameras are those of the database where it lists the images."""
     takes, videos = images.takes, images.videos
-    shares = [own.tracked.inter_share for own in videos]
-    paired = []
-    for own, share in zip(videos, shares, strict=True):
-        linked_anyway = may_link(share, own.chosen.frames, own.tracks, options)
-        paired.append(
-            pair_images(
-                *(own.source.pictures.path, own.tracks, own.chosen, options),
-                needed=takes.num_takes == 1 and not linked_anyway,
-                clock=clock,
-                progress=progress,
-            )
+
+    def cameras(paired: PairedImages) -> ImageCameras:
+        shapes = [shape_of(v.source.pictures, v.size, v.pixel_aspect) for v in videos]
+        if listed:
+            return _listed_cameras(database, listed, takes, shapes)
+        return new_cameras(
+            paired, takes, shapes, images.inputs.photos, options.camera, context=context
         )
-    together = pairs_of_takes(paired, takes)
-    cameras = _cameras(images, together, database, listed, options, clock=clock)
-    matched = verify_images(together, cameras.of_images, options, clock=clock, progress=progress)
-    linked = link_images(
-        *(takes, matched, cameras.of_images, np.concatenate([*shares, images.inputs.no_motion])),
+
+    return match_images(
+        takes,
+        [
+            SelectedTracks(own.source.pictures.path, own.tracks, own.tracked.inter_share)
+            for own in videos
+        ],
+        images.inputs.no_motion,
+        cameras,
         pictures_of(
             takes,
             [ShownVideo(own.source.pictures, own.display) for own in videos],
             [photo.path for photo in images.inputs.photos],
             options,
         ),
+        options=ImageMatchOptions(
+            options.pairs, options.verify, options.links, least_length(options.tracks)
+        ),
+        context=context,
         name=images.inputs.name,
-        options=options,
-        clock=clock,
-        progress=progress,
     )
-    return cameras, linked
 
 
 def _with_chosen_tracks(
@@ -403,43 +399,15 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     return listed
 
 
-@dataclass(frozen=True)
-class _Cameras:
-    """The cameras of the images.
-
-    Attributes:
-        of_images: the camera of each image; images share one where it is the same object.
-        new: the same for a database that lists no images; None for one that does.
-        focal_length: the estimated one, see `MatchReport`.
-        warnings: what the user should know of them.
-    """
-
-    of_images: list[Any]
-    new: list[Any] | None
-    focal_length: float | None
-    warnings: list[str]
-
-
-def _cameras(
-    images: _Images,
-    paired: PairedImages,
-    database: Path,
-    listed: Sequence[DatabaseImage],
-    options: MatchOptions,
-    *,
-    clock: Clock,
-) -> _Cameras:
-    """Those of the database where it lists the images, else new ones."""
-    takes = images.takes
-    shapes = [shape_of(v.source.pictures, v.size, v.pixel_aspect) for v in images.videos]
-    if not listed:
-        made = new_cameras(paired, takes, shapes, images.inputs.photos, options, clock=clock)
-        return _Cameras(made.of_images, made.of_images, made.focal_length, made.warnings)
+def _listed_cameras(
+    database: Path, listed: Sequence[DatabaseImage], takes: Takes, shapes: Sequence[Shape]
+) -> ImageCameras:
+    """The cameras of a database that lists the images."""
     of_images = listed_cameras(database, listed, takes.images.names)
     notes: dict[str, None] = {}
     for video, shape in enumerate(shapes):
-        camera, aspect = of_images[takes.images_of(video).start], shape.pixel_aspect
+        camera = of_images[takes.images_of(video).start]
         notes |= dict.fromkeys(
-            check_pixel_aspect(camera, aspect, "import the images with one of these")
+            check_pixel_aspect(camera, shape.pixel_aspect, "import the images with one of these")
         )
-    return _Cameras(of_images, None, None, list(notes))
+    return ImageCameras(of_images, None, tuple(notes))

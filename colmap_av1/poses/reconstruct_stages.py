@@ -8,25 +8,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.images.takes import Takes
-from colmap_av1.matching.image_matches import (
-    NewCameras,
-    PairedImages,
-    new_cameras,
-    pair_images,
-    pairs_of_takes,
-    shape_of,
-    verify_images,
+from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
+from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.match_images import (
+    ImageMatches,
+    ImageMatchOptions,
+    SelectedTracks,
+    match_images,
+    pair_videos,
 )
-from colmap_av1.matching.links import LinkedImages, LinkReport, link_images
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
-from colmap_av1.matching.weak_gaps import may_link
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
@@ -37,7 +35,8 @@ from colmap_av1.poses.reconstruct_tracks import (
     tracks_of,
 )
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
@@ -72,11 +71,12 @@ class MatchesResult:
     keypoints_per_image: float
 
 
-def _write_links(folder: Path, linked: LinkedImages) -> None:
+def _write_links(folder: Path, found: ImageMatches) -> None:
     folder.mkdir()
-    broken = np.array([before for before, _ in linked.report.broken_gaps], np.int32)
+    contradicted = found.links.frames_of_gaps("contradicted")
+    broken = np.array([before for before, _ in contradicted], np.int32)
     with (folder / _LINKS).open("wb") as file:
-        np.savez(file, **vars(linked.tracks), broken=broken)
+        np.savez(file, **vars(found.link_tracks), broken=broken)
 
 
 def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
@@ -113,26 +113,22 @@ def match_stage(
         with clock.measure("pairs"):
             index = _key_images(run, videos, takes)
         keyed = takes.some(index)
-        paired = _paired_images(run, videos, keyed)
-        made = _cameras(run, videos, takes, index, paired)
-        cameras = made.of_images
-        apart = len(takes.take) / len(keyed.take)
-        linked = _match_images(run, videos, paired, cameras, keyed, images_apart=apart)
-        matched = linked.matched
+        found = _match_images(run, videos, takes, index)
+        cameras, matched = found.cameras, found.matched
         with clock.measure("database"):
             write_matched_images(
                 *(partial / "database.db", keyed.images.names, cameras, matched),
                 places=run.positions.places[index] if run.positions is not None else None,
             )
-        _write_links(partial / run.stages.name, linked)
+        _write_links(partial / run.stages.name, found)
         of_videos = cameras[: keyed.images_of(len(videos)).start]
         configs = [geometry.config for geometry in matched.geometries]
         num_keypoints = sum(len(k.xy) for k in matched.keypoints)
         return MatchesResult(
-            links=linked.report,
-            link_warnings=(*made.warnings, *linked.report.warnings),
+            links=found.links,
+            link_warnings=found.warnings,
             key_images=tuple(index),
-            num_pose_tracks=len(np.unique(np.concatenate([k.track for k in paired.keypoints]))),
+            num_pose_tracks=found.num_tracks,
             guessed=not all(camera.has_prior_focal_length for camera in of_videos),
             forward_motion=matched.forward_motion,
             num_pairs=len(configs),
@@ -184,67 +180,51 @@ def _pose_density(run: Run) -> DensityOptions:
     )
 
 
-def _paired_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> PairedImages:
-    """Some images of all takes, matched along a spread selection of tracks for poses."""
-    options, density = run.options.match, _pose_density(run)
-    paired = []
+def _selected_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[SelectedTracks]:
+    """A spread selection of the tracks of each video, for poses."""
+    density = _pose_density(run)
+    selected = []
     for video, own in enumerate(videos):
-        chosen = takes.of_video(video)
         with run.clock.measure("pairs"):
-            sparse = select_tracks(pose_tracks(run, own.tracks).keep_frames(chosen.frames), density)
-        linked_anyway = may_link(own.inter_share, chosen.frames, sparse, options)
-        paired.append(
-            pair_images(
-                *(run.sources[video].pictures.path, sparse, chosen, options),
-                needed=takes.num_takes == 1 and not linked_anyway,
-                clock=run.clock,
-                progress=run.progress,
-            )
-        )
-    return pairs_of_takes(paired, takes)
-
-
-def _cameras(
-    run: Run,
-    videos: Sequence[VideoTracks],
-    takes: Takes,
-    index: Sequence[int],
-    paired: PairedImages,
-) -> NewCameras:
-    """The cameras of the key images, that are some of all images.
-
-    What is estimated comes from all images: a few that lie far apart mislead.
-    """
-    options, photos = run.options.match, run.inputs.photos
-    opened = [source.pictures for source in run.sources]
-    shapes = [shape_of(v, v.picture_size, v.display.pixel_aspect) for v in opened]
-    if options.camera.camera_params is not None or len(index) == len(takes.take):
-        keyed = takes.some(index)
-        return new_cameras(paired, keyed, shapes, photos, options, clock=run.clock)
-    every = _paired_images(run, videos, takes)
-    made = new_cameras(every, takes, shapes, photos, options, clock=run.clock)
-    return replace(made, of_images=[made.of_images[i] for i in index])
+            tracks = pose_tracks(run, own.tracks).keep_frames(takes.of_video(video).frames)
+            sparse = select_tracks(tracks, density)
+        path = run.sources[video].pictures.path
+        selected.append(SelectedTracks(path, sparse, own.inter_share))
+    return selected
 
 
 def _match_images(
-    run: Run,
-    videos: Sequence[VideoTracks],
-    paired: PairedImages,
-    cameras: Sequence[Any],
-    takes: Takes,
-    *,
-    images_apart: float,
-) -> LinkedImages:
-    """The images matched along some tracks of each video and by links."""
-    options, clock, progress = run.options.match, run.clock, run.progress
-    matched = verify_images(paired, cameras, options, clock=clock, progress=progress)
-    shares = [own.inter_share for own in videos]
-    return link_images(
-        *(takes, matched, cameras, np.concatenate([*shares, run.inputs.no_motion])),
-        run.pictures(takes),
+    run: Run, videos: Sequence[VideoTracks], takes: Takes, index: Sequence[int]
+) -> ImageMatches:
+    """Match the key images, that are some of all images.
+
+    Cameras are estimated from all images: a few that lie far apart mislead.
+    """
+    options = run.options.match
+    context = RunContext.of(options.run, run.clock, run.progress)
+    groups = ImageMatchOptions(
+        options.pairs, options.verify, options.links, least_length(options.tracks)
+    )
+    keyed = takes.some(index)
+
+    def cameras(paired: PairedImages) -> ImageCameras:
+        opened = [source.pictures for source in run.sources]
+        shapes = [shape_of(v, v.picture_size, v.display.pixel_aspect) for v in opened]
+        photos = run.inputs.photos
+        if options.camera.camera_params is not None or len(index) == len(takes.take):
+            return new_cameras(paired, keyed, shapes, photos, options.camera, context=context)
+        every = pair_videos(takes, _selected_tracks(run, videos, takes), groups, context)
+        made = new_cameras(every, takes, shapes, photos, options.camera, context=context)
+        return replace(made, of_images=[made.of_images[i] for i in index])
+
+    return match_images(
+        keyed,
+        _selected_tracks(run, videos, keyed),
+        run.inputs.no_motion,
+        cameras,
+        run.pictures(keyed),
+        options=groups,
+        context=context,
         name=run.inputs.name,
-        images_apart=images_apart,
-        options=options,
-        clock=clock,
-        progress=progress,
+        images_apart=len(takes.take) / len(keyed.take),
     )
