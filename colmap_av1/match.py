@@ -342,7 +342,11 @@ def _with_chosen_tracks(
 ) -> PreparedImages:
     """The images with the tracks that are matched, in place of all tracks of the video."""
     tracks, read_out = without_shutter(
-        *(prepared.tracks, prepared.display, prepared.source.pictures.frame_rate, options, clock)
+        prepared.tracks,
+        prepared.display,
+        prepared.source.pictures.frame_rate,
+        options.camera,
+        RunContext.of(options.run, clock),
     )
     with clock.measure("pairs"):
         tracks = select_tracks(tracks.keep_frames(prepared.chosen.frames), options.density)

@@ -29,7 +29,6 @@ from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model
-from colmap_av1.geometry.coverage import evenly_spread
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import (
     CameraOptions,
@@ -43,6 +42,7 @@ from colmap_av1.options import (
     TriangulateOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
+from colmap_av1.util.spread import evenly_spread
 from colmap_av1.video.unchanged import file_state
 
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())

@@ -19,7 +19,7 @@ from colmap_av1.database.reading import (
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
-from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
+from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.poses.seams import images_in_time
 
 _Floats = NDArray[np.float64]
@@ -147,5 +147,4 @@ def _fitting(
 
 def _errors(a: _Floats, b: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
     """Sampson distance of matched rays [2, n] by the poses of two images, float64 [n]."""
-    algebraic, squared = epipolar_terms(essential_of_poses(a, b), xa, xb)
-    return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-24)))
+    return sampson_error(essential_of_poses(a, b), xa, xb)

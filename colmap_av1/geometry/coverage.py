@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_av1 import _core
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
@@ -110,11 +111,6 @@ def views_of(
         PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
         for image, mask in zip(images, masks, strict=True)
     ]
-
-
-def evenly_spread(count: int, most: int) -> list[int]:
-    """Indices from 0 to before `count`, evenly spread, `most` at most."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(most, count))})
 
 
 def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:

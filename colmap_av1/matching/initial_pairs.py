@@ -20,8 +20,9 @@ from colmap_av1.matching.initial_adjustment import (
 )
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_ANGLE, INITIAL_MIN_INLIERS
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
-from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
+from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.util.progress import Clock
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
@@ -94,13 +95,11 @@ def _denied(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
 
 def _error(E: _Floats, x: Sequence[_Floats]) -> float:
     """Sampson error that most of the matches keep to, in focal lengths."""
-    algebraic, gradient = epipolar_terms(E, x[0], x[1])
-    error = np.abs(algebraic) / np.sqrt(np.maximum(gradient, np.finfo(np.float64).tiny))
-    return float(np.quantile(error, _SHARE))
+    return float(np.quantile(sampson_error(E, x[0], x[1]), _SHARE))
 
 
 def _thinned(geometry: TwoViewGeometry) -> TwoViewGeometry:
     """The geometry with some of its inliers, spread over all of them."""
     count = len(geometry.inlier_matches)
-    chosen = np.linspace(0, count - 1, _START - 1).round().astype(np.intp)
+    chosen = evenly_spread(count, _START - 1, rounded=True)
     return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])

@@ -31,6 +31,8 @@ _REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
 # What keeps sums of points that coincide or lie on a line apart from 0.
 _ROUNDING = 1e-12
 _IDENTITY = np.eye(3)
+# Keeps a division by a gradient of 0 finite.
+_SMALLEST = np.finfo(np.float64).tiny
 # A model with this share of the matches is not searched any longer.
 _TRUSTED_SHARE = 0.95
 # A search finds no more inliers than a quick fit by this share of the matches, and hardly ever
@@ -232,7 +234,7 @@ def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
     if model.matrix is None:
         return math.inf
     algebraic, gradient = epipolar_terms(model.matrix, points.spread_a, points.spread_b)
-    squared = algebraic**2 / np.maximum(gradient, np.finfo(np.float64).tiny)
+    squared = algebraic**2 / np.maximum(gradient, _SMALLEST)
     return float(np.log1p(squared).sum())
 
 
@@ -328,6 +330,12 @@ def epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> 
     """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
     algebraic, gradient = epipolar_terms(F, xa, xb)
     return np.asarray(algebraic**2 <= max_error**2 * gradient)
+
+
+def sampson_error(F: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
+    """Sampson error of matches [2, n] (Hartley and Zisserman, eq. 11.9), float64 [n]."""
+    algebraic, gradient = epipolar_terms(F, xa, xb)
+    return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(gradient, _SMALLEST)))
 
 
 def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floats]:

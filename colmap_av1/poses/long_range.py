@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
-from colmap_av1.geometry.coverage import evenly_spread
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, masked_features, quick_features
 from colmap_av1.matching.links import match_pairs
-from colmap_av1.matching.two_view_models import epipolar_terms, essential_of_poses
+from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.options import VerifyOptions
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 _Image = NDArray[np.uint8]
@@ -176,9 +176,8 @@ class FarViewCheck:
             for camera, xy in ((self._cameras[i], xa), (self._cameras[j], xb))
         ]
         focal = np.mean([self._cameras[k].mean_focal_length() for k in (i, j)])
-        algebraic, squared = epipolar_terms(essential_of_poses(a, b), *normalised)
         # Per image: each has a part of the distance.
-        distance = np.sqrt(2) * focal * np.abs(algebraic) / np.sqrt(np.maximum(squared, 1e-12))
+        distance = np.sqrt(2) * focal * sampson_error(essential_of_poses(a, b), *normalised)
         # A distorted position may have no ray.
         return np.asarray(distance[np.isfinite(distance)])
 

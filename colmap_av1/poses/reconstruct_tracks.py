@@ -12,7 +12,6 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.geometry.coverage import evenly_spread
 from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.inputs import Inputs
@@ -39,6 +38,8 @@ from colmap_av1.tracks.video_tracks import (
 )
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import FileState, check_unchanged
 
@@ -155,7 +156,11 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     def make(partial: Path) -> TracksResult:
         tracked, chosen, is_long = _track_and_choose(run, video, options, partial)
         tracks, read_out = without_shutter(
-            tracked.tracks, shown.display, shown.frame_rate, options, clock
+            tracked.tracks,
+            shown.display,
+            shown.frame_rate,
+            options.camera,
+            RunContext.of(options.run, clock),
         )
         # Of a long video no other frame is of use from here on.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks

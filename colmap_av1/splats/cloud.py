@@ -12,11 +12,11 @@ from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_ro
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
-    evenly_spread,
     nearest_depth,
     squares_of_cells,
     without_gaps,
 )
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]

@@ -19,10 +19,11 @@ from colmap_av1.geometry.colmap_model import (
     read_model,
     take_rows,
 )
-from colmap_av1.geometry.coverage import PosedCamera, evenly_spread
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import distance_uncertainty
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.outputs import check_files, made_by
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 

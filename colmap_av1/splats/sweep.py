@@ -19,7 +19,6 @@ from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, no_poin
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
-    evenly_spread,
     nearest_in_cells,
     squares_of_cells,
 )
@@ -33,6 +32,7 @@ from colmap_av1.splats.ray_search import (
     smaller,
     sweep_image,
 )
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]

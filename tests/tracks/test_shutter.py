@@ -28,7 +28,7 @@ from colmap_av1.matching.shutter.estimate import ReadOut, estimate_read_out
 from colmap_av1.tracks.shutter import correct_tracks, velocities
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource
-from colmap_av1.util.progress import Clock
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import Display
 
 WIDTH, HEIGHT, FOCAL, NUM_FRAMES, RATE = 640, 480, 560.0, 60, 30.0
@@ -129,7 +129,7 @@ def test_what_is_asked_for() -> None:
     tracks = tracks_of(0.45)
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
         options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
-        moved, read_out = without_shutter(tracks, Display(), RATE, options, Clock())
+        moved, read_out = without_shutter(tracks, Display(), RATE, options.camera, RunContext())
         assert read_out == pytest.approx(found)
         assert (moved is tracks) == (found is None)
     options = MatchOptions(
@@ -139,9 +139,9 @@ def test_what_is_asked_for() -> None:
             camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
         )
     )
-    _, read_out = without_shutter(tracks, Display(), RATE, options, Clock())
+    _, read_out = without_shutter(tracks, Display(), RATE, options.camera, RunContext())
     assert read_out == pytest.approx(15, abs=1.5)
-    assert without_shutter(tracks, Display(), None, options, Clock()) == (tracks, None)
+    assert without_shutter(tracks, Display(), None, options.camera, RunContext()) == (tracks, None)
     for wrong in ("soon", "101", "nan"):
         with pytest.raises(OptionError, match="give estimate, none, or milliseconds"):
             CameraOptions(rolling_shutter=wrong)

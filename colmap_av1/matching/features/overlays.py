@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.matching.features.sift import Features, alike
+from colmap_av1.util.spread import evenly_spread
 
 # Images that each is held against, spread over all.
 _NUM_COMPARED = 8
@@ -66,8 +67,7 @@ def _cells(xy: NDArray[np.float32], side: float, columns: int) -> NDArray[np.int
 def _shares_in_place(features: Sequence[Features], width: int) -> list[NDArray[np.float64]]:
     """Of each feature of some images, the share of other images that show it in its place."""
     num_images = len(features)
-    spread = np.linspace(0, num_images - 1, min(_NUM_COMPARED, num_images))
-    compared = np.unique(spread.astype(np.int64)).tolist()
+    compared = evenly_spread(num_images, _NUM_COMPARED)
     image = np.repeat(compared, [len(features[k].xy) for k in compared])
     descriptors = np.concatenate([features[k].descriptors for k in compared])
     columns = int(width / _STILL) + 3  # none is beside the first of the next row

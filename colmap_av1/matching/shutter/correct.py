@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from colmap_av1.geometry.cameras import is_nearly_pinhole, is_square
 from colmap_av1.matching.shutter.estimate import estimate_read_out
-from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.options import CameraOptions
 from colmap_av1.options.camera import DEFAULT_MODEL, camera_of_model, parse_camera_params
 from colmap_av1.tracks.shutter import correct_tracks
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import Clock
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import Display
 
 
@@ -16,8 +16,8 @@ def without_shutter(
     tracks: Tracks,
     display: Display,
     rate: float | None,
-    options: MatchOptions,
-    clock: Clock,
+    camera: CameraOptions,
+    context: RunContext,
 ) -> tuple[Tracks, float | None]:
     """The tracks where they are in the middle of each picture's read-out, and the time of that.
 
@@ -25,22 +25,22 @@ def without_shutter(
         tracks: tracks of all frames, of which neighbours say how they move.
         display: how the pictures are shown that they are of.
         rate: frames per second; None, where it is unknown, leaves them as they are.
-        options: those of the camera and the seed are used.
-        clock: gets the stage "shutter".
+        camera: the read-out time, the model and given intrinsics.
+        context: its clock gets the stage "shutter".
 
     Returns:
         The tracks, and the read-out time in milliseconds; None where nothing is corrected.
     """
-    wanted = options.camera.rolling_shutter
+    wanted = camera.rolling_shutter
     if wanted == "none" or rate is None or tracks.num_frames == 0:
         return tracks, None
-    with clock.measure("shutter"):
+    with context.clock.measure("shutter"):
         down = rows_down(display, (tracks.width, tracks.height))
         if wanted != "estimate":
             read_out = float(wanted) / 1000 * rate
-        elif is_nearly_pinhole(options.camera.camera_model) and is_square(display.pixel_aspect):
-            focal = _focal_length(options.camera)
-            found = estimate_read_out(tracks, down, focal, options.run.seed)
+        elif is_nearly_pinhole(camera.camera_model) and is_square(display.pixel_aspect):
+            focal = _focal_length(camera)
+            found = estimate_read_out(tracks, down, focal, context.seed)
             if isinstance(found, str):
                 return tracks, None
             read_out = found.frames

@@ -12,6 +12,7 @@ from colmap_av1.matching.focal import estimate_focal_length, lowest, pose_loss
 from colmap_av1.matching.pairs import ImageKeypoints, pair_matches
 from colmap_av1.tracks.shutter import at_middle_of_read_out, row_places, velocities
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
@@ -112,7 +113,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
     number = tracks.track
     views = []
     last = tracks.num_frames - 1 - _GAPS[0]
-    for first in np.unique(np.linspace(0, max(last, 0), _NUM_PAIRS).astype(int)).tolist():
+    for first in evenly_spread(max(last, 0) + 1, _NUM_PAIRS):
         found = None
         for gap in _GAPS:
             if first + gap >= tracks.num_frames:
@@ -131,13 +132,15 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
         if found is None:
             continue
         some = rng.permutation(len(found[0]))[:_NUM_MATCHES]
-        rows = found[0][some], found[1][some]
+        a, b = found[0][some], found[1][some]
         views.append(
             _View(
-                *(
-                    tuple(values[r].astype(np.float64) - shift for r in rows)  # type: ignore[arg-type]
-                    for values, shift in ((tracks.xy, centre), (speed, 0), (place, 0))
-                )
+                (
+                    tracks.xy[a].astype(np.float64) - centre,
+                    tracks.xy[b].astype(np.float64) - centre,
+                ),
+                (speed[a].astype(np.float64), speed[b].astype(np.float64)),
+                (place[a].astype(np.float64), place[b].astype(np.float64)),
             )
         )
     return views

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.geometry.coverage import PosedCamera, evenly_spread
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 _Indices = NDArray[np.int64]

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.util.spread import evenly_spread
+
 _Floats = NDArray[np.float64]
 _Item = TypeVar("_Item")
 
@@ -117,8 +119,7 @@ def vertical_lines(
 
 def some_spread(items: Sequence[_Item]) -> list[_Item]:
     """As many of some items, evenly spread, as lines are looked for in pictures of."""
-    few = np.unique(np.linspace(0, len(items) - 1, _NUM_PICTURES).round().astype(int))
-    return [items[i] for i in few]
+    return [items[i] for i in evenly_spread(len(items), _NUM_PICTURES, rounded=True)]
 
 
 def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
