@@ -69,7 +69,7 @@ def estimate_focal_length(
         seed: the random seed.
 
     Returns:
-        The focal length in heights of a pixel; None where the motion does not determine it, as
+        The focal length in pixel heights; None where the motion does not determine it, as
         where the camera moves along its axis, or in a plane circle around what it looks at, or
         where there are too few matches.
     """

@@ -1,4 +1,4 @@
-"""Pairs from which COLMAP's incremental mapper would begin a model that fails."""
+"""Pairs that would make a bad initial pair for COLMAP's incremental mapper."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# The mapper asks half as much of its first pair where no pair has all that it asks for: first half
-# the inliers, then half the angle.
+# If no pair meets the mapper's limits for an initial pair, it halves them: first the inliers, then
+# the angle.
 _START = INITIAL_MIN_INLIERS // 2
 _ANGLE = INITIAL_MIN_ANGLE / 2
-# Where the parallax of near views is within what the mapper takes for noise, 4 px, the pose of the
-# homography has two to ten times the angle that the essential matrix tells, and two to twenty
-# times the errors that most matches keep to. Where it is right, the angles agree to a third.
+# If the parallax of near views is below the mapper's noise limit of 4 px, the pose of the
+# homography has two to ten times the angle of the essential matrix's, and two to twenty times the
+# error of most matches. If it is right, the angles agree to a third.
 _MUCH_WIDER = 1.5
 _MUCH_WORSE = 1.5
 _SHARE = 0.9
@@ -43,15 +43,15 @@ def demote_bad_initial_pairs(
 ) -> MatchedImages:
     """Limit the inliers of pairs that would make a bad initial pair.
 
-    COLMAP's mapper takes a pair's pose from its homography wherever that explains most of the
-    matches (`EstimateTwoViewGeometryPose`). Where the matches themselves deny this pose, or the
-    adjustment of the pair alone takes its camera far off, a model that begins with it fails after
-    a few images, and the mapper writes it all the same, first. The pair keeps what it needs to
-    link its images; tracks go through the pairs between.
+    COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
+    (`EstimateTwoViewGeometryPose`). If the matches contradict this pose, or the adjustment of the
+    pair alone moves its camera far off, a model that begins with the pair fails after a few images,
+    and the mapper still writes it first. A demoted pair keeps enough inliers to connect its images;
+    tracks continue through the pairs between.
 
     Args:
-        matched: the images. Whether the pose of the homography is right cannot be told of pairs
-            without an essential matrix, as no focal length is known.
+        matched: the images. Pairs without an essential matrix, as no focal length is known, are not
+            tested for the pose of the homography.
         cameras: the camera of each image.
         clock: gets the stage "verification".
     """
@@ -59,9 +59,9 @@ def demote_bad_initial_pairs(
     with clock.measure("verification"):
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):
-                # They tell as much as all do.
+                # The few inliers decide as well as all.
                 few = _thinned(geometry)
-                if _denied(few, inliers_of(matched, cameras, pair, few)):
+                if _is_contradicted(few, inliers_of(matched, cameras, pair, few)):
                     geometries[k] = few
         for k in runaway_starts(replace(matched, geometries=geometries), cameras):
             geometries[k] = _thinned(geometries[k])
@@ -77,8 +77,8 @@ def _may_start(geometry: TwoViewGeometry) -> bool:
     )
 
 
-def _denied(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
-    """Whether the matches say that the pose of the homography is not that of the pair."""
+def _is_contradicted(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
+    """Whether the matches contradict the pose of the homography."""
     of_pair = geometry.E
     assert of_pair is not None
     assert geometry.H is not None
@@ -94,7 +94,7 @@ def _denied(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
 
 
 def _error(E: _Floats, x: Sequence[_Floats]) -> float:
-    """Sampson error that most of the matches keep to, in focal lengths."""
+    """Sampson error that most matches are below, in focal lengths."""
     return float(np.quantile(sampson_error(E, x[0], x[1]), _SHARE))
 
 
