@@ -171,9 +171,10 @@ def _link_rows(links: LinkReport) -> Rows:
     """What connects images where motion does not; no row where no pictures were matched."""
     if links.num_images == 0:
         return []
-    shown = ", ".join(_named(gap.frames, links.videos) for gap in links.gaps[:_NUM_LISTED_GAPS])
-    more = ", ..." if len(links.gaps) > _NUM_LISTED_GAPS else ""
-    gaps = f", gaps at frames {shown}{more}" if links.gaps else ""
+    frames = links.frames_of_gaps()
+    shown = ", ".join(_named(gap, links.videos) for gap in frames[:_NUM_LISTED_GAPS])
+    more = ", ..." if len(frames) > _NUM_LISTED_GAPS else ""
+    gaps = f", gaps at frames {shown}{more}" if frames else ""
     pairs = (
         f"{links.num_links} pairs linked by {links.num_images} pictures, "
         f"{links.num_revisits} seen again"

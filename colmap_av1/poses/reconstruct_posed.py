@@ -151,7 +151,7 @@ def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
     if posed.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
-    looked_at = [gap.frames for gap in posed.matches.result.links.gaps]
+    looked_at = posed.matches.result.links.frames_of_gaps()
     seams = [
         (frame_of[first], frame_of[second])
         for first, second in posed.adjustment.result.doubtful_seams
