@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from colmap_av1.batch.files import fetch, is_url, state_of
+from colmap_av1.batch.files import fetch, is_url, state_of, without_secrets
 from colmap_av1.batch.jobs import Ended, Job, Outcome, Row, Source, TooSmall, Work
 from colmap_av1.batch.needs import estimated_needs, fits
-from colmap_av1.batch.outputs import REPORT, output_at, report_in
+from colmap_av1.batch.outputs import REPORT, files_below, output_at, report_in
 from colmap_av1.batch.rows import plain, row_facts, row_of
 from colmap_av1.batch.tasks import (
     TASKS,
@@ -99,8 +99,12 @@ class _Attempt:
         key = digest_of([state, [s for _, s in models], work.version, *depends_on(work)])
         kept = report_in(output.read(f"{job.name}/{REPORT}"))
         if kept is not None and kept["key"] == key:
-            row = dataclasses.replace(row_of(kept["row"]), name=job.name, input=str(job.source))
+            row = dataclasses.replace(
+                row_of(kept["row"]), name=job.name, input=without_secrets(str(job.source))
+            )
             return Ended(row, kept=True)
+        if kept is not None and kept.get("task") != work.task:
+            raise OptionError(f"{job.name}: is of another task: give another output")
         video = fetch(job.source, self._copies, work.stall)
         file = read_file(video)
         needs = estimated_needs(work, file)
@@ -116,10 +120,11 @@ class _Attempt:
         report = {
             "key": key,
             "version": work.version,
-            "input": {"path": str(job.source), **state},
+            "input": {"path": without_secrets(str(job.source)), **state},
             "task": work.task,
             "options": plain(dataclasses.asdict(cast(Any, work.options))),
             "row": row_facts(row),
+            "files": [p.relative_to(folder).as_posix() for p in files_below(folder)],
             "report": self._as_named(plain(dataclasses.asdict(made.report))),
         }
         (folder / REPORT).write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
@@ -165,7 +170,7 @@ class _Attempt:
     def _row(self, state: Literal["done", "failed"]) -> Row:
         return Row(
             self._job.name,
-            str(self._job.source),
+            without_secrets(str(self._job.source)),
             state,
             seconds=round(time.perf_counter() - self._start, 3),
             cpu_seconds=round(cpu_seconds() - self._cpu, 3),
@@ -181,7 +186,7 @@ class _Attempt:
         if isinstance(value, str):
             for path in (*self._copies.glob("video*"), self._copies):
                 value = value.replace(str(path), str(self._job.source))
-            value = value.replace(str(self._folder), self._job.name)
+            value = without_secrets(value.replace(str(self._folder), self._job.name))
         return value
 
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from colmap_av1.batch.files import without_secrets
 from colmap_av1.batch.jobs import Ended, Job, Outcome, Row, Work
 from colmap_av1.batch.worker import Worker
 from colmap_av1.errors import OptionError
@@ -109,7 +110,7 @@ class RayEngine:
             reason, text = "defect", f"{type(error.cause).__name__}: {line}"
         except failures.RayError as error:
             reason, text = "lost", f"its machine or process was lost ({type(error).__name__})"
-        row = Row(job.name, str(job.source), "failed", reason, error=text)
+        row = Row(job.name, without_secrets(str(job.source)), "failed", reason, error=text)
         return Ended(row, passing=reason != "defect", starved=reason == "memory")
 
     def _look(self) -> None:

@@ -8,7 +8,6 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -18,10 +17,16 @@ from colmap_av1.errors import ColmapAv1Error, OptionError, VideoError
 _Result = TypeVar("_Result")
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+_SECRET = re.compile(r"""([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/?@]*@)?([^\s?'"]*)(?:\?[^\s'"]*)?""")
 _BLOCK = 1 << 22
 # What stores call the sign of a changed object: S3 and Azure, HTTP, Google.
 _TAGS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "updated")
 EXTRA = "colmap-av1[remote]"
+
+
+def without_secrets(text: str) -> str:
+    """The text with its URLs cut at the query and without passwords: signed URLs hold secrets."""
+    return _SECRET.sub(r"\1\2", text)
 
 
 def is_url(address: str) -> bool:
@@ -42,16 +47,19 @@ def filesystem(url: str) -> tuple[Any, str]:
     Raises:
         OptionError: a package is missing, or there is no such kind of URL.
     """
+    shown = without_secrets(url)
     try:
         import fsspec  # noqa: PLC0415 - few need it
     except ImportError as error:
-        raise OptionError(f"{url}: needs the package fsspec: pip install '{EXTRA}'") from error
+        raise OptionError(f"{shown}: needs the package fsspec: pip install '{EXTRA}'") from error
     try:
         system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
-        raise OptionError(f"{url}: {error}: pip install '{EXTRA}' has those of S3") from error
+        reason = without_secrets(str(error))
+        raise OptionError(f"{shown}: {reason}: pip install '{EXTRA}' has those of S3") from error
     except ValueError as error:
-        raise OptionError(f"{url}: {error}: give a path, or a URL that fsspec knows") from error
+        reason = without_secrets(str(error))
+        raise OptionError(f"{shown}: {reason}: give a path, or a URL that fsspec knows") from error
     return system, str(path)
 
 
@@ -143,6 +151,7 @@ def unless_stalled(
         OSError: it failed, or stood still; it may then run on as long as the process does.
         ColmapAv1Error: what the step raised.
     """
+    shown = without_secrets(address)
     result: list[_Result] = []
     failure: list[BaseException] = []
     last = [time.monotonic()]
@@ -162,7 +171,7 @@ def unless_stalled(
     threading.Thread(target=run, daemon=True).start()
     while not done.wait(max(0.01, last[0] + seconds - time.monotonic())):
         if time.monotonic() - last[0] >= seconds:
-            raise OSError(errno.ETIMEDOUT, f"nothing comes for {seconds:g} seconds", address)
+            raise OSError(errno.ETIMEDOUT, f"nothing comes for {seconds:g} seconds", shown)
     if failure:
         raise _as_os_error(failure[0], address) from failure[0]
     return result[0]
@@ -177,14 +186,8 @@ def _as_os_error(error: BaseException, address: str) -> BaseException:
     if isinstance(error, OSError) and error.errno is not None:
         return error
     reason = next(iter(str(error).splitlines()), "") or type(error).__name__
-    return OSError(errno.EIO, reason, address)
+    return OSError(errno.EIO, without_secrets(reason), without_secrets(address))
 
 
 def _missing(address: str) -> VideoError:
-    return VideoError(f"{address}: no such file: give the path of a video")
-
-
-def free(folder: Path) -> None:
-    """Remove a folder that may not be there, were it empty."""
-    with suppress(OSError):
-        folder.rmdir()
+    return VideoError(f"{without_secrets(address)}: no such file: give the path of a video")

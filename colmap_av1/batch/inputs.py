@@ -10,7 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from colmap_av1.batch.files import filesystem, is_url, open_to_read, unless_stalled
+from colmap_av1.batch.files import (
+    filesystem,
+    is_url,
+    open_to_read,
+    unless_stalled,
+    without_secrets,
+)
 from colmap_av1.batch.jobs import Source
 from colmap_av1.errors import OptionError
 
@@ -53,7 +59,9 @@ def list_videos(inputs: Sequence[str], output: str, stall: float) -> Iterator[Na
             count += 1
             yield named
         if count == 0:
-            raise OptionError(f"{word}: holds no video: give a list, pattern or folder with one")
+            raise OptionError(
+                f"{without_secrets(word)}: holds no video: give a list, pattern or folder with one"
+            )
 
 
 def _list_one(word: str, output: str, stall: float) -> Iterator[Named]:
@@ -75,7 +83,9 @@ def _list_one(word: str, output: str, stall: float) -> Iterator[Named]:
         fixed = word[: next(i for i, letter in enumerate(word) if letter in _SPECIAL)]
         yield from _named(place.matches(), fixed.rpartition("/")[0], stall)
     else:
-        raise OptionError(f"{word}: no such file or folder: give a list, pattern, folder or URL")
+        raise OptionError(
+            f"{without_secrets(word)}: no such file or folder: give a list, pattern, folder or URL"
+        )
 
 
 def _named(addresses: Sequence[str] | Iterator[str], root: str, stall: float) -> Iterator[Named]:
@@ -118,7 +128,7 @@ def _members(address: str, name: str, stall: float) -> Iterator[Named]:
                         part = Source(address, member.name, member.offset_data, member.size)
                         found.append((f"{name}/{stem}", part))
         except tarfile.TarError as error:
-            what = f"{address}: no tar file, or damaged: {error}: give another"
+            what = f"{without_secrets(address)}: no tar file, or damaged: {error}: give another"
             raise OptionError(what) from error
         return found
 
@@ -132,7 +142,7 @@ def _of_list(word: str, stall: float) -> Iterator[Named]:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
             if len(line) == _LONGEST_LINE or b"\0" in line:
                 raise OptionError(
-                    f"{word}: line {number} is no path: give a text file with a line for each "
+                    f"{without_secrets(word)}: line {number} is no path: give a text file with a line for each "
                     "video, or a video by a name that ends as videos do"
                 )
             # Names of files need not be valid text.

@@ -6,14 +6,13 @@ import errno
 import json
 import os
 import shutil
-import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from colmap_av1.batch.files import filesystem, free, is_url
+from colmap_av1.batch.files import filesystem, is_url
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.files import only_run, remove_leftovers, whole_file
 
@@ -25,7 +24,8 @@ ROWS, PAGE = "batch", "report.html"
 # Marks the folder of a video in an object store as one that is being written.
 _UNFINISHED = ".unfinished"
 # Where a process keeps what it has not finished.
-OURS = f"colmap-av1-{socket.gethostname()}"
+_SCRATCH = ".colmap-av1-"
+_LOCK = "lock"
 
 
 class Output(Protocol):
@@ -82,18 +82,33 @@ def scratch_of_process(scratch: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OSError: it cannot be made.
     """
-    folder = scratch_of(scratch, os.getpid())
-    remove_leftovers(folder.parent, OURS)
+    remove_unused_scratch(scratch)
+    os.makedirs(scratch, exist_ok=True)
+    # Containers may share host name and process numbers: only a random name is unique.
+    folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=scratch))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder
+        new = folder / "new"
+        with only_run(new):
+            new.rename(folder / _LOCK)  # held before others can find it
+            yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def scratch_of(scratch: str | os.PathLike[str], process: int) -> Path:
-    """The folder that a process of this machine has among the scratch."""
-    return Path(scratch) / f".{OURS}.{process}.partial"
+def remove_unused_scratch(scratch: str | os.PathLike[str]) -> None:
+    """Remove the folders of `scratch_of_process` that ended processes left."""
+    if os.name != "posix":  # elsewhere there is no lock that tells
+        return
+    for folder in Path(scratch).glob(f"{_SCRATCH}*"):
+        if (folder / _LOCK).is_file():
+            with suppress(OSError), only_run(folder / _LOCK) as unused:
+                if unused:
+                    shutil.rmtree(folder, ignore_errors=True)
+
+
+def files_below(folder: Path) -> list[Path]:
+    """All files below a folder, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
 def report_in(content: bytes | None) -> dict[str, Any] | None:
@@ -120,25 +135,34 @@ class _FolderOutput:
 
     def publish(self, folder: Path, name: str) -> None:
         target = self._root / name
-        if target.exists() and report_in(self.read(f"{name}/{REPORT}")) is None:
-            _refuse_foreign(str(target), any(target.iterdir()) if target.is_dir() else True)
-        staging = scratch_of(self._root / HIDDEN, os.getpid()) / "publish"
-        staging.mkdir(parents=True)
-        try:
+        there = files_below(target) if target.is_dir() else [target] if target.exists() else []
+        old = {path.relative_to(target).as_posix() for path in there}
+        new = {path.relative_to(folder).as_posix() for path in files_below(folder)}
+        ours = _files_of_ours(self, name, old, new)
+        with scratch_of_process(self._root / HIDDEN) as staging:
             target.parent.mkdir(parents=True, exist_ok=True)
-            whole = staging / "new"
+            whole = staging / "whole"
             try:
                 folder.rename(whole)
             except OSError as error:
                 if error.errno != errno.EXDEV:
                     raise
                 shutil.copytree(folder, whole)  # the scratch is on another disk
-            if target.exists():
-                target.rename(staging / "old")
-            whole.rename(target)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-            free(staging.parent)
+            if not old:
+                if target.exists():
+                    shutil.rmtree(target)  # folders without a file
+                whole.rename(target)
+                return
+            # What users have put beside our files stays where it is, whenever this is stopped.
+            mark = target / _UNFINISHED
+            mark.write_text(json.dumps(sorted(ours | new)))
+            (target / REPORT).unlink(missing_ok=True)
+            for path in sorted((ours & old) - new - {REPORT, _UNFINISHED}):
+                (target / path).unlink()
+            for path in sorted(new, key=lambda p: (p == REPORT, p)):
+                (target / path).parent.mkdir(parents=True, exist_ok=True)
+                (whole / path).replace(target / path)
+            mark.unlink()
 
     def put(self, file: Path, path: str) -> None:
         with whole_file(self._root / path) as partial:
@@ -158,7 +182,7 @@ class _FolderOutput:
                         f"{self._root}: another batch is at work in it: wait for its end, or give "
                         "another output"
                     )
-                remove_leftovers(hidden, OURS)
+                remove_unused_scratch(hidden)
                 for suffix in (".csv", ".json"):
                     remove_leftovers(self._root, f"{ROWS}{shard}{suffix}")
                 yield
@@ -189,18 +213,17 @@ class _UrlOutput:
         old: set[str] = set()
         with suppress(FileNotFoundError):
             old = {str(path) for path in self._system.find(target)}
+        new = {path.relative_to(folder).as_posix() for path in files_below(folder)}
+        there = {path.removeprefix(f"{target}/") for path in old}
+        ours = _files_of_ours(self, name, there, new)
         mark = f"{target}/{_UNFINISHED}"
-        if report_in(self.read(f"{name}/{REPORT}")) is None:
-            _refuse_foreign(f"{self._address}/{name}", bool(old) and mark not in old)
-        self._system.pipe_file(mark, b"")
-        if f"{target}/{REPORT}" in old:
+        self._system.pipe_file(mark, json.dumps(sorted(ours | new)).encode())
+        if REPORT in there:
             self._system.rm_file(f"{target}/{REPORT}")
-        new = [p for p in sorted(folder.rglob("*")) if p.is_file()]
-        paths = {p: f"{target}/{p.relative_to(folder).as_posix()}" for p in new}
-        for path in sorted(old - {mark, f"{target}/{REPORT}", *paths.values()}):
-            self._system.rm_file(path)
-        for file in sorted(new, key=lambda p: p == folder / REPORT):
-            self._system.put_file(str(file), paths[file])
+        for path in sorted((ours & there) - new - {REPORT, _UNFINISHED}):
+            self._system.rm_file(f"{target}/{path}")
+        for path in sorted(new, key=lambda p: (p == REPORT, p)):
+            self._system.put_file(str(folder / path), f"{target}/{path}")
         self._system.rm_file(mark)
 
     def put(self, file: Path, path: str) -> None:
@@ -216,9 +239,32 @@ class _UrlOutput:
         yield
 
 
-def _refuse_foreign(place: str, holds_things: bool) -> None:
-    """Refuse to take the place of what no batch has made."""
-    if holds_things:
-        raise OptionError(
-            f"{place}: is there and not of a batch: give another output, or move it away"
-        )
+def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) -> set[str]:
+    """The files of a video's folder that an earlier run wrote, as its report or mark lists them.
+
+    Raises:
+        OptionError: no batch has made the folder, or a new file would replace one of a user.
+    """
+    if not there:
+        return set()
+    mark = output.read(f"{name}/{_UNFINISHED}")
+    if mark is not None:
+        try:
+            listed: Any = json.loads(mark)
+        except ValueError:  # stopped while it was written: nothing was changed before
+            listed = [_UNFINISHED, *new]
+    else:
+        report = report_in(output.read(f"{name}/{REPORT}"))
+        if report is None:
+            raise OptionError(
+                f"{name}: is there and not of a batch: give another output, or move it away"
+            )
+        # Reports of earlier versions have no list.
+        listed = [REPORT, *report.get("files", new)]
+    ours = {_UNFINISHED, REPORT, *(path for path in listed if isinstance(path, str))}
+    # A list from elsewhere must not reach outside of the folder: only what was found in it counts.
+    ours &= there
+    for path in sorted(there - ours):
+        if any(path == n or path.startswith(f"{n}/") or n.startswith(f"{path}/") for n in new):
+            raise OptionError(f"{name}/{path}: is in the way and not of a batch: move it away")
+    return ours

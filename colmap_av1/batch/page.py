@@ -170,7 +170,7 @@ def _rows(into: Output, place: str, names: Sequence[str]) -> Iterator[Row]:
         try:
             content = into.read(name) or b""
             yield from read_json(io.TextIOWrapper(io.BytesIO(content), encoding="ascii"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, OverflowError, RecursionError) as error:
             raise OptionError(f"{place}/{name}: damaged: run the batch again") from error
 
 
@@ -197,7 +197,7 @@ def _page(place: str, totals: _Totals, rows: Sequence[Row], into: Output) -> Ite
     yield f'<table id="videos">\n<thead><tr><th></th>{heads}</tr></thead>\n<tbody>\n'
     for row in rows:
         cells = "".join(_cell(name, getattr(row, name)) for name in shown)
-        yield f'<tr class="{row.state}"><td>{_thumbnail(row, into)}</td>{cells}</tr>\n'
+        yield f'<tr class="{_text(row.state)}"><td>{_thumbnail(row, into)}</td>{cells}</tr>\n'
     yield f"</tbody>\n</table>\n<script>{_SCRIPT}</script>\n</html>\n"
 
 

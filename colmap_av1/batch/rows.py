@@ -13,6 +13,7 @@ from typing import Any, TextIO
 from colmap_av1.batch.jobs import Row
 
 _COLUMNS = [field.name for field in dataclasses.fields(Row)]
+_WORDS = {"name", "input", "state", "reason", "warnings", "error"}
 _WARNINGS = "; "
 
 
@@ -73,9 +74,19 @@ def row_of(facts: Mapping[str, Any]) -> Row:
         ValueError: they are not those of a row.
     """
     try:
-        return Row(**{**facts, "warnings": tuple(facts["warnings"])})
+        row = Row(**{**facts, "warnings": tuple(facts["warnings"])})
     except (KeyError, TypeError) as error:
         raise ValueError(f"no row: {error}") from error
+    words = (row.name, row.input, row.reason, row.error, *row.warnings)
+    numbers = [getattr(row, name) for name in _COLUMNS if name not in _WORDS]
+    is_valid = (
+        row.state in ("done", "failed")
+        and all(isinstance(word, str) for word in words)
+        and all(n is None or (type(n) in (int, float) and math.isfinite(n)) for n in numbers)
+    )
+    if not is_valid:
+        raise ValueError("no row: a value is of the wrong kind")
+    return row
 
 
 def plain(value: Any) -> Any:

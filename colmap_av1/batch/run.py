@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +41,7 @@ _WRITE_EVERY = 5.0
 _WRITE_SHARE = 0.05
 _WAIT = 1.0
 _GB = 10**9
+_TASK = re.compile(rb'^ "task": "([a-z]+)"', re.MULTILINE)
 
 
 @dataclass
@@ -140,6 +142,7 @@ def run_batch(
     with ExitStack() as opened:
         into = output_at(place)
         opened.enter_context(into.opened(shard))
+        _refuse_another_task(into, place, work.task)
         try:
             scratch = opened.enter_context(scratch_of_process(work.scratch))
         except OSError as error:
@@ -182,6 +185,23 @@ def run_batch(
         video_seconds=totals[1],
         warnings=_warnings(index),
     )
+
+
+def _refuse_another_task(output: Output, place: str, task: str) -> None:
+    """Refuse an output whose tables are those of another task.
+
+    Raises:
+        OptionError: they are.
+    """
+    with suppress(OSError):  # there is nothing yet
+        for name in output.files(".json"):
+            if name == f"{ROWS}.json" or name.startswith(f"{ROWS}-"):
+                found = _TASK.search(output.read(name) or b"")
+                if found is not None and found[1].decode() != task:
+                    raise OptionError(
+                        f"{place}: holds a batch of the task {found[1].decode()}: give another "
+                        "output"
+                    )
 
 
 def _drive(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +15,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from colmap_av1.batch.attempt import attempt
+from colmap_av1.batch.files import without_secrets
 from colmap_av1.batch.jobs import Ended, Job, Outcome, Row, Work
-from colmap_av1.batch.outputs import scratch_of, scratch_of_process
+from colmap_av1.batch.outputs import remove_unused_scratch, scratch_of_process
 from colmap_av1.util.memory import resident_memory
 from colmap_av1.util.processes import bound
 
@@ -58,7 +58,7 @@ class Worker:
                 process.stdin.flush()
                 outcome: Outcome = pickle.load(process.stdout)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
-            row = Row(job.name, str(job.source), "failed")
+            row = Row(job.name, without_secrets(str(job.source)), "failed")
             ended = self._fault(error, stopped, work, row)
             seconds = round(time.perf_counter() - start, 3)
             return Ended(_with_seconds(ended.row, seconds), False, ended.passing, ended.starved)
@@ -118,7 +118,7 @@ class Worker:
             return
         _kill(process)
         process.wait()
-        shutil.rmtree(scratch_of(self._scratch, process.pid), ignore_errors=True)
+        remove_unused_scratch(self._scratch)
 
 
 def serve(scratch: str) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
-from colmap_av1.batch.files import absolute, fetch, is_url
+from colmap_av1.batch.files import absolute, fetch, is_url, without_secrets
 from colmap_av1.batch.jobs import Source
 from colmap_av1.cli.terminal import print_note
 from colmap_av1.errors import OptionError
@@ -54,7 +54,7 @@ def _fetched(url: str, folder: Path, quiet: bool) -> str:
         return address
     folder.mkdir()
     if not quiet:
-        print_note(f"fetching {url}")
+        print_note(f"fetching {without_secrets(url)}")
     try:
         copy = fetch(Source(address), folder, BatchOptions().stall)
     except OptionError as error:

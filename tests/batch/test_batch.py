@@ -22,10 +22,13 @@ from colmap_av1 import (
     ReadOptions,
     ReconstructOptions,
     RunOptions,
+    VideoError,
     run_batch,
 )
 from colmap_av1.batch.attempt import attempt
+from colmap_av1.batch.files import state_of, without_secrets
 from colmap_av1.batch.jobs import Ended, Job, Needs, Source, Work
+from colmap_av1.batch.outputs import remove_unused_scratch, scratch_of_process
 from colmap_av1.batch.run import Counts
 from colmap_av1.batch.tasks import TASKS, Made, Task
 from colmap_av1.cli import main
@@ -242,3 +245,40 @@ def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
     assert report.num_done == 1
     (row,) = rows_of(dense)
     assert (row["images"], int(row["points"]) > 10_000) == ("12", True)
+
+
+def test_files_of_users_stay_in_the_folder_of_a_video(clips: Path, tmp_path: Path) -> None:
+    out, video = tmp_path / "out", clips / "a" / "clip00.mp4"
+    run_batch(video, out, ReadOptions(), options=ALONE)
+    users = [out / "clip00" / name for name in ("my_training.ply", "splats/a.ply")]
+    for file in users:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("mine")
+    assert run_batch(video, out, ReadOptions(strict=True), options=ALONE).num_done == 1
+    assert [file.read_text() for file in users] == ["mine", "mine"]
+    assert run_batch(video, out, ReadOptions(strict=True), options=ALONE).num_kept == 1
+    before = files_of(out)
+    with pytest.raises(OptionError, match="task"):
+        run_batch(video, out, MatchOptions(), options=ALONE)
+    (out / "batch.json").unlink()
+    assert run_batch(video, out, MatchOptions(), options=ALONE).failed == {"unfit": 1}
+    assert files_of(out) == before
+
+
+def test_a_folder_in_use_is_nobody_elses_scratch(tmp_path: Path) -> None:
+    """Containers may share host name and process numbers."""
+    with scratch_of_process(tmp_path) as one, scratch_of_process(tmp_path) as other:
+        (one / "a").touch()
+        assert one != other
+        remove_unused_scratch(tmp_path)
+        assert (one / "a").exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_secrets_of_signed_urls_are_not_shown() -> None:
+    text = "[5] https://me:PASS@host/v.mp4?X-Amz-Signature=SECRET&b=2: nothing comes"
+    assert without_secrets(text) == "[5] https://host/v.mp4 nothing comes"
+    assert without_secrets("/a/b?c.mp4") == "/a/b?c.mp4"
+    with pytest.raises(VideoError) as raised:
+        state_of(Source("memory://none.mp4?sig=SECRET"), 5.0)
+    assert "SECRET" not in str(raised.value)

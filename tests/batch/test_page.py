@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html.parser
+import json
 import re
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from colmap_av1 import OptionError, write_page
 from colmap_av1.batch.jobs import Row
-from colmap_av1.batch.rows import write_json
+from colmap_av1.batch.rows import row_facts, write_json
 from colmap_av1.cli import main
 
 JPEG = b"\xff\xd8\xff\xe0 a small picture"
@@ -109,12 +110,23 @@ def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
     assert {row[0]: row[-2] for row in page.tables["quantiles"]}["points"] == "299"
 
 
+def row_text(field: str, value: object) -> str:
+    """A file of rows, one of whose values is altered."""
+    facts = {**row_facts(Row("x", "/x", "done")), field: value}
+    return f'{{"rows": [\n  {json.dumps(facts)}]\n}}'
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (None, "holds no batch.json"),
         ('{"rows": [\n  {"name": "x"', "damaged"),
         ('{"rows": [\n  {"name": "x"}]\n}', "damaged"),
+        (row_text("state", "<script>alert(1)</script>"), "damaged"),
+        (row_text("seconds", "<script>"), "damaged"),
+        (row_text("points", [1]), "damaged"),
+        (row_text("error", {"a": "b"}), "damaged"),
+        ('{"rows": [\n  {"name": ' + "[" * 100_000, "damaged"),
     ],
 )
 def test_no_page(
@@ -124,5 +136,7 @@ def test_no_page(
         (tmp_path / "batch.json").write_text(content)
     with pytest.raises(OptionError, match=message):
         write_page(tmp_path)
+    assert main(["batch", "report", "--output", str(tmp_path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
     assert main(["batch", "report", "--output", str(tmp_path / "none")]) == 2
     assert "holds no batch.json" in capsys.readouterr().err
