@@ -82,7 +82,7 @@ def compare(
     given, and fills a database; each of these is mapped by COLMAP's incremental mapper with the
     same settings, and the models are measured. Where no model is given, that is SIMPLE_RADIAL, and
     RADIAL where this package estimates the focal length from the tracks.
-    The folder gets `report.html`, `report.md` and `results.json`, and keeps what every stage
+    The folder gets `report.html` and `results.json`, and keeps what every stage
     made: another run does only what is missing or damaged, or depends on what has changed. A
     front-end that fails leaves a line in its column; the others stand.
 

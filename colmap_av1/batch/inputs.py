@@ -142,8 +142,8 @@ def _of_list(word: str, stall: float) -> Iterator[Named]:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
             if len(line) == _LONGEST_LINE or b"\0" in line:
                 raise OptionError(
-                    f"{without_secrets(word)}: line {number} is no path: give a text file with a line for each "
-                    "video, or a video by a name that ends as videos do"
+                    f"{without_secrets(word)}: line {number} is no path: give a text file "
+                    "with a line for each video, or a video by a name that ends as videos do"
                 )
             # Names of files need not be valid text.
             address, tab, name = os.fsdecode(line.rstrip(b"\r\n")).partition("\t")

@@ -87,11 +87,13 @@ def test_folders_are_whole_or_unmarked(store: Any, clips: Path, tmp_path: Path) 
 
     # As an upload that was cut off leaves it.
     store.rm_file("bucket/out/x/report.json")
-    store.pipe_file("bucket/out/x/.unfinished", b"")
+    store.pipe_file("bucket/out/x/.unfinished", b'["images/stale.png", "thumbnail.jpg"]')
+    store.pipe_file("bucket/out/x/images/mine.png", b"mine")
     store.pipe_file("bucket/out/x/images/stale.png", b"")
     store.put_file(str(clips / "a" / "clip02.mp4"), "bucket/in/x.mp4")
     run_batch("s3://bucket/in/x.mp4", "s3://bucket/out", ReadOptions(), options=ALONE)
     assert [p.rpartition("/")[2] for p in store.find("bucket/out/x")] == [
+        "mine.png",
         "report.json",
         "thumbnail.jpg",
     ]

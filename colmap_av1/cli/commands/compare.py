@@ -68,7 +68,5 @@ def _run(namespace: argparse.Namespace) -> int:
             print_warning(f"{column.name}: nothing is trained: {column.training_error}")
     print_result(namespace, compare_rows(result), result.warnings)
     if all(column.model is None for column in result.columns):
-        raise EvaluationError(
-            f"{result.output}: no front-end gave a model: report.md there gives the reason for each"
-        )
+        raise EvaluationError(f"{result.output}: no front-end gave a model: see report.html there")
     return _FAILED_TRAINING if any(column.training_error for column in result.columns) else 0

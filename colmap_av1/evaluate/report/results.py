@@ -74,7 +74,7 @@ class CompareReport:
     """What `compare` measured.
 
     Attributes:
-        output: the folder with `report.html`, `report.md` and `results.json`.
+        output: the folder with `report.html` and `results.json`.
         video: the video.
         num_frames: its shown frames.
         num_images: images that every front-end was given.

@@ -1,4 +1,4 @@
-"""The report of a comparison: one HTML file, Markdown and JSON."""
+"""The report of a comparison: one HTML file and JSON."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ from colmap_av1.evaluate.report.tables import (
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import whole_file
 
-PICTURES = "pictures"
 _CSS = """
 body { font: 15px/1.5 system-ui, "Helvetica Neue", Arial, sans-serif; color: #1f2937;
   max-width: 1120px; margin: 2.5em auto; padding: 0 1.5em; }
@@ -67,7 +66,7 @@ footer { color: #6b7280; font-size: 12px; margin-top: 3em; }
 
 @dataclass(frozen=True)
 class _Figure:
-    """A picture and the file it is kept in."""
+    """A picture, its file format by the ending of its name."""
 
     name: str
     caption: str
@@ -80,7 +79,7 @@ class _Figure:
 
 
 def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage) -> None:
-    """Write `report.html`, `report.md` with its `pictures/`, and `results.json`.
+    """Write `report.html` and `results.json`.
 
     The HTML file needs no other and no network.
 
@@ -102,10 +101,6 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     if curves is not None:
         figures["training"] = [_Figure("training.svg", "Renderings over time", curves)]
     figures["crops"] = _crop_figures(report.columns)
-    folder = report.output / PICTURES
-    folder.mkdir(exist_ok=True)
-    for figure in (figure for group in figures.values() for figure in group):
-        _write(folder / figure.name, figure.content)
     tables = {"models": models_table(report), "cost": cost_table(report.columns)}
     tables["lengths"] = lengths_table(report.columns)
     if any(column.training is not None for column in report.columns):
@@ -113,7 +108,6 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     on_the_way = milestones_table(report.columns)
     if on_the_way is not None:
         tables["milestones"] = on_the_way
-    _write(report.output / "report.md", _markdown(report, tables, figures).encode())
     _write(report.output / "report.html", _html(report, tables, figures).encode())
     _write(report.output / "results.json", _json(report).encode())
 
@@ -242,35 +236,6 @@ def _notes(report: CompareReport) -> list[str]:
             "no poses or cloud to measure against: give --reference, or compare sift-exhaustive"
         )
     return [*notes, *report.warnings]
-
-
-def _markdown(
-    report: CompareReport, tables: Mapping[str, Table], figures: Mapping[str, list[_Figure]]
-) -> str:
-    def picture(figure: _Figure) -> str:
-        return f"![{figure.caption}]({PICTURES}/{figure.name})"
-
-    def table(one: Table) -> list[str]:
-        lines = [one.header, ["---", *["---:"] * (len(one.header) - 1)], *one.rows]
-        rows = [f"| {' | '.join(line)} |" for line in lines]
-        return [f"## {one.title}", "", *([one.about, ""] if one.about else []), *rows, ""]
-
-    views = [f for f in figures["clouds"] if f.name.endswith("_view.png")]
-    plans = [f for f in figures["clouds"] if f.name.endswith("_plan.png")]
-    parts = [f"# Front-ends compared on {report.video.name}", "", _facts(report), ""]
-    parts += [*[f"- {note}" for note in _notes(report)], ""]
-    parts += [*table(tables["models"]), picture(figures["bars"][0]), ""]
-    parts += ["## Clouds from one viewpoint", ""]
-    for figure in (*views, *plans):
-        parts += [figure.caption, "", picture(figure), ""]
-    if "renderings" in tables:
-        for kind in ("renderings", "milestones"):
-            parts += table(tables[kind]) if kind in tables else []
-        for figure in (*figures.get("training", []), *figures["crops"]):
-            parts += [figure.caption, "", picture(figure), ""]
-    parts += [*table(tables["lengths"]), picture(figures["lengths"][0]), ""]
-    parts += [*table(tables["cost"]), picture(figures["cost"][0]), ""]
-    return "\n".join(parts)
 
 
 def _html(
