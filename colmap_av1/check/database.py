@@ -16,8 +16,8 @@ from colmap_av1.check.contents import (
     pairs_with_rows,
     parallax_of,
 )
-from colmap_av1.check.finding import Finding
 from colmap_av1.check.findings import (
+    Finding,
     frame_findings,
     gap_findings,
     image_findings,
@@ -25,8 +25,8 @@ from colmap_av1.check.findings import (
     motion_findings,
     orphan_findings,
     pair_findings,
+    value_findings,
 )
-from colmap_av1.check.findings_values import value_findings
 from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pycolmap
 
 from colmap_av1.check.contents import Images, Pairs, Parallax
-from colmap_av1.check.finding import Finding, some
 from colmap_av1.database.layout import columns
+from colmap_av1.errors import ImageError
+from colmap_av1.geometry.cameras import camera_fault
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
     INITIAL_LEAST_ANGLE,
@@ -19,9 +22,42 @@ from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
+from colmap_av1.util.texts import check_name
 
-# Share of keypoints without a match that is worth a line.
+Severity = Literal["error", "warning", "note"]
+
+# Fewer keypoints without a match than this share are not mentioned.
 _NOTED_SHARE = 0.01
+# COLMAP's mappers ignore images whose camera is outside these limits: the focal length as a
+# multiple of the longer side, and the absolute value of any distortion parameter.
+_FOCAL_RATIOS = (0.1, 10.0)
+_LARGEST_DISTORTION = 1.0
+# Keypoints up to this many pixels outside their image are accepted: rounding puts them there.
+_MARGIN = 1.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding in a database that matters for mapping it.
+
+    Attributes:
+        severity: "error": mappers stop or find nothing; "warning": a part is lost, or some
+            program stops; "note": nothing is wrong.
+        text: one line.
+        damage: no program writes such values: the file is damaged, or parts of several are mixed.
+    """
+
+    severity: Severity
+    text: str
+    damage: bool = False
+
+
+def _some(names: Sequence[str], what: str) -> str:
+    """A count and an example, such as "3 images (a.png, ...)"."""
+    plural = "s" if len(names) > 1 else ""
+    # A name may hold anything, line breaks too.
+    first = names[0] if names[0].isprintable() and names[0] else repr(names[0])
+    return f"{len(names)} {what}{plural} ({first}{', ...' if plural else ''})"
 
 
 def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
@@ -31,7 +67,7 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
         return
     lost = [n for n, c in zip(images.names, images.camera_ids, strict=True) if c not in cameras]
     if lost:
-        yield Finding("error", f"{some(lost, 'image')} without a camera: the mappers stop")
+        yield Finding("error", f"{_some(lost, 'image')} without a camera: the mappers stop")
     unknown = sum(not camera.has_prior_focal_length for camera in cameras.values())
     if unknown:
         yield Finding(
@@ -44,6 +80,82 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
         yield Finding("note", f"images have {len(sizes)} sizes")
     if images.names != sorted(images.names):
         yield Finding("note", "image ids do not follow the order of names: match by name, not id")
+
+
+def value_findings(
+    images: Images, pairs: Pairs, cameras: dict[int, pycolmap.Camera]
+) -> Iterator[Finding]:
+    """Values that no program can use, whatever the rest of the database is like."""
+    yield from _name_findings(images)
+    yield from _camera_findings(cameras)
+    yield from _position_findings(images, cameras)
+    for count, fault in (
+        (pairs.num_with_itself, "of an image with itself"),
+        (pairs.num_swapped, "stored under the larger image id first"),
+    ):
+        if count:
+            yield Finding("warning", f"{count} pairs are {fault}: mappers mix them up", damage=True)
+
+
+def _name_findings(images: Images) -> Iterator[Finding]:
+    if "" in images.names:
+        yield Finding("error", "an image has no name: programs find no file for it")
+    unusable = [name for name in images.names if name and not _is_usable(name)]
+    if unusable:
+        yield Finding(
+            "error",
+            f"{_some(unusable, 'image')} with a name outside the image folder, or none that a file "
+            "can have: name it by its path within the folder",
+        )
+
+
+def _is_usable(name: str) -> bool:
+    try:
+        check_name(name)
+    except ImageError:
+        return False
+    return True
+
+
+def _camera_findings(cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
+    faults = {i: camera_fault(camera) for i, camera in cameras.items()}
+    for camera_id, fault in faults.items():
+        if fault:
+            yield Finding("error", f"camera {camera_id} has {fault}: mappers stop or find nothing")
+            break
+    unlike = [
+        str(i)
+        for i, camera in cameras.items()
+        if not faults[i] and camera.has_bogus_params(*_FOCAL_RATIOS, _LARGEST_DISTORTION)
+    ]
+    if unlike:
+        yield Finding(
+            "warning",
+            f"{_some(unlike, 'camera')} with parameters that do not fit the size of the images: "
+            "mappers leave their images out unless they refine the parameters",
+        )
+
+
+def _position_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
+    unknown, outside = [], []
+    for name, camera_id, xy in zip(images.names, images.camera_ids, images.keypoints, strict=True):
+        if not np.isfinite(xy).all():
+            unknown.append(name)
+        elif len(xy) and camera_id in cameras:
+            size = np.array([cameras[camera_id].width, cameras[camera_id].height], np.float64)
+            if np.any(xy < -_MARGIN) or np.any(xy > size + _MARGIN):
+                outside.append(name)
+    if unknown:
+        yield Finding(
+            "error", f"{_some(unknown, 'image')} with keypoints that are not numbers: mappers hang"
+        )
+    if outside:
+        yield Finding(
+            "warning",
+            f"{_some(outside, 'image')} with keypoints outside: is the camera's size that of the "
+            "images the keypoints are of?",
+            damage=True,
+        )
 
 
 def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[Finding]:
@@ -65,7 +177,7 @@ def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[F
         if bare:
             yield Finding(
                 "error",
-                f"{some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
+                f"{_some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
                 "3.12 on stop; 'colmap-av1 match' completes the frames",
             )
     elif rigs and any(rigs.get(camera_id) != camera_id for camera_id in images.camera_ids):
@@ -83,7 +195,7 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     bare = [n for n, c, p in zip(images.names, counts, in_pair, strict=True) if p and not c]
     if bare:
         yield Finding(
-            "error", f"{some(bare, 'image')} with matches but without keypoints: most mappers stop"
+            "error", f"{_some(bare, 'image')} with matches but without keypoints: most mappers stop"
         )
     elif pairs.num_astray:
         yield Finding(
@@ -94,7 +206,7 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
         )
     empty = [n for n, c in zip(images.names, counts, strict=True) if not c]
     if empty and not bare:
-        yield Finding("warning", f"{some(empty, 'image')} without keypoints")
+        yield Finding("warning", f"{_some(empty, 'image')} without keypoints")
     uneven = [
         name
         for name, count, described in zip(images.names, counts, images.num_descriptors, strict=True)
@@ -103,7 +215,7 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     if uneven:
         yield Finding(
             "warning",
-            f"{some(uneven, 'image')} with another number of descriptors than of keypoints: "
+            f"{_some(uneven, 'image')} with another number of descriptors than of keypoints: "
             "guided matching and vocabulary trees stop, mappers ignore it",
         )
     total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)

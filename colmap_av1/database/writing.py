@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,15 +14,30 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.file import is_new, write_existing, write_new
 from colmap_av1.database.layout import columns, has_rows
-from colmap_av1.database.reading import image_ids_from_pair_id
-from colmap_av1.database.writing_frames import complete_frames, write_places
-from colmap_av1.database.writing_keypoints import append_keypoints
-from colmap_av1.database.writing_pairs import append_pairs, order_pairs
+from colmap_av1.database.reading import (
+    SHAPES,
+    image_ids_from_pair_id,
+    keypoints_from_row,
+    matches_from_row,
+    pair_id_from_image_ids,
+)
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.two_view_geometry import TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting
+
+# COLMAP's SensorType of a camera.
+_CAMERA_SENSOR = 0
+# COLMAP's PosePriorCoordinateSystem of latitude, longitude and altitude.
+WGS84 = 0
+# The layout of COLMAP 3.10 to 3.13. Later versions migrate it, earlier ones ignore the table.
+_POSE_PRIORS = (
+    "CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL, position BLOB, "
+    "coordinate_system INTEGER NOT NULL, position_covariance BLOB, "
+    "FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)"
+)
+_UNKNOWN = np.full(9, np.nan, dtype="<f8")
 
 
 def write_matched_images(
@@ -116,20 +131,20 @@ def write_matches(
             _check_nothing_lost(connection, path, dict(zip(image_ids, names, strict=True)))
         elif on_existing == "replace":
             _clear_images(connection, set(image_ids))
-        firsts = append_keypoints(connection, path, image_ids, keypoints)
+        firsts = _append_keypoints(connection, path, image_ids, keypoints)
         shifts = [np.array([firsts[i], firsts[j]], dtype=np.uint32) for i, j in pairs]
-        append_pairs(
+        _append_pairs(
             connection,
             path,
-            order_pairs(image_ids, pairs),
+            _order_pairs(image_ids, pairs),
             shifts=shifts,
             matches=matches,
             geometries=geometries,
         )
         if names:
-            complete_frames(connection, path)
+            _complete_frames(connection, path)
         if places is not None:
-            write_places(connection, image_ids, places)
+            _write_places(connection, image_ids, places)
 
     if is_new(path):
         write_new(path, fill)
@@ -177,9 +192,7 @@ def _insert_images(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
 ) -> dict[str, int]:
     """Insert images with a camera for all or one for each; returns the ids of the names."""
-    each: list[Any] = (
-        [cameras] * len(names) if isinstance(cameras, pycolmap.Camera) else list(cameras)
-    )
+    each = [cameras] * len(names) if isinstance(cameras, pycolmap.Camera) else list(cameras)
     rows = list({id(camera): camera for camera in each}.values())
     row_of = {id(camera): row for row, camera in enumerate(rows)}
     (first_id,) = connection.execute(
@@ -247,3 +260,316 @@ def _clear_images(connection: sqlite3.Connection, image_ids: set[int]) -> None:
             f"DELETE FROM {table} WHERE pair_id = ?",
             (row for row in pair_ids if not image_ids.isdisjoint(image_ids_from_pair_id(row[0]))),
         )
+
+
+def _append_keypoints(
+    connection: sqlite3.Connection,
+    path: Path,
+    image_ids: Sequence[int],
+    keypoints: Sequence[ImageKeypoints],
+) -> list[int]:
+    """Append keypoints to those that the images have; returns where each image's begin."""
+    firsts = [0] * len(image_ids)
+    all_present = any(len(k.xy) for k in keypoints)
+    for index in np.argsort(np.asarray(image_ids, dtype=np.int64)):
+        image_id, xy = image_ids[index], keypoints[index].xy.astype("<f4")
+        present = _read_present_keypoints(connection, path, image_id)
+        firsts[index] = len(present)
+        all_present &= np.array_equal(present[len(present) - len(xy) :, :2], xy)
+        shapes = np.tile(np.array(SHAPES[present.shape[1]], dtype="<f4"), (len(xy), 1))
+        data = np.concatenate([present, np.concatenate([xy, shapes], axis=1)])
+        connection.execute(
+            "INSERT OR REPLACE INTO keypoints (image_id, rows, cols, data) VALUES (?, ?, ?, ?)",
+            (image_id, *data.shape, data.tobytes()),
+        )
+        _append_descriptors(connection, image_id, len(present), len(xy))
+    if all_present:
+        raise DatabaseError(
+            f"{path} has these very keypoints already: they were appended before, so there is "
+            "nothing to do; on_existing replace writes them anew"
+        )
+    return firsts
+
+
+def _read_present_keypoints(
+    connection: sqlite3.Connection, path: Path, image_id: int
+) -> NDArray[np.float32]:
+    """An image's keypoints with all their columns; [0, 2] where it has none."""
+    row = connection.execute(
+        "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
+    ).fetchone()
+    if row is None or row[0] == 0:
+        return np.empty((0, 2), dtype="<f4")
+    return keypoints_from_row(path, image_id, *row)
+
+
+def _append_descriptors(
+    connection: sqlite3.Connection, image_id: int, num_present: int, num_new: int
+) -> None:
+    """Keep an image's descriptors, where it has any, as many as its keypoints.
+
+    COLMAP's guided matching and vocabulary trees refuse other numbers. A zero descriptor lies
+    at a right angle to every other and as near to one other zero descriptor as to the next,
+    so neither the limit of the distance nor that of its ratio lets it match.
+    """
+    if not columns(connection, "descriptors"):
+        return
+    row = connection.execute(
+        "SELECT cols, data FROM descriptors WHERE image_id = ? AND rows = ? AND cols > 0",
+        (image_id, num_present),
+    ).fetchone()
+    if row is not None:
+        num_cols, data = row
+        connection.execute(
+            "UPDATE descriptors SET rows = ?, data = ? WHERE image_id = ?",
+            (num_present + num_new, (data or b"") + bytes(num_new * num_cols), image_id),
+        )
+
+
+def _order_pairs(image_ids: Sequence[int], pairs: NDArray[np.int32]) -> list[tuple[int, int, bool]]:
+    """Rows (pair id, index of the pair, whether its images swap), by pair id.
+
+    COLMAP's columns follow the smaller image id, whatever the order of the images.
+    """
+    rows = []
+    for index, (i, j) in enumerate(pairs):
+        ids = image_ids[i], image_ids[j]
+        rows.append((pair_id_from_image_ids(*ids), index, ids[0] > ids[1]))
+    rows.sort()
+    if len({row[0] for row in rows}) != len(rows):
+        raise ValueError("a pair of images is given twice")
+    return rows
+
+
+def _append_pairs(
+    connection: sqlite3.Connection,
+    path: Path,
+    order: Sequence[tuple[int, int, bool]],
+    *,
+    shifts: Sequence[NDArray[np.uint32]],
+    matches: Sequence[NDArray[np.uint32]],
+    geometries: Sequence[TwoViewGeometry],
+) -> None:
+    """Write pairs; those that have rows get the new matches and inliers after their own.
+
+    Args:
+        connection: the database.
+        path: its path, for messages.
+        order: the pairs' ids and indices, see `_order_pairs`.
+        shifts: for each pair, uint32 [2] number of its images' first new keypoints.
+        matches: for each pair, uint32 [n, 2] matches, counted from these.
+        geometries: for each pair, its geometry, likewise.
+    """
+    present = {
+        row[0]
+        for row in connection.execute(
+            "SELECT pair_id FROM matches WHERE rows > 0 "
+            "UNION SELECT pair_id FROM two_view_geometries WHERE rows > 0"
+        )
+    }
+    there = columns(connection, "two_view_geometries")
+    models = [name for name in ("F", "E", "H", "qvec", "tvec") if name in there]
+    names = ["pair_id", "rows", "cols", "data", "config", *models]
+    insert_geometry = (
+        f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(names)}) "
+        f"VALUES ({', '.join('?' * len(names))})"
+    )
+    for pair_id, index, swap in order:
+        geometry = _swap_images(geometries[index]) if swap else geometries[index]
+        pair_matches = _swapped(matches[index] + shifts[index], swap)
+        inliers = _swapped(geometry.inlier_matches + shifts[index], swap)
+        if geometry.config == TwoViewConfig.DEGENERATE:
+            inliers = inliers[:0]
+        keeps_models = False
+        if pair_id in present:
+            their_matches, their_inliers, their_support = _read_pair(connection, path, pair_id)
+            pair_matches = np.concatenate([their_matches, pair_matches])
+            keeps_models = len(their_inliers) > 0 and their_support >= len(inliers)
+            inliers = np.concatenate([their_inliers, inliers])
+        connection.execute(
+            "INSERT OR REPLACE INTO matches (pair_id, rows, cols, data) VALUES (?, ?, 2, ?)",
+            (pair_id, len(pair_matches), pair_matches.astype("<u4").tobytes()),
+        )
+        if keeps_models:
+            connection.execute(
+                "UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?",
+                (len(inliers), inliers.astype("<u4").tobytes(), pair_id),
+            )
+            continue
+        blobs = (_float_blob(getattr(geometry, name)) for name in models)
+        connection.execute(
+            insert_geometry,
+            (
+                pair_id,
+                len(inliers),
+                2,
+                inliers.astype("<u4").tobytes(),
+                int(geometry.config),
+                *blobs,
+            ),
+        )
+
+
+def _read_pair(
+    connection: sqlite3.Connection, path: Path, pair_id: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32], int]:
+    """A pair's matches, its inliers, and how many inliers support its models.
+
+    A geometry that was never estimated, as importers write it, and one of several models are
+    supported by nothing. Inliers of a degenerate geometry or a watermark are none.
+    """
+    row = connection.execute(
+        "SELECT rows, data FROM matches WHERE pair_id = ?", (pair_id,)
+    ).fetchone()
+    matches = matches_from_row(path, pair_id, *(row or (0, None)))
+    row = connection.execute(
+        "SELECT rows, data, config FROM two_view_geometries WHERE pair_id = ?", (pair_id,)
+    ).fetchone()
+    num_rows, data, config = row or (0, None, TwoViewConfig.UNDEFINED)
+    inliers = matches_from_row(path, pair_id, num_rows, data)
+    if len(matches) == 0:
+        matches = inliers
+    if config in (TwoViewConfig.DEGENERATE, TwoViewConfig.WATERMARK):
+        inliers = inliers[:0]
+    without_model = (TwoViewConfig.UNDEFINED, TwoViewConfig.MULTIPLE)
+    return matches, inliers, 0 if config in without_model else len(inliers)
+
+
+def _swapped(matches: NDArray[np.uint32], swap: bool) -> NDArray[np.uint32]:
+    return matches[:, ::-1] if swap else matches
+
+
+def _float_blob(values: NDArray[np.float64] | None) -> bytes | None:
+    return None if values is None else np.asarray(values, dtype="<f8").tobytes()
+
+
+def _swap_images(geometry: TwoViewGeometry) -> TwoViewGeometry:
+    """The models of the same geometry from the second image to the first.
+
+    The columns of `inlier_matches` stay as they are.
+    """
+    qvec = tvec = H = None
+    if geometry.qvec is not None and geometry.tvec is not None:
+        w, x, y, z = geometry.qvec
+        qvec = np.array([w, -x, -y, -z])
+        tvec = -_rotation(qvec) @ geometry.tvec
+    if geometry.H is not None and np.linalg.cond(geometry.H) < 1 / np.finfo(np.float64).eps:
+        H = np.asarray(np.linalg.inv(geometry.H), dtype=np.float64)
+    return dataclasses.replace(
+        geometry,
+        E=None if geometry.E is None else geometry.E.T,
+        F=None if geometry.F is None else geometry.F.T,
+        H=H,
+        qvec=qvec,
+        tvec=tvec,
+    )
+
+
+def _rotation(qvec: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, (x, y, z) = qvec[0], qvec[1:]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
+
+
+def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:
+    """Give every image a frame where the file has rigs or frames at all.
+
+    COLMAP makes rigs and frames by itself, but only where there are none.
+    """
+    tables = ("rigs", "rig_sensors", "frames", "frame_data")
+    if not all(columns(connection, table) for table in tables):
+        return
+    if not (has_rows(connection, "rigs") or has_rows(connection, "frames")):
+        return
+    rig_of_camera = dict(
+        connection.execute(
+            "SELECT ref_sensor_id, rig_id FROM rigs WHERE ref_sensor_type = ?", (_CAMERA_SENSOR,)
+        ).fetchall()
+    )
+    in_larger_rig = {
+        row[0]
+        for row in connection.execute(
+            "SELECT sensor_id FROM rig_sensors WHERE sensor_type = ?", (_CAMERA_SENSOR,)
+        )
+    }
+    unframed = connection.execute(
+        "SELECT image_id, name, camera_id FROM images WHERE image_id NOT IN "
+        "(SELECT data_id FROM frame_data WHERE sensor_type = ?) ORDER BY image_id",
+        (_CAMERA_SENSOR,),
+    ).fetchall()
+    for image_id, name, camera_id in unframed:
+        if camera_id not in rig_of_camera:
+            if camera_id in in_larger_rig:
+                raise DatabaseError(
+                    f"{path}: image {name!r} has no frame, and its camera is one of several in a "
+                    "rig: run COLMAP's rig_configurator on the database first"
+                )
+            rig_of_camera[camera_id] = connection.execute(
+                "INSERT INTO rigs (ref_sensor_id, ref_sensor_type) VALUES (?, ?)",
+                (camera_id, _CAMERA_SENSOR),
+            ).lastrowid
+        frame_id = connection.execute(
+            "INSERT INTO frames (rig_id) VALUES (?)", (rig_of_camera[camera_id],)
+        ).lastrowid
+        connection.execute(
+            "INSERT INTO frame_data (frame_id, data_id, sensor_id, sensor_type) "
+            "VALUES (?, ?, ?, ?)",
+            (frame_id, image_id, camera_id, _CAMERA_SENSOR),
+        )
+
+
+def _write_places(
+    connection: sqlite3.Connection, image_ids: Sequence[int], places: NDArray[np.float64]
+) -> None:
+    """Write where images were taken as pose priors; images that have one keep it.
+
+    A file of COLMAP 3.8 or 3.9 gets them where these look for them, too.
+
+    Args:
+        connection: the open file.
+        image_ids: the images.
+        places: float64 [n, 3] latitude, longitude and altitude; NaN where unknown.
+    """
+    known = [(i, p) for i, p in zip(image_ids, places, strict=True) if np.isfinite(p).all()]
+    if not known:
+        return
+    if not columns(connection, "pose_priors"):
+        connection.execute(_POSE_PRIORS)
+    if "pose_prior_id" in columns(connection, "pose_priors"):
+        _write_newer(connection, known)
+    else:
+        connection.executemany(
+            "INSERT OR IGNORE INTO pose_priors (image_id, position, coordinate_system, "
+            "position_covariance) VALUES (?, ?, ?, ?)",
+            ((i, p.astype("<f8").tobytes(), WGS84, _UNKNOWN.tobytes()) for i, p in known),
+        )
+    if "prior_tx" in columns(connection, "images"):
+        connection.executemany(
+            "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? "
+            "WHERE image_id = ? AND prior_tx IS NULL",
+            ((*map(float, p), i) for i, p in known),
+        )
+
+
+def _write_newer(
+    connection: sqlite3.Connection, known: Sequence[tuple[int, NDArray[np.float64]]]
+) -> None:
+    """The same in the layout of COLMAP 4.0 and later."""
+    camera_of = dict(connection.execute("SELECT image_id, camera_id FROM images").fetchall())
+    connection.executemany(
+        "INSERT OR IGNORE INTO pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type, "
+        "position, position_covariance, gravity, coordinate_system) VALUES (?, ?, ?, ?, ?, ?, ?)",
+        (
+            (
+                i,
+                camera_of[i],
+                _CAMERA_SENSOR,
+                p.astype("<f8").tobytes(),
+                _UNKNOWN.tobytes(),
+                _UNKNOWN[:3].tobytes(),
+                WGS84,
+            )
+            for i, p in known
+        ),
+    )
