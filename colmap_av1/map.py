@@ -12,9 +12,9 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.check.crossings import model_crossings
 from colmap_av1.check.database import check
-from colmap_av1.check.model_figures import ModelFigures, model_figures
+from colmap_av1.check.model import check_model
+from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
@@ -23,7 +23,7 @@ from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
-from colmap_av1.poses.long_range import FarViews, model_far_views
+from colmap_av1.poses.long_range import FarViews
 from colmap_av1.poses.mapper import is_mapper_log, map_poses
 from colmap_av1.poses.placing.placement import (
     Placement,
@@ -32,7 +32,6 @@ from colmap_av1.poses.placing.placement import (
     write_place,
 )
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
-from colmap_av1.poses.seams import model_joints
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.outputs import check_files, check_folder
@@ -144,15 +143,20 @@ def map_database(
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
-    missing = _missing(num_images, num_registered)
-    warnings = [*placement.warnings, missing, *_about_joints(model, database, thin_gaps)]
-    far_views: FarViews | None = None
-    try:
-        with clock.measure("far views"):
-            far_views = model_far_views(model, image_path, progress)
-        warnings.append(far_views.warning())
-    except ImageError as error:  # the model stands all the same
-        warnings.append(f"far views are not compared: {error}")
+    unreadable = None
+    with clock.measure("far views"):
+        try:
+            found = check_model(model, image_path=image_path, database=database, progress=progress)
+        except ImageError as error:  # the model stands all the same
+            unreadable = f"far views are not compared: {error}"
+            found = check_model(model, database=database)
+    warnings = (
+        *placement.warnings,
+        _missing(num_images, num_registered),
+        # What the model itself shows says more than the matches it is made of.
+        *(found.joint_warnings or (few_matches_warning(thin_gaps),)),
+        found.far_views.warning() if found.far_views else unreadable,
+    )
     return MapReport(
         output=output,
         database=database,
@@ -160,18 +164,11 @@ def map_database(
         num_images=num_images,
         num_registered=num_registered,
         place=placement.facts,
-        figures=model_figures(model),
-        far_views=far_views,
+        figures=found.figures,
+        far_views=found.far_views,
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )
-
-
-def _about_joints(model: Any, database: Path, thin_gaps: Sequence[Gap]) -> tuple[str | None, ...]:
-    """What the user should know of a model whose parts hardly hold together, or wrongly."""
-    told = (model_joints(model).warning, model_crossings(model, database).warning)
-    # What the model itself shows says more than what it is made of.
-    return told if any(told) else (few_matches_warning(thin_gaps),)
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:

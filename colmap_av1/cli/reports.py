@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_av1.batch.run import BatchReport
 from colmap_av1.check.database import CheckReport
-from colmap_av1.check.model_figures import ModelFigures
+from colmap_av1.check.model import ModelCheck
 from colmap_av1.densify import DensifyReport
 from colmap_av1.map import MapReport
 from colmap_av1.match import MatchReport
 from colmap_av1.matching.links import LinkReport, gap_in_video
 from colmap_av1.matching.shutter.of_video import VideoReadOut
 from colmap_av1.motion.info import StreamReport
-from colmap_av1.poses.long_range import FarViews
 from colmap_av1.reconstruct import ReconstructReport
 
 if TYPE_CHECKING:  # the comparison is slow to import
@@ -143,14 +142,15 @@ def _far_view_rows(median: float | None, largest: float | None) -> Rows:
     return [("far views agree to", f"{median:.2f} px, {largest:.2f} px at 90 %")]
 
 
-def model_rows(figures: ModelFigures, far_views: FarViews) -> Rows:
+def model_rows(found: ModelCheck) -> Rows:
     """Figures of a model, and whether it holds together."""
+    figures, far_views = found.figures, found.far_views
     return [
         ("images", f"{figures.num_registered} with a pose"),
         ("points", f"{figures.num_points}, in {figures.mean_track_length:.2f} images on average"),
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
-        *_far_view_rows(far_views.median, far_views.largest),
+        *(_far_view_rows(far_views.median, far_views.largest) if far_views else ()),
         ("focal length", f"{figures.focal_length:.2f} px"),
     ]
 

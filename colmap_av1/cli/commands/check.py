@@ -6,16 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from colmap_av1.check.crossings import model_crossings
 from colmap_av1.check.database import check
-from colmap_av1.check.model_figures import model_figures
+from colmap_av1.check.model import check_model
 from colmap_av1.cli.commands.shared import add_command, add_images, add_quiet, print_result
 from colmap_av1.cli.reports import check_rows, model_rows
 from colmap_av1.cli.terminal import progress_bars
 from colmap_av1.errors import OptionError
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.poses.long_range import model_far_views
-from colmap_av1.poses.seams import model_joints
 
 _FAILED_CHECK = 1
 
@@ -65,11 +62,13 @@ def _run(namespace: argparse.Namespace) -> int:
 def _check_model(namespace: argparse.Namespace) -> bool:
     """Print what a model is like; whether it holds together."""
     model = read_model(namespace.model)
+    database = None if namespace.database is None else Path(namespace.database)
     with progress_bars(namespace.quiet) as report:
-        far_views = model_far_views(model, Path(namespace.image_path), report)
-    told = [far_views.warning(), model_joints(model).warning]
-    if namespace.database is not None:
-        told.append(model_crossings(model, Path(namespace.database)).warning)
-    warnings = tuple(warning for warning in told if warning is not None)
-    print_result(namespace, model_rows(model_figures(model), far_views), warnings)
-    return not warnings
+        found = check_model(
+            model,
+            image_path=Path(namespace.image_path),
+            database=database,
+            progress=report,
+        )
+    print_result(namespace, model_rows(found), found.warnings)
+    return not found.warnings

@@ -1,0 +1,72 @@
+"""Diagnosis of a COLMAP model: whether its poses fit its points, images and matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from colmap_av1.check.crossings import Crossings, model_crossings
+from colmap_av1.check.model_figures import ModelFigures, model_figures
+from colmap_av1.poses.long_range import FarViews, model_far_views
+from colmap_av1.poses.seams import Joints, model_joints
+from colmap_av1.util.progress import Progress, no_progress
+
+
+@dataclass(frozen=True)
+class ModelCheck:
+    """Diagnosis of a model.
+
+    Attributes:
+        figures: its images, points, errors and focal length.
+        joints: the points that join neighbouring images.
+        crossings: the matches across neighbouring images; None without a database.
+        far_views: the long-range check; None without an image folder.
+    """
+
+    figures: ModelFigures
+    joints: Joints
+    crossings: Crossings | None
+    far_views: FarViews | None
+
+    @property
+    def joint_warnings(self) -> tuple[str, ...]:
+        """Warnings about neighbouring images that are joined weakly or wrongly."""
+        found = (self.joints.warning, self.crossings.warning if self.crossings else None)
+        return tuple(warning for warning in found if warning is not None)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All warnings; none if the model holds together."""
+        far_warning = self.far_views.warning() if self.far_views else None
+        return (*((far_warning,) if far_warning is not None else ()), *self.joint_warnings)
+
+
+def check_model(
+    model: pycolmap.Reconstruction,
+    *,
+    image_path: Path | None = None,
+    database: Path | None = None,
+    progress: Progress = no_progress,
+) -> ModelCheck:
+    """Check whether a model holds together.
+
+    Args:
+        model: the model.
+        image_path: folder of its images, for the long-range check.
+        database: COLMAP database of its matches, which is not changed.
+        progress: called for the stage "far views".
+
+    Raises:
+        ImageError: an image is missing, unreadable or of another size than its camera.
+        DatabaseError: the database cannot be read, or is damaged.
+    """
+    # First, as it may find that images are missing.
+    far_views = None if image_path is None else model_far_views(model, image_path, progress)
+    return ModelCheck(
+        figures=model_figures(model),
+        joints=model_joints(model),
+        crossings=None if database is None else model_crossings(model, database),
+        far_views=far_views,
+    )
