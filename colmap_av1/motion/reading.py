@@ -67,7 +67,7 @@ def read_motion(
     length of the video, but for a few bytes a frame.
 
     Args:
-        video: a file that `colmap_av1.video.open_stream` takes.
+        video: a file that `colmap_av1.video.container.open_stream` takes.
         options: how to read.
 
     Yields:

@@ -1,4 +1,4 @@
-// Python's view of the model core: arrays in, arrays out, the GIL released between.
+// Python's view of the geometry core: arrays in, arrays out, the GIL released between.
 
 #include "bindings/geometry.h"
 
@@ -49,16 +49,16 @@ nb::tuple triangulate(const Poses& cam_from_world, const Pairs& focal, const Ind
                       std::int64_t last, int min_observations, double max_reprojection_error,
                       double min_angle, std::optional<double> max_depth_error, double sigma_floor,
                       double error_to_sigma) {
-  const model::PosedTracks tracks{.cam_from_world = span_of(cam_from_world),
+  const geometry::PosedTracks tracks{.cam_from_world = span_of(cam_from_world),
                                   .focal = span_of(focal),
                                   .offsets = span_of(offsets),
                                   .view = span_of(view),
                                   .rays = span_of(rays),
                                   .sigma = span_of(sigma)};
-  model::PointArrays points;
+  geometry::PointArrays points;
   {
     const nb::gil_scoped_release release;
-    points = model::triangulate(tracks, first, last,
+    points = geometry::triangulate(tracks, first, last,
                                 {.min_observations = min_observations,
                                  .max_reprojection_error = max_reprojection_error,
                                  .min_angle = min_angle,
@@ -73,7 +73,7 @@ nb::tuple triangulate(const Poses& cam_from_world, const Pairs& focal, const Ind
                         points.num_tracks);
 }
 
-model::GreyPicture grey_picture(const Picture& pixels) {
+geometry::GreyPicture grey_picture(const Picture& pixels) {
   return {.pixels = span_of(pixels),
           .width = static_cast<std::int64_t>(pixels.shape(1)),
           .height = static_cast<std::int64_t>(pixels.shape(0))};
@@ -89,7 +89,7 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
   std::vector<float> found;
   {
     const nb::gil_scoped_release release;
-    found = model::correlate_patches(grey_picture(one), span_of(at_one), grey_picture(two),
+    found = geometry::correlate_patches(grey_picture(one), span_of(at_one), grey_picture(two),
                                      span_of(at_two), min_deviation);
   }
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
@@ -104,10 +104,10 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
   if (patches.shape(1) != patches.shape(2)) {
     throw nb::value_error("patches are no squares");
   }
-  model::FoundPatches found;
+  geometry::FoundPatches found;
   {
     const nb::gil_scoped_release release;
-    found = model::find_patches({.pixels = span_of(patches),
+    found = geometry::find_patches({.pixels = span_of(patches),
                                  .side = static_cast<std::int64_t>(patches.shape(1)),
                                  .index = span_of(index),
                                  .middle = span_of(middle),
@@ -119,7 +119,7 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
                         adopt(std::move(found.missed)), adopt(std::move(found.likeness)));
 }
 
-model::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
+geometry::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
                               const Pairs& rays, const Points& xyz, const Indices& offsets,
                               const Indices& observation) {
   return {.cam_from_world = span_of(cam_from_world),
@@ -137,7 +137,7 @@ nb::object reprojection_errors(const Poses& cam_from_world, const Pairs& focal, 
   std::vector<double> errors;
   {
     const nb::gil_scoped_release release;
-    errors = model::reprojection_errors(
+    errors = geometry::reprojection_errors(
         seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation));
   }
   return adopt(std::move(errors));
@@ -148,7 +148,7 @@ nb::object widest_angles(const Points& centres, const Points& xyz, const Indices
   std::vector<double> angles;
   {
     const nb::gil_scoped_release release;
-    angles = model::widest_angles(span_of(centres), span_of(xyz), span_of(offsets), span_of(view));
+    angles = geometry::widest_angles(span_of(centres), span_of(xyz), span_of(offsets), span_of(view));
   }
   return adopt(std::move(angles));
 }
@@ -161,7 +161,7 @@ nb::object hanging_observations(const Poses& cam_from_world, const Pairs& focal,
   std::vector<std::int64_t> counts;
   {
     const nb::gil_scoped_release release;
-    counts = model::hanging_observations(
+    counts = geometry::hanging_observations(
         seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation),
         {.before = before,
          .as_near = as_near,
@@ -174,10 +174,10 @@ nb::object hanging_observations(const Poses& cam_from_world, const Pairs& focal,
 
 nb::tuple points_in_view(const Pose& cam_from_world, const InputArray<double, nb::shape<2>>& low,
                          const InputArray<double, nb::shape<2>>& high, const Points& xyz) {
-  model::PointsInView found;
+  geometry::PointsInView found;
   {
     const nb::gil_scoped_release release;
-    found = model::points_in_view(span_of(cam_from_world),
+    found = geometry::points_in_view(span_of(cam_from_world),
                                   {.low_x = low.data()[0],
                                    .low_y = low.data()[1],
                                    .high_x = high.data()[0],
@@ -193,10 +193,10 @@ nb::tuple points_in_picture(const Pose& cam_from_world,
                             const InputArray<double, nb::shape<4>>& pinhole, double width,
                             double height, const Points& xyz) {
   const double* params = pinhole.data();
-  model::PointsInPicture found;
+  geometry::PointsInPicture found;
   {
     const nb::gil_scoped_release release;
-    found = model::points_in_picture(span_of(cam_from_world),
+    found = geometry::points_in_picture(span_of(cam_from_world),
                                      {.focal_x = params[0],
                                       .focal_y = params[1],
                                       .centre_x = params[2],
@@ -216,7 +216,7 @@ nb::object nearest_in_cells(const Pairs& xy, const Numbers& depth, int cell, std
   std::vector<double> nearest;
   {
     const nb::gil_scoped_release release;
-    nearest = model::nearest_in_cells(span_of(xy), span_of(depth), cell, columns, rows);
+    nearest = geometry::nearest_in_cells(span_of(xy), span_of(depth), cell, columns, rows);
   }
   return adopt<double>(std::move(nearest),
                        {static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
@@ -228,7 +228,7 @@ nb::object best_at_spacings(const Pairs& xy, const Numbers& depth, const Indices
   std::vector<std::int64_t> found;
   {
     const nb::gil_scoped_release release;
-    found = model::best_at_spacings(span_of(xy), span_of(depth), span_of(rank), width, height,
+    found = geometry::best_at_spacings(span_of(xy), span_of(depth), span_of(rank), width, height,
                                     {.spacings = span_of(spacings),
                                      .steps_per_octave = steps_per_octave,
                                      .most_steps = most_steps});

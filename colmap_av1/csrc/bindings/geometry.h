@@ -1,4 +1,4 @@
-// Bindings of the model core.
+// Bindings of the geometry core.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -23,7 +23,7 @@ namespace {
 
 using colmap_av1::fuzz::check;
 using colmap_av1::fuzz::Input;
-namespace model = colmap_av1::model;
+namespace geometry = colmap_av1::geometry;
 
 using Doubles = std::vector<double>;
 using Indices = std::vector<std::int64_t>;
@@ -88,7 +88,7 @@ void run_points(Input& input) {
   const Doubles xyz = reals(input, 3 * num_points);
   const Indices observation = indices(input, num_seen, num_seen);
   const Indices rows = offsets(input, num_points, num_seen);
-  const model::SeenPoints points{.cam_from_world = poses,
+  const geometry::SeenPoints points{.cam_from_world = poses,
                                  .focal = focal,
                                  .view = view,
                                  .rays = rays,
@@ -96,13 +96,13 @@ void run_points(Input& input) {
                                  .offsets = rows,
                                  .observation = observation};
   refused_or([&] {
-    const Doubles errors = model::reprojection_errors(points);
+    const Doubles errors = geometry::reprojection_errors(points);
     check(errors.size() == num_seen &&
               std::all_of(errors.begin(), errors.end(), [](double e) { return e >= 0; }),
           "errors are numbers");
   });
   refused_or([&] {
-    const Indices counts = model::hanging_observations(
+    const Indices counts = geometry::hanging_observations(
         points, {.before = real(input),
                  .as_near = real(input),
                  .support = input.byte() % 5,
@@ -115,20 +115,20 @@ void run_points(Input& input) {
   });
   refused_or([&] {
     const Doubles angles =
-        model::widest_angles(std::span(poses).first(3 * num_views), xyz, rows, view);
+        geometry::widest_angles(std::span(poses).first(3 * num_views), xyz, rows, view);
     check(std::all_of(angles.begin(), angles.end(), [](double a) { return a >= 0 && a < 3.2; }),
           "angles are at most half a turn");
   });
   std::vector<float> sigma(num_seen);
   for (float& value : sigma) value = static_cast<float>(input.byte()) / 16.F;
   refused_or([&] {
-    const model::PosedTracks tracks{.cam_from_world = poses,
+    const geometry::PosedTracks tracks{.cam_from_world = poses,
                                     .focal = focal,
                                     .offsets = rows,
                                     .view = view,
                                     .rays = rays,
                                     .sigma = sigma};
-    const auto found = model::triangulate(
+    const auto found = geometry::triangulate(
         tracks, 0, static_cast<std::int64_t>(num_points),
         {.min_observations = input.byte() % 4, .max_reprojection_error = real(input)});
     check(found.xyz.size() == 3 * found.error.size() && found.count.size() == found.error.size(),
@@ -145,13 +145,13 @@ void run_pictures(Input& input) {
   const auto pose = std::span(numbers).first<12>();
   const auto given = std::span(numbers).subspan(12, 4);
   const auto xyz = std::span(numbers).subspan(16);
-  const auto in_view = model::points_in_view(
+  const auto in_view = geometry::points_in_view(
       pose, {.low_x = given[0], .low_y = given[1], .high_x = given[2], .high_y = given[3]}, xyz);
   check(in_view.xyz.size() == 3 * in_view.index.size() && in_view.index.size() <= num_points,
         "points in view are some of all");
   const std::int64_t width = input.byte();
   const std::int64_t height = input.byte();
-  const auto shown = model::points_in_picture(pose,
+  const auto shown = geometry::points_in_picture(pose,
                                               {.focal_x = given[0],
                                                .focal_y = given[1],
                                                .centre_x = given[2],
@@ -164,23 +164,23 @@ void run_pictures(Input& input) {
   const int cell = input.byte() % 20;
   refused_or([&] {
     const std::int64_t columns = input.byte() % 20;
-    const auto nearest = model::nearest_in_cells(beyond, depths, cell, columns, 7);
+    const auto nearest = geometry::nearest_in_cells(beyond, depths, cell, columns, 7);
     check(nearest.size() == static_cast<std::size_t>(7 * columns), "all cells have depths");
   });
   Indices rank(shown.depth.size());
   for (std::size_t i = 0; i < rank.size(); ++i) rank[i] = static_cast<std::int64_t>(i);
   const Indices spacings{16, 4, input.byte() % 4};
-  const model::SurfaceOptions options{.spacings = spacings,
+  const geometry::SurfaceOptions options{.spacings = spacings,
                                       .steps_per_octave = real(input),
                                       .most_steps = input.byte() % 40};
   refused_or([&] {
     const Indices stages =
-        model::best_at_spacings(shown.xy, shown.depth, rank, width, height, options);
+        geometry::best_at_spacings(shown.xy, shown.depth, rank, width, height, options);
     // The first point is the best one, wherever it is.
     check(stages.empty() || stages.front() == 0, "the best point is wanted first");
   });
   rank.resize(depths.size());
-  refused_or([&] { model::best_at_spacings(beyond, depths, rank, width, height, options); });
+  refused_or([&] { geometry::best_at_spacings(beyond, depths, rank, width, height, options); });
 }
 
 void run_patches(Input& input) {
@@ -188,14 +188,14 @@ void run_patches(Input& input) {
   const std::int64_t height = input.byte() % 24;
   std::vector<std::uint8_t> pixels(static_cast<std::size_t>(width * height));
   for (std::uint8_t& pixel : pixels) pixel = input.byte();
-  const model::GreyPicture picture{.pixels = pixels, .width = width, .height = height};
+  const geometry::GreyPicture picture{.pixels = pixels, .width = width, .height = height};
   std::vector<float> places(2 * (input.byte() % 9));
   for (float& at : places) at = static_cast<float>(2 * real(input));
   refused_or([&] {
     const auto one = std::span(places).first(places.size() / 4 * 2);
     const auto two = std::span(places).subspan(one.size());
     const auto found =
-        model::correlate_patches(picture, one, picture, two, static_cast<float>(real(input)));
+        geometry::correlate_patches(picture, one, picture, two, static_cast<float>(real(input)));
     check(std::all_of(found.begin(), found.end(),
                       [](float value) { return std::abs(value) < 1.001F; }),
           "correlations are at most 1");
@@ -205,11 +205,11 @@ void run_patches(Input& input) {
   std::vector<float> change(4 * num_sought);
   for (float& value : change) value = static_cast<float>(real(input));
   // The picture itself where it is a square, so that something is found.
-  const model::CutPatches patches{
+  const geometry::CutPatches patches{
       .pixels = pixels, .side = width, .index = index, .middle = places, .change = change};
   const auto max_move = static_cast<float>(real(input));
   refused_or([&] {
-    const auto found = model::find_patches(patches, picture, places, max_move);
+    const auto found = geometry::find_patches(patches, picture, places, max_move);
     for (std::size_t i = 0; i < num_sought; ++i) {
       const bool is_found = std::isfinite(found.missed[i]);
       check(found.missed[i] >= 0 && std::abs(found.likeness[i]) < 1.001F, "patches are compared");

@@ -7,7 +7,7 @@
 #include <cstddef>
 #include <limits>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 using Vector = std::array<double, 3>;
 
@@ -90,4 +90,4 @@ double widest_angle(std::size_t count, const RayOf& ray_of) {
   return std::acos(std::clamp(narrowest, -1.0, 1.0));
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

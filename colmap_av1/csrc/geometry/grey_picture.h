@@ -9,7 +9,7 @@
 #include <stdexcept>
 #include <vector>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 // Borrowed: a grey picture, rows one after the other.
 struct GreyPicture {
@@ -88,4 +88,4 @@ class FloatPicture {
   std::int64_t height_ = 0;
 };
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

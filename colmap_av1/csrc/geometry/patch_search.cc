@@ -7,7 +7,7 @@
 #include <limits>
 #include <stdexcept>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 // Side in pixels of what is compared.
@@ -243,4 +243,4 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
   return found;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -7,7 +7,7 @@
 
 #include "geometry/grey_picture.h"
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 // What is to be found: squares cut out of pictures, and how another picture shows them.
 struct CutPatches {
@@ -34,4 +34,4 @@ struct FoundPatches {
 FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
                           std::span<const float> start, float max_move);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -5,7 +5,7 @@
 #include <cstddef>
 #include <stdexcept>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 constexpr int kSamples = kPatch * kPatch;
@@ -101,4 +101,4 @@ std::vector<float> correlate_patches(const GreyPicture& one, std::span<const flo
   return found;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -6,7 +6,7 @@
 
 #include "geometry/grey_picture.h"
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 // Side of a patch in pixels.
 inline constexpr int kPatch = 8;
@@ -20,4 +20,4 @@ std::vector<float> correlate_patches(const GreyPicture& one, std::span<const flo
                                      const GreyPicture& two, std::span<const float> at_two,
                                      float min_deviation);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -8,7 +8,7 @@
 
 #include "geometry/geometry.h"
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 // Throws for points, rows of observations and views that do not fit each other.
@@ -172,4 +172,4 @@ std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
   return counts;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -5,7 +5,7 @@
 #include <span>
 #include <vector>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 // Borrowed: points and where posed images see them, in compressed sparse row form.
 struct SeenPoints {
@@ -45,4 +45,4 @@ struct HangingOptions {
 std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
                                                const HangingOptions& options);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -9,7 +9,7 @@
 
 #include "geometry/geometry.h"
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 // Points worked on at a time.
@@ -112,4 +112,4 @@ std::vector<double> nearest_in_cells(std::span<const double> xy, std::span<const
   return nearest;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

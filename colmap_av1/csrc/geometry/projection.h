@@ -5,7 +5,7 @@
 #include <span>
 #include <vector>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 // A pinhole camera's pixels: the first one's centre is at (0.5, 0.5).
 struct Pinhole {
@@ -53,4 +53,4 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
 std::vector<double> nearest_in_cells(std::span<const double> xy, std::span<const double> depth,
                                      int cell, std::int64_t columns, std::int64_t rows);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -6,7 +6,7 @@
 #include <limits>
 #include <stdexcept>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 void check(std::span<const double> xy, std::span<const double> depth,
@@ -79,4 +79,4 @@ std::vector<std::int64_t> best_at_spacings(std::span<const double> xy,
   return found;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -5,7 +5,7 @@
 #include <span>
 #include <vector>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 struct SurfaceOptions {
   std::span<const std::int64_t> spacings;  // px; widths of cells, wide ones first
@@ -22,4 +22,4 @@ std::vector<std::int64_t> best_at_spacings(std::span<const double> xy,
                                            std::span<const std::int64_t> rank, std::int64_t width,
                                            std::int64_t height, const SurfaceOptions& options);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

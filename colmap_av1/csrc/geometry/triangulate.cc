@@ -9,7 +9,7 @@
 
 #include "geometry/geometry.h"
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 namespace {
 
 // Two rays that a first guess is made of, by their place in the track from 0 to 1.
@@ -261,4 +261,4 @@ PointArrays triangulate(const PosedTracks& tracks, std::int64_t first, std::int6
   return points;
 }
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

@@ -6,7 +6,7 @@
 #include <span>
 #include <vector>
 
-namespace colmap_av1::model {
+namespace colmap_av1::geometry {
 
 struct TriangulateOptions {
   int min_observations = 2;
@@ -44,4 +44,4 @@ struct PointArrays {
 PointArrays triangulate(const PosedTracks& tracks, std::int64_t first, std::int64_t last,
                         const TriangulateOptions& options);
 
-}  // namespace colmap_av1::model
+}  // namespace colmap_av1::geometry

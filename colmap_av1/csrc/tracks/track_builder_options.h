@@ -8,7 +8,7 @@
 
 namespace colmap_av1::tracks {
 
-// A limit without a value is off. Meaning and units: TrackOptions in the package's options.py.
+// A limit without a value is off. Meaning and units: TrackOptions in the package's options/tracks.py.
 struct TrackBuilderOptions {
   int min_length = 4;
   std::optional<double> cosine;
