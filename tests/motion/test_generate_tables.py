@@ -5,12 +5,14 @@ import pytest
 from conftest import PROJECT
 
 CORE = PROJECT / "colmap_av1" / "csrc" / "av1"
-DEFINITION = re.compile(r"^const (std::\w+) (\w+)((?:\[\d+\])+) = (\{.*?\});$", re.M | re.S)
+DEFINITION = re.compile(
+    r"^(?:inline constexpr|const) (std::\w+) (\w+)((?:\[\d+\])+) = (\{.*?\});$", re.M | re.S
+)
 DECLARATION = re.compile(r"^extern const (std::\w+) (\w+)((?:\[\d+\])+);$", re.M)
 
 
-def read_tables(stem: str) -> dict[str, tuple[tuple[int, ...], list[int]]]:
-    text = (CORE / f"{stem}.cc").read_text(encoding="utf-8")
+def read_tables(file: str) -> dict[str, tuple[tuple[int, ...], list[int]]]:
+    text = (CORE / file).read_text(encoding="utf-8")
     return {
         name: (
             tuple(int(dim) for dim in re.findall(r"\d+", dims)),
@@ -21,7 +23,7 @@ def read_tables(stem: str) -> dict[str, tuple[tuple[int, ...], list[int]]]:
 
 
 def test_every_cdf_row_increases_to_one_and_ends_with_its_counter():
-    cdfs = read_tables("default_cdfs")
+    cdfs = read_tables("default_cdfs.cc")
     assert len(cdfs) == 96
     for name, (dims, values) in cdfs.items():
         for start in range(0, len(values), dims[-1]):
@@ -31,16 +33,15 @@ def test_every_cdf_row_increases_to_one_and_ends_with_its_counter():
             assert all(a < b for a, b in pairwise(row[:-1])), name
 
 
-@pytest.mark.parametrize("stem", ["default_cdfs", "spec_tables"])
-def test_declarations_match_definitions(stem):
-    source = (CORE / f"{stem}.cc").read_text(encoding="utf-8")
-    header = (CORE / f"{stem}.h").read_text(encoding="utf-8")
+def test_declarations_match_definitions():
+    source = (CORE / "default_cdfs.cc").read_text(encoding="utf-8")
+    header = (CORE / "default_cdfs.h").read_text(encoding="utf-8")
     assert DECLARATION.findall(header) == [match[:3] for match in DEFINITION.findall(source)]
 
 
-@pytest.mark.parametrize("stem", ["default_cdfs", "spec_tables"])
-def test_arrays_hold_as_many_values_as_stated(stem):
-    for name, (dims, values) in read_tables(stem).items():
+@pytest.mark.parametrize("file", ["default_cdfs.cc", "spec_tables.h"])
+def test_arrays_hold_as_many_values_as_stated(file):
+    for name, (dims, values) in read_tables(file).items():
         size = 1
         for dim in dims:
             size *= dim
@@ -48,7 +49,7 @@ def test_arrays_hold_as_many_values_as_stated(stem):
 
 
 def test_every_scan_visits_each_position_once():
-    scans = {k: v for k, v in read_tables("spec_tables").items() if "Scan" in k}
+    scans = {k: v for k, v in read_tables("spec_tables.h").items() if "Scan" in k}
     assert len(scans) == 32
     for name, (_, values) in scans.items():
         width, height = (int(side) for side in re.findall(r"\d+", name))
@@ -59,7 +60,7 @@ def test_block_sizes_agree_with_their_names():
     constants = dict(
         re.findall(r"int (BLOCK_\d+X\d+) = (\d+);", (CORE / "constants.h").read_text("utf-8"))
     )
-    tables = read_tables("spec_tables")
+    tables = read_tables("spec_tables.h")
     assert len(constants) == 22
     for name, index in constants.items():
         width, height = (int(side) for side in re.findall(r"\d+", name))

@@ -2,8 +2,8 @@
 
 Usage: ``python generate_tables.py SPEC_DIR``, where SPEC_DIR holds the specification's markdown
 chapters (03.symbols.md to 10.additional.tables.md). The files constants.h, spec_tables.h,
-spec_tables.cc, default_cdfs.h and default_cdfs.cc are written beside this script; they are
-committed, so building the package needs neither the specification nor this script.
+default_cdfs.h and default_cdfs.cc are written beside this script; they are committed, so building
+the package needs neither the specification nor this script.
 
 Every array definition of the chapters is either emitted or named in ``_PIXEL_TABLES`` or
 ``_NOT_CONSTANT``: a table that a later edition of the specification adds is never dropped
@@ -132,9 +132,9 @@ class _Table:
 
     @property
     def declaration(self) -> str:
-        """Type, name and dimensions, without ``extern`` and without the values."""
+        """Type, name and dimensions, without specifiers and without the values."""
         dims = "".join(f"[{dim}]" for dim in self.dims)
-        return f"const {self.cpp_type} {self.cpp_name}{dims}"
+        return f"{self.cpp_type} {self.cpp_name}{dims}"
 
 
 def _evaluate(expression: str, constants: dict[str, int]) -> int:
@@ -326,23 +326,33 @@ def _format(values: list[_Nested], indent: str, prefix: str) -> str:
 
 
 def _header(tables: list[_Table]) -> str:
-    declarations = "\n".join(f"extern {table.declaration};" for table in tables)
+    declarations = "\n".join(f"extern const {table.declaration};" for table in tables)
     return (
         f"{_BANNER}\n#pragma once\n\n#include <cstdint>\n\nnamespace colmap_av1::av1 {{\n\n"
         f"{declarations}\n\n}}  // namespace colmap_av1::av1\n"
     )
 
 
-def _source(tables: list[_Table], header_name: str) -> str:
+def _definitions(tables: list[_Table], specifiers: str) -> str:
     definitions = []
     for table in tables:
         if isinstance(table.values, int):
             raise ValueError(f"{table.name} is no array; check the specification")
-        definitions.append(f"{_format(table.values, '', f'{table.declaration} = ')};")
-    joined = "\n\n".join(definitions)
+        definitions.append(f"{_format(table.values, '', f'{specifiers} {table.declaration} = ')};")
+    return "\n\n".join(definitions)
+
+
+def _source(tables: list[_Table], header_name: str) -> str:
     return (
         f'{_BANNER}\n#include "av1/{header_name}"\n\nnamespace colmap_av1::av1 {{\n\n'
-        f"{joined}\n\n}}  // namespace colmap_av1::av1\n"
+        f"{_definitions(tables, 'const')}\n\n}}  // namespace colmap_av1::av1\n"
+    )
+
+
+def _constexpr_header(tables: list[_Table]) -> str:
+    return (
+        f"{_BANNER}\n#pragma once\n\n#include <cstdint>\n\nnamespace colmap_av1::av1 {{\n\n"
+        f"{_definitions(tables, 'inline constexpr')}\n\n}}  // namespace colmap_av1::av1\n"
     )
 
 
@@ -392,8 +402,7 @@ def generate(spec_dir: Path) -> dict[str, str]:
         "constants.h": _constants_header(symbols, enumerations),
         "default_cdfs.h": _header(cdfs),
         "default_cdfs.cc": _source(cdfs, "default_cdfs.h"),
-        "spec_tables.h": _header(others),
-        "spec_tables.cc": _source(others, "spec_tables.h"),
+        "spec_tables.h": _constexpr_header(others),
     }
 
 

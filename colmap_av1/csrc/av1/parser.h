@@ -35,7 +35,7 @@ struct Event {
   int obu_offset = 0;  // of the frame's first OBU in its temporal unit, in bytes
   int num_tile_groups = 0;
   int num_wrong_trailing_bits = 0;  // tiles that end otherwise than the specification demands
-  int shown_decode_index = -1;  // show_existing_frame: the event that decoded the frame
+  int shown_decode_index = -1;      // show_existing_frame: the event that decoded the frame
   // By RefFrame; -1 and 0 where there is none.
   std::array<int, TOTAL_REFS_PER_FRAME> ref_decode_index{};
   std::array<std::array<int, 2>, TOTAL_REFS_PER_FRAME> ref_size{};  // UpscaledWidth, FrameHeight

@@ -4,7 +4,8 @@
 #include <algorithm>
 #include <bit>
 #include <cstring>
-#include <vector>
+#include <iterator>
+#include <utility>
 
 #include "av1/error.h"
 #include "av1/spec_tables.h"
@@ -18,7 +19,7 @@ namespace {
 constexpr int kLevelStride = 36;
 
 // By the logarithms of width and height less 2, TX_SIZES_ALL where there is none
-const auto kTxSizes = [] {
+constexpr auto kTxSizes = [] {
   std::array<std::array<std::uint8_t, 5>, 5> sizes{};
   for (auto& row : sizes) row.fill(TX_SIZES_ALL);
   for (std::size_t i = 0; i < TX_SIZES_ALL; ++i) {
@@ -77,86 +78,79 @@ struct ScanEntry {
   std::uint8_t br_offset;    // added to the context of coeff_br
 };
 
-// The scans of all transform sizes and classes with the parts of the contexts that depend on the
-// position alone.
-class ScanTables {
- public:
-  ScanTables() {
-    std::size_t size = 0;
-    for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) size += 3 * num_positions(tx_size);
-    entries_.reserve(size);
-    for (int tx_size = 0; tx_size < TX_SIZES_ALL; ++tx_size) {
-      for (int c = 0; c < 3; ++c) {
-        first_[tx_size][c] = entries_.size();
-        add(tx_size, c);
-      }
+// 5.11.41 Get scan function
+template <int kTxSize, int kTxClass>
+constexpr const auto& scan_of() {
+  const auto choose = [](const auto& def, const auto& mrow, const auto& mcol) -> const auto& {
+    if constexpr (kTxClass == TX_CLASS_2D) {
+      return def;
+    } else if constexpr (kTxClass == TX_CLASS_VERT) {
+      return mrow;
+    } else {
+      return mcol;
     }
+  };
+  if constexpr (kTxSize == TX_4X4) {
+    return choose(kDefaultScan4x4, kMrowScan4x4, kMcolScan4x4);
+  } else if constexpr (kTxSize == TX_4X8) {
+    return choose(kDefaultScan4x8, kMrowScan4x8, kMcolScan4x8);
+  } else if constexpr (kTxSize == TX_8X4) {
+    return choose(kDefaultScan8x4, kMrowScan8x4, kMcolScan8x4);
+  } else if constexpr (kTxSize == TX_8X8) {
+    return choose(kDefaultScan8x8, kMrowScan8x8, kMcolScan8x8);
+  } else if constexpr (kTxSize == TX_8X16) {
+    return choose(kDefaultScan8x16, kMrowScan8x16, kMcolScan8x16);
+  } else if constexpr (kTxSize == TX_16X8) {
+    return choose(kDefaultScan16x8, kMrowScan16x8, kMcolScan16x8);
+  } else if constexpr (kTxSize == TX_16X16) {
+    return choose(kDefaultScan16x16, kMrowScan16x16, kMcolScan16x16);
+  } else if constexpr (kTxSize == TX_4X16) {
+    return choose(kDefaultScan4x16, kMrowScan4x16, kMcolScan4x16);
+  } else if constexpr (kTxSize == TX_16X4) {
+    return choose(kDefaultScan16x4, kMrowScan16x4, kMcolScan16x4);
+  } else if constexpr (kTxSize == TX_8X32) {
+    return kDefaultScan8x32;
+  } else if constexpr (kTxSize == TX_32X8) {
+    return kDefaultScan32x8;
+  } else if constexpr (kTxSize == TX_16X32 || kTxSize == TX_16X64) {
+    return kDefaultScan16x32;
+  } else if constexpr (kTxSize == TX_32X16 || kTxSize == TX_64X16) {
+    return kDefaultScan32x16;
+  } else {
+    return kDefaultScan32x32;
   }
+}
 
-  const ScanEntry* get(int tx_size, int tx_class) const {
-    return entries_.data() + first_[tx_size][tx_class];
-  }
-
- private:
-  static std::size_t num_positions(int tx_size) {
-    const int adjusted = kAdjustedTxSize[tx_size];
-    return std::size_t{kTxWidth[adjusted]} * kTxHeight[adjusted];
-  }
-
-  // 5.11.41 Get scan function
-  template <typename Visit>
-  static void visit_scan(int tx_size, int c, Visit&& visit) {
-    const auto choose = [&](const auto& def, const auto& mrow, const auto& mcol) {
-      visit(c == TX_CLASS_2D ? def : c == TX_CLASS_VERT ? mrow : mcol);
-    };
-    switch (tx_size) {
-      case TX_4X4: return choose(kDefaultScan4x4, kMrowScan4x4, kMcolScan4x4);
-      case TX_4X8: return choose(kDefaultScan4x8, kMrowScan4x8, kMcolScan4x8);
-      case TX_8X4: return choose(kDefaultScan8x4, kMrowScan8x4, kMcolScan8x4);
-      case TX_8X8: return choose(kDefaultScan8x8, kMrowScan8x8, kMcolScan8x8);
-      case TX_8X16: return choose(kDefaultScan8x16, kMrowScan8x16, kMcolScan8x16);
-      case TX_16X8: return choose(kDefaultScan16x8, kMrowScan16x8, kMcolScan16x8);
-      case TX_16X16: return choose(kDefaultScan16x16, kMrowScan16x16, kMcolScan16x16);
-      case TX_4X16: return choose(kDefaultScan4x16, kMrowScan4x16, kMcolScan4x16);
-      case TX_16X4: return choose(kDefaultScan16x4, kMrowScan16x4, kMcolScan16x4);
-      case TX_8X32: return visit(kDefaultScan8x32);
-      case TX_32X8: return visit(kDefaultScan32x8);
-      case TX_16X32:
-      case TX_16X64: return visit(kDefaultScan16x32);
-      case TX_32X16:
-      case TX_64X16: return visit(kDefaultScan32x16);
-      default: return visit(kDefaultScan32x32);
+// A scan with the parts of the contexts that depend on the position alone.
+template <int kTxSize, int kTxClass>
+constexpr auto kScan = [] {
+  constexpr const auto& kPositions = scan_of<kTxSize, kTxClass>();
+  constexpr int kWidthLog2 = kTxWidthLog2[kAdjustedTxSize[kTxSize]];
+  std::array<ScanEntry, std::size(kPositions)> entries{};
+  for (std::size_t i = 0; i < entries.size(); ++i) {
+    const int pos = kPositions[i];
+    const int row = pos >> kWidthLog2;
+    const int col = pos - (row << kWidthLog2);
+    ScanEntry& entry = entries[i];
+    entry.index = static_cast<std::uint16_t>(row * kLevelStride + col);
+    bool near;
+    if constexpr (kTxClass == TX_CLASS_2D) {
+      entry.base_offset = kCoeffBaseCtxOffset[kTxSize][std::min(row, 4)][std::min(col, 4)];
+      near = row < 2 && col < 2;
+    } else {
+      const int along = kTxClass == TX_CLASS_VERT ? row : col;
+      entry.base_offset = kCoeffBasePosCtxOffset[std::min(along, 2)];
+      near = along == 0;
     }
+    entry.br_offset = pos == 0 ? 0 : near ? 7 : 14;
   }
+  return entries;
+}();
 
-  void add(int tx_size, int c) {
-    const int bwl = kTxWidthLog2[kAdjustedTxSize[tx_size]];
-    visit_scan(tx_size, c, [&](const auto& scan) {
-      for (const int pos : scan) {
-        const int row = pos >> bwl;
-        const int col = pos - (row << bwl);
-        ScanEntry entry;
-        entry.index = static_cast<std::uint16_t>(row * kLevelStride + col);
-        bool near;
-        if (c == TX_CLASS_2D) {
-          entry.base_offset = kCoeffBaseCtxOffset[tx_size][std::min(row, 4)][std::min(col, 4)];
-          near = row < 2 && col < 2;
-        } else {
-          const int along = c == TX_CLASS_VERT ? row : col;
-          entry.base_offset = kCoeffBasePosCtxOffset[std::min(along, 2)];
-          near = along == 0;
-        }
-        entry.br_offset = pos == 0 ? 0 : near ? 7 : 14;
-        entries_.push_back(entry);
-      }
-    });
-  }
-
-  std::vector<ScanEntry> entries_;
-  std::size_t first_[TX_SIZES_ALL][3];
-};
-
-const ScanTables kScanTables;
+template <int kTxClass>
+constexpr auto kScans = []<std::size_t... kTxSize>(std::index_sequence<kTxSize...>) {
+  return std::array<const ScanEntry*, TX_SIZES_ALL>{kScan<kTxSize, kTxClass>.data()...};
+}(std::make_index_sequence<TX_SIZES_ALL>());
 
 // Levels are stored with their value up to 15 in the low six bits, for coeff_br, and their value
 // up to 3 in the high two, for coeff_base: one sum over the neighbours serves both contexts.
@@ -503,7 +497,7 @@ template <int kTxClass>
 std::uint8_t TileParser::read_levels(int tx_size, int tx_size_ctx, int ptype, int eob,
                                      int dc_sign_ctx) {
   constexpr int kStride = kLevelStride;
-  const ScanEntry* scan = kScanTables.get(tx_size, kTxClass);
+  const ScanEntry* scan = kScans<kTxClass>[tx_size];
   auto& base_cdfs = cdf_.coeff_base[tx_size_ctx][ptype];
   auto& br_cdfs = cdf_.coeff_br[std::min(tx_size_ctx, TX_32X32)][ptype];
   int num_nonzero = 0;

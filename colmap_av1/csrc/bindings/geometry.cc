@@ -50,21 +50,21 @@ nb::tuple triangulate(const Poses& cam_from_world, const Pairs& focal, const Ind
                       double min_angle, std::optional<double> max_depth_error, double sigma_floor,
                       double error_to_sigma) {
   const geometry::PosedTracks tracks{.cam_from_world = span_of(cam_from_world),
-                                  .focal = span_of(focal),
-                                  .offsets = span_of(offsets),
-                                  .view = span_of(view),
-                                  .rays = span_of(rays),
-                                  .sigma = span_of(sigma)};
+                                     .focal = span_of(focal),
+                                     .offsets = span_of(offsets),
+                                     .view = span_of(view),
+                                     .rays = span_of(rays),
+                                     .sigma = span_of(sigma)};
   geometry::PointArrays points;
   {
     const nb::gil_scoped_release release;
     points = geometry::triangulate(tracks, first, last,
-                                {.min_observations = min_observations,
-                                 .max_reprojection_error = max_reprojection_error,
-                                 .min_angle = min_angle,
-                                 .max_depth_error = max_depth_error,
-                                 .sigma_floor = sigma_floor,
-                                 .error_to_sigma = error_to_sigma});
+                                   {.min_observations = min_observations,
+                                    .max_reprojection_error = max_reprojection_error,
+                                    .min_angle = min_angle,
+                                    .max_depth_error = max_depth_error,
+                                    .sigma_floor = sigma_floor,
+                                    .error_to_sigma = error_to_sigma});
   }
   const std::size_t count = points.error.size();
   return nb::make_tuple(adopt<double>(std::move(points.xyz), {count, 3}),
@@ -90,7 +90,7 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
   {
     const nb::gil_scoped_release release;
     found = geometry::correlate_patches(grey_picture(one), span_of(at_one), grey_picture(two),
-                                     span_of(at_two), min_deviation);
+                                        span_of(at_two), min_deviation);
   }
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
 }
@@ -108,20 +108,20 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
   {
     const nb::gil_scoped_release release;
     found = geometry::find_patches({.pixels = span_of(patches),
-                                 .side = static_cast<std::int64_t>(patches.shape(1)),
-                                 .index = span_of(index),
-                                 .middle = span_of(middle),
-                                 .change = span_of(change)},
-                                grey_picture(target), span_of(start), max_move);
+                                    .side = static_cast<std::int64_t>(patches.shape(1)),
+                                    .index = span_of(index),
+                                    .middle = span_of(middle),
+                                    .change = span_of(change)},
+                                   grey_picture(target), span_of(start), max_move);
   }
   const std::size_t count = found.missed.size();
   return nb::make_tuple(adopt<float>(std::move(found.xy), {count, 2}),
                         adopt(std::move(found.missed)), adopt(std::move(found.likeness)));
 }
 
-geometry::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal, const Indices& view,
-                              const Pairs& rays, const Points& xyz, const Indices& offsets,
-                              const Indices& observation) {
+geometry::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal,
+                                 const Indices& view, const Pairs& rays, const Points& xyz,
+                                 const Indices& offsets, const Indices& observation) {
   return {.cam_from_world = span_of(cam_from_world),
           .focal = span_of(focal),
           .view = span_of(view),
@@ -148,7 +148,8 @@ nb::object widest_angles(const Points& centres, const Points& xyz, const Indices
   std::vector<double> angles;
   {
     const nb::gil_scoped_release release;
-    angles = geometry::widest_angles(span_of(centres), span_of(xyz), span_of(offsets), span_of(view));
+    angles =
+        geometry::widest_angles(span_of(centres), span_of(xyz), span_of(offsets), span_of(view));
   }
   return adopt(std::move(angles));
 }
@@ -178,11 +179,11 @@ nb::tuple points_in_view(const Pose& cam_from_world, const InputArray<double, nb
   {
     const nb::gil_scoped_release release;
     found = geometry::points_in_view(span_of(cam_from_world),
-                                  {.low_x = low.data()[0],
-                                   .low_y = low.data()[1],
-                                   .high_x = high.data()[0],
-                                   .high_y = high.data()[1]},
-                                  span_of(xyz));
+                                     {.low_x = low.data()[0],
+                                      .low_y = low.data()[1],
+                                      .high_x = high.data()[0],
+                                      .high_y = high.data()[1]},
+                                     span_of(xyz));
   }
   const std::size_t count = found.index.size();
   return nb::make_tuple(adopt(std::move(found.index)),
@@ -197,13 +198,13 @@ nb::tuple points_in_picture(const Pose& cam_from_world,
   {
     const nb::gil_scoped_release release;
     found = geometry::points_in_picture(span_of(cam_from_world),
-                                     {.focal_x = params[0],
-                                      .focal_y = params[1],
-                                      .centre_x = params[2],
-                                      .centre_y = params[3],
-                                      .width = width,
-                                      .height = height},
-                                     span_of(xyz));
+                                        {.focal_x = params[0],
+                                         .focal_y = params[1],
+                                         .centre_x = params[2],
+                                         .centre_y = params[3],
+                                         .width = width,
+                                         .height = height},
+                                        span_of(xyz));
   }
   const std::size_t count = found.index.size();
   return nb::make_tuple(adopt(std::move(found.index)),
@@ -229,9 +230,9 @@ nb::object best_at_spacings(const Pairs& xy, const Numbers& depth, const Indices
   {
     const nb::gil_scoped_release release;
     found = geometry::best_at_spacings(span_of(xy), span_of(depth), span_of(rank), width, height,
-                                    {.spacings = span_of(spacings),
-                                     .steps_per_octave = steps_per_octave,
-                                     .most_steps = most_steps});
+                                       {.spacings = span_of(spacings),
+                                        .steps_per_octave = steps_per_octave,
+                                        .most_steps = most_steps});
   }
   return adopt(std::move(found));
 }

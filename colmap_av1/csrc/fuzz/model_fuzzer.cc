@@ -31,12 +31,10 @@ using Indices = std::vector<std::int64_t>;
 // Numbers near 0, as rays and places are, and those at which arithmetic ends.
 double real(Input& input) {
   constexpr double kLargest = std::numeric_limits<double>::max();
-  constexpr std::array<double, 6> kEdges{std::numeric_limits<double>::quiet_NaN(),
-                                         std::numeric_limits<double>::infinity(),
-                                         -std::numeric_limits<double>::infinity(),
-                                         kLargest,
-                                         std::numeric_limits<double>::denorm_min(),
-                                         -0.0};
+  constexpr std::array<double, 6> kEdges{
+      std::numeric_limits<double>::quiet_NaN(),  std::numeric_limits<double>::infinity(),
+      -std::numeric_limits<double>::infinity(),  kLargest,
+      std::numeric_limits<double>::denorm_min(), -0.0};
   const std::uint8_t choice = input.byte();
   return choice < kEdges.size() ? kEdges[choice] : (static_cast<double>(choice) - 128) / 16;
 }
@@ -89,12 +87,12 @@ void run_points(Input& input) {
   const Indices observation = indices(input, num_seen, num_seen);
   const Indices rows = offsets(input, num_points, num_seen);
   const geometry::SeenPoints points{.cam_from_world = poses,
-                                 .focal = focal,
-                                 .view = view,
-                                 .rays = rays,
-                                 .xyz = xyz,
-                                 .offsets = rows,
-                                 .observation = observation};
+                                    .focal = focal,
+                                    .view = view,
+                                    .rays = rays,
+                                    .xyz = xyz,
+                                    .offsets = rows,
+                                    .observation = observation};
   refused_or([&] {
     const Doubles errors = geometry::reprojection_errors(points);
     check(errors.size() == num_seen &&
@@ -102,12 +100,12 @@ void run_points(Input& input) {
           "errors are numbers");
   });
   refused_or([&] {
-    const Indices counts = geometry::hanging_observations(
-        points, {.before = real(input),
-                 .as_near = real(input),
-                 .support = input.byte() % 5,
-                 .around = real(input),
-                 .fewest_around = input.byte() % 9});
+    const Indices counts =
+        geometry::hanging_observations(points, {.before = real(input),
+                                                .as_near = real(input),
+                                                .support = input.byte() % 5,
+                                                .around = real(input),
+                                                .fewest_around = input.byte() % 9});
     for (std::size_t i = 0; i < counts.size(); ++i) {
       check(counts[i] >= 0 && counts[i] <= rows[i + 1] - rows[i],
             "points hang in images that see them");
@@ -123,11 +121,11 @@ void run_points(Input& input) {
   for (float& value : sigma) value = static_cast<float>(input.byte()) / 16.F;
   refused_or([&] {
     const geometry::PosedTracks tracks{.cam_from_world = poses,
-                                    .focal = focal,
-                                    .offsets = rows,
-                                    .view = view,
-                                    .rays = rays,
-                                    .sigma = sigma};
+                                       .focal = focal,
+                                       .offsets = rows,
+                                       .view = view,
+                                       .rays = rays,
+                                       .sigma = sigma};
     const auto found = geometry::triangulate(
         tracks, 0, static_cast<std::int64_t>(num_points),
         {.min_observations = input.byte() % 4, .max_reprojection_error = real(input)});
@@ -152,13 +150,13 @@ void run_pictures(Input& input) {
   const std::int64_t width = input.byte();
   const std::int64_t height = input.byte();
   const auto shown = geometry::points_in_picture(pose,
-                                              {.focal_x = given[0],
-                                               .focal_y = given[1],
-                                               .centre_x = given[2],
-                                               .centre_y = given[3],
-                                               .width = static_cast<double>(width),
-                                               .height = static_cast<double>(height)},
-                                              xyz);
+                                                 {.focal_x = given[0],
+                                                  .focal_y = given[1],
+                                                  .centre_x = given[2],
+                                                  .centre_y = given[3],
+                                                  .width = static_cast<double>(width),
+                                                  .height = static_cast<double>(height)},
+                                                 xyz);
   const auto beyond = std::span(numbers).first(2 * (numbers.size() / 2));
   const auto depths = std::span(numbers).first(numbers.size() / 2);
   const int cell = input.byte() % 20;
@@ -170,9 +168,8 @@ void run_pictures(Input& input) {
   Indices rank(shown.depth.size());
   for (std::size_t i = 0; i < rank.size(); ++i) rank[i] = static_cast<std::int64_t>(i);
   const Indices spacings{16, 4, input.byte() % 4};
-  const geometry::SurfaceOptions options{.spacings = spacings,
-                                      .steps_per_octave = real(input),
-                                      .most_steps = input.byte() % 40};
+  const geometry::SurfaceOptions options{
+      .spacings = spacings, .steps_per_octave = real(input), .most_steps = input.byte() % 40};
   refused_or([&] {
     const Indices stages =
         geometry::best_at_spacings(shown.xy, shown.depth, rank, width, height, options);

@@ -70,7 +70,8 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
         std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
-        // As pixels times depth: most points are not seen, and a division takes as long as all else.
+        // As pixels times depth: most points are not seen, and a division takes as long as all
+        // else.
         const auto [u, v, z] = at;
         const double x = camera.focal_x * u + camera.centre_x * z;
         const double y = camera.focal_y * v + camera.centre_y * z;

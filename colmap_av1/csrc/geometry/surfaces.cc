@@ -23,8 +23,9 @@ void check(std::span<const double> xy, std::span<const double> depth,
       throw std::invalid_argument("a point lies outside the picture, behind it or without end");
     }
   }
-  if (options.most_steps < 1 || !std::all_of(options.spacings.begin(), options.spacings.end(),
-                                             [](std::int64_t s) { return s > 0; })) {
+  if (options.most_steps < 1 ||
+      !std::all_of(
+          options.spacings.begin(), options.spacings.end(), [](std::int64_t s) { return s > 0; })) {
     throw std::invalid_argument("spacings and steps are 1 or more");
   }
 }

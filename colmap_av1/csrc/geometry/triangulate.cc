@@ -97,8 +97,7 @@ Vector first_guess(std::span<const Observation> track, double limit, double& cos
 Vector solve(const std::array<double, 6>& n, const Vector& gradient) {
   const auto [a, b, c, d, e, f] = n;  // a b c / . d e / . . f
   const double trace = a + d + f;
-  const double det =
-      a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c);
+  const double det = a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c);
   if (!std::isfinite(trace) || !(det > kSingular * trace * trace * trace)) return {};
   // LDL^T.
   const double l10 = b / a;

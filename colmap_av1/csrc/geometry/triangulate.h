@@ -13,7 +13,7 @@ struct TriangulateOptions {
   double max_reprojection_error = 0;      // px
   double min_angle = 0;                   // radians
   std::optional<double> max_depth_error;  // share of the distance
-  double sigma_floor = 0;  // px; error that an observation has however accurate its motion is
+  double sigma_floor = 0;     // px; error that an observation has however accurate its motion is
   double error_to_sigma = 0;  // from a point's mean reprojection error to that of its rays
 };
 

@@ -8,7 +8,8 @@
 
 namespace colmap_av1::tracks {
 
-// A limit without a value is off. Meaning and units: TrackOptions in the package's options/tracks.py.
+// A limit without a value is off. Meaning and units: TrackOptions in the package's
+// options/tracks.py.
 struct TrackBuilderOptions {
   int min_length = 4;
   std::optional<double> cosine;
@@ -21,7 +22,7 @@ struct TrackBuilderOptions {
   std::optional<double> border;
   std::optional<double> interpolation;
   std::optional<double> bridge;
-  int cells = 1;    // along either side of a unit
+  int cells = 1;  // along either side of a unit
   // Along either side of a square of them that a track starts in; divides cells, or twice as many.
   int seeding = 1;
   // Display indices of the frames whose observations are kept; without a value those of all.

@@ -42,8 +42,7 @@ class TrackStore {
   }
   // Whether a cell holds a track that has no place in a frame yet.
   bool is_unplaced(const Cell& cell, const ChainedFrame& frame) const {
-    return cell.track == kSeed ||
-           (cell.track != kNoTrack && last_seen_[cell.track] != frame.order);
+    return cell.track == kSeed || (cell.track != kNoTrack && last_seen_[cell.track] != frame.order);
   }
 
   // Makes a track of the seed in a cell, seen there where the frame is shown.
