@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
+
+# The record of a block: every value that its syntax gives, under the specification's names.
+BLOCK = _core.block_dtype()
+
+_Value = TypeVar("_Value", bound=np.generic)
+
+
+class _PerUnit(cached_property[NDArray[_Value]], Generic[_Value]):
+    """A field of the blocks, spread over their units when it is first asked for."""
+
+    def __init__(self) -> None:
+        super().__init__(self._spread)
+
+    def _spread(self, frame: FrameMotion) -> NDArray[_Value]:
+        assert self.attrname is not None
+        values: NDArray[_Value] = frame.blocks[self.attrname][frame.block_index]
+        values.setflags(write=False)
+        return values
 
 
 @dataclass(frozen=True)
@@ -17,7 +36,7 @@ class FrameMotion:
 
     Arrays named after the AV1 specification hold one entry per 4x4 luma unit,
     shape [mi_rows, mi_cols]. Units may lie beyond the picture edge (MiRows and
-    MiCols are even).
+    MiCols are even). They are made of `blocks` and `block_index` and cannot be written.
 
     Attributes:
         decode_index: number of the frame among the events (decoded frames and
@@ -34,6 +53,10 @@ class FrameMotion:
         ref_size: [8, 2] (width, height) in pixels of the same frames, 0 where absent.
         slot_decode_index: [8] decode_index of the frame in each reference slot after
             this frame's reference frame update process; -1 for an empty slot.
+        blocks: BLOCK [n] records of the frame's blocks, in decoding order; their fields are
+            those below and more of the block syntax.
+        block_index: int32 [mi_rows, mi_cols] index of the block that a unit is in.
+        local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
         ref_frame: int8 [mi_rows, mi_cols, 2] RefFrame: 0 INTRA, 1..7 LAST..ALTREF, -1 none.
         mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list][0 = row, 1 = column] in 1/8 px.
         mi_size: uint8 MiSize (BLOCK_4X4 = 0 .. BLOCK_64X16 = 21).
@@ -48,7 +71,6 @@ class FrameMotion:
         use_intrabc: uint8.
         warp_index: int32; row of local_warp_params of the unit's block, -1 without
             a valid local warp.
-        local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
     """
 
     decode_index: int
@@ -60,20 +82,23 @@ class FrameMotion:
     ref_display_index: NDArray[np.int32]
     ref_size: NDArray[np.int32]
     slot_decode_index: NDArray[np.int32]
-    ref_frame: NDArray[np.int8]
-    mv: NDArray[np.int16]
-    mi_size: NDArray[np.uint8]
-    y_mode: NDArray[np.uint8]
-    is_inter: NDArray[np.uint8]
-    skip: NDArray[np.uint8]
-    skip_mode: NDArray[np.uint8]
-    segment_id: NDArray[np.uint8]
-    motion_mode: NDArray[np.uint8]
-    compound_type: NDArray[np.uint8]
-    interintra: NDArray[np.uint8]
-    use_intrabc: NDArray[np.uint8]
-    warp_index: NDArray[np.int32]
+    blocks: NDArray[np.void]
+    block_index: NDArray[np.int32]
     local_warp_params: NDArray[np.int32]
+
+    ref_frame = _PerUnit[np.int8]()
+    mv = _PerUnit[np.int16]()
+    mi_size = _PerUnit[np.uint8]()
+    y_mode = _PerUnit[np.uint8]()
+    is_inter = _PerUnit[np.uint8]()
+    skip = _PerUnit[np.uint8]()
+    skip_mode = _PerUnit[np.uint8]()
+    segment_id = _PerUnit[np.uint8]()
+    motion_mode = _PerUnit[np.uint8]()
+    compound_type = _PerUnit[np.uint8]()
+    interintra = _PerUnit[np.uint8]()
+    use_intrabc = _PerUnit[np.uint8]()
+    warp_index = _PerUnit[np.int32]()
 
     def displacement(self, list_index: int) -> NDArray[np.float32]:
         """Displacement of every unit's centre into the frame its list references.
@@ -87,3 +112,9 @@ class FrameMotion:
             global warp applied; NaN where the unit has no reference in this list.
         """
         return _core.displacement(self, list_index)
+
+
+# Names of the arrays that hold one entry per unit.
+UNIT_FIELDS = tuple(
+    name for name, value in vars(FrameMotion).items() if isinstance(value, _PerUnit)
+)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, VideoError, cannot_write
-from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.frame_motion import UNIT_FIELDS, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.util.arguments import checks_arguments
@@ -39,7 +39,8 @@ def export_motion(
     """Write the motion of every coded frame to a .npz or .h5 file.
 
     Coded frame i (in bitstream order, from 0) has its arrays under '%06d/' % i, named after
-    the fields of `FrameMotion`, with its header values under '%06d/header/'. Frames are
+    those of `FrameMotion` (per unit, not per block), with its header values under
+    '%06d/header/'. Frames are
     written one by one, so memory does not grow with the video. The file appears under its
     name only when complete.
 
@@ -122,10 +123,13 @@ def _open_h5(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
 
 
 def _arrays(frame: FrameMotion) -> Iterator[tuple[str, NDArray[Any]]]:
-    for field in dataclasses.fields(frame):
-        value = getattr(frame, field.name)
-        if field.name == "header":
+    names = [field.name for field in dataclasses.fields(frame)]
+    at = names.index("blocks")
+    names[at : at + 2] = UNIT_FIELDS  # in place of blocks and block_index
+    for name in names:
+        value = getattr(frame, name)
+        if name == "header":
             for key, entry in value.items():
                 yield f"header/{key}", np.asarray(entry)
         else:
-            yield field.name, np.asarray(value)
+            yield name, np.asarray(value)

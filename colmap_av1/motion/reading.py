@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.errors import BitstreamError, LimitError, OptionError
-from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.options import ReadOptions
 from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import threads_or_cpus
@@ -24,7 +24,7 @@ from colmap_av1.video.container import check_process, open_stream
 
 # Bytes of block data that threads may read ahead of their use, all together.
 _READ_AHEAD = 1 << 28
-_BYTES_PER_UNIT = 24
+_BYTES_PER_UNIT = 24  # 4 and a share of its block's 60: 8 in most video
 _SMALL_AHEAD = 4  # frames
 
 
@@ -304,6 +304,7 @@ def _frame_motion(event: _core.Event, display_index: dict[int, int]) -> FrameMot
 
     header = event.header()
     ref_decode_index = event.ref_decode_index()
+    blocks, block_index, local_warp_params = event.take_blocks()
     return FrameMotion(
         decode_index=event.decode_index,
         display_index=display_index.get(event.decode_index, -1),
@@ -314,5 +315,7 @@ def _frame_motion(event: _core.Event, display_index: dict[int, int]) -> FrameMot
         ref_display_index=displayed(ref_decode_index),
         ref_size=event.ref_size(),
         slot_decode_index=event.slot_decode_index(),
-        **event.take_units(),
+        blocks=blocks.view(BLOCK),
+        block_index=block_index,
+        local_warp_params=local_warp_params,
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_av1 import _core
+from colmap_av1.motion.frame_motion import BLOCK
 from colmap_av1.video.container import open_stream
 
 _UNIT_FIELDS = (
@@ -43,7 +44,7 @@ _MULTIPLIERS = ("delta_q_res", "delta_lf_res")
 
 def read_events(stream: Path) -> tuple[list[Any], dict[str, int]]:
     """Events of a stream with their blocks, and the first sequence header."""
-    parser = _core.Parser(keep_blocks=True)
+    parser = _core.Parser()
     events: list[Any] = []
     sequence = None
     with open_stream(stream) as opened:
@@ -109,9 +110,10 @@ def _block_differences(
     rows, cols = header["mi_rows"], header["mi_cols"]
     offset = int(want["h_unit_offset"][index])
     intra = header["frame_type"] in _INTRA_FRAMES
-    units = event.take_units()
+    data, block_index, local_warp_params = event.take_blocks()
+    blocks = data.view(BLOCK)
     for name in _UNIT_FIELDS:
-        got = units[name]
+        got = blocks[name][block_index]
         value = want[f"u_{name}"][offset : offset + rows * cols].reshape(got.shape)
         if name == "skip_mode" and intra:
             # 5.11.7 sets skip_mode to 0 in intra frames. The kit's decoder leaves what the
@@ -121,17 +123,23 @@ def _block_differences(
             row, col = np.argwhere((got != value).reshape(rows, cols, -1).any(axis=2))[0]
             yield f"{name} at {row}, {col} is {got[row, col]}, expected {value[row, col]}"
 
-    blocks = event.blocks()
     of_frame = want["b_frame"] == index
-    if len(blocks["row"]) != np.count_nonzero(of_frame):
-        yield f"{len(blocks['row'])} blocks, expected {np.count_nonzero(of_frame)}"
+    if len(blocks) != np.count_nonzero(of_frame):
+        yield f"{len(blocks)} blocks, expected {np.count_nonzero(of_frame)}"
         return
-    compound = units["ref_frame"][blocks["row"], blocks["col"], 1] > 0
+    compound = blocks["ref_frame"][:, 1] > 0
+    renamed = {
+        "row": blocks["mi_row"],
+        "col": blocks["mi_col"],
+        "palette_size_y": blocks["palette_size"][:, 0],
+        "palette_size_uv": blocks["palette_size"][:, 1],
+    }
     for key, values in want.items():
         if not key.startswith("b_") or key == "b_frame":
             continue
         name = key[2:]
-        got, value = blocks[name], values[of_frame].astype(np.int32)
+        got = renamed[name] if name in renamed else blocks[name]
+        value = values[of_frame].astype(np.int32)
         if name in ("comp_group_idx", "compound_idx"):
             got, value = got[compound], value[compound]
         if name == "delta_lf" and not header["delta_lf_present"]:
@@ -142,13 +150,15 @@ def _block_differences(
 
     first = int(np.argmax(of_frame)) if of_frame.any() else 0
     warps = of_frame[want["w_block"]]
-    if not np.array_equal(blocks["warp_block"], want["w_block"][warps] - first):
+    warp_block = np.flatnonzero(blocks["local_warp"] >= 0)
+    valid = blocks["warp_index"][warp_block] >= 0
+    if not np.array_equal(warp_block, want["w_block"][warps] - first):
         yield "blocks with a local warp differ"
-    elif not np.array_equal(blocks["warp_valid"], want["w_valid"][warps]):
+    elif not np.array_equal(valid, want["w_valid"][warps]):
         yield "LocalValid differs"
     else:
-        valid = blocks["warp_valid"] == 1
-        if not np.array_equal(blocks["warp_params"][valid], want["w_params"][warps][valid]):
+        params = local_warp_params[blocks["warp_index"][warp_block[valid]]]
+        if not np.array_equal(params, want["w_params"][warps][valid]):
             yield "LocalWarpParams differ"
-    if not np.array_equal(blocks["tile_sizes"], want["t_size"][want["t_frame"] == index]):
+    if not np.array_equal(event.tile_sizes(), want["t_size"][want["t_frame"] == index]):
         yield "tile sizes differ"

@@ -10,12 +10,13 @@ import av
 import cv2
 import numpy as np
 import pytest
+from block_data import blank_blocks, frame_of_blocks, units, with_units
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.motion.frame_motion import FrameMotion
+from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import TrackOptions
 from colmap_av1.tracks.tracks import Tracks, build_tracks
@@ -64,16 +65,20 @@ def frame(
     """
     refs = refs or {}
     rows, cols = 2 * ((height + 7) // 8), 2 * ((width + 7) // 8)
-    ref_frame = np.full((rows, cols, 2), -1, np.int8)
-    mv = np.zeros((rows, cols, 2, 2), np.int16)
-    if not motion:
-        ref_frame[..., 0] = 0
+    blocks = blank_blocks(rows, cols)
+    blocks["mi_size"] = mi_size
+    blocks["ref_frame"] = -1
+    if motion:
+        blocks["y_mode"] = NEWMV
+        blocks["is_inter"] = 1
+    else:
+        blocks["ref_frame"][..., 0] = 0
     for index, (ref, vector) in enumerate(motion):
-        ref_frame[..., index] = ref
+        blocks["ref_frame"][..., index] = ref
         if isinstance(vector, tuple):
-            mv[..., index, :] = round(8 * vector[1]), round(8 * vector[0])
+            blocks["mv"][..., index, :] = round(8 * vector[1]), round(8 * vector[0])
         else:
-            mv[..., index, :] = vector
+            blocks["mv"][..., index, :] = vector
     ref_decode_index = np.full(8, -1, np.int32)
     ref_display_index = np.full(8, -1, np.int32)
     ref_size = np.zeros((8, 2), np.int32)
@@ -82,19 +87,8 @@ def frame(
         ref_display_index[ref] = ref_display
         ref_size[ref] = (ref_sizes or {}).get(ref, (width, height))
     kept = [decode, *(d for d, _ in refs.values())] if slots is None else list(slots)
-    units = {
-        name: np.zeros((rows, cols), np.uint8)
-        for name in (
-            "skip",
-            "skip_mode",
-            "segment_id",
-            "motion_mode",
-            "compound_type",
-            "interintra",
-            "use_intrabc",
-        )
-    }
-    return FrameMotion(
+    return frame_of_blocks(
+        blocks,
         decode_index=decode,
         display_index=decode if display is None else display,
         width=width,
@@ -110,14 +104,6 @@ def frame(
         ref_display_index=ref_display_index,
         ref_size=ref_size,
         slot_decode_index=np.resize(np.array(kept, np.int32), 8),
-        ref_frame=ref_frame,
-        mv=mv,
-        mi_size=np.full((rows, cols), mi_size, np.uint8),
-        y_mode=np.full((rows, cols), NEWMV if motion else 0, np.uint8),
-        is_inter=np.full((rows, cols), 1 if motion else 0, np.uint8),
-        warp_index=np.full((rows, cols), -1, np.int32),
-        local_warp_params=np.zeros((0, 6), np.int32),
-        **units,
     )
 
 
@@ -161,14 +147,8 @@ def check_invariants(tracks: Tracks, min_length: int, cell: int = 4) -> None:
 
 def warp_units(motion: FrameMotion, params: Sequence[int]) -> FrameMotion:
     """All units as LOCALWARP blocks of one model; the mv is nonsense."""
-    return replace(
-        motion,
-        motion_mode=np.full_like(motion.motion_mode, LOCALWARP),
-        mi_size=np.full_like(motion.mi_size, BLOCK_8X8),
-        warp_index=np.zeros_like(motion.warp_index),
-        local_warp_params=np.array([params], np.int32),
-        mv=np.full_like(motion.mv, 999),
-    )
+    warped = with_units(motion, motion_mode=LOCALWARP, mi_size=BLOCK_8X8, warp_index=0, mv=999)
+    return replace(warped, local_warp_params=np.array([params], np.int32))
 
 
 def similarity_params(angle: float, zoom: float, shift: tuple[float, float]) -> list[int]:
@@ -193,10 +173,7 @@ def test_displacement_of_a_translation_is_the_vector() -> None:
 def test_displacement_of_intra_blocks_is_nan() -> None:
     motion = frame(0)
     assert np.isnan(displacement(motion)).all()
-    copied = replace(
-        motion, is_inter=np.ones_like(motion.is_inter), use_intrabc=np.ones_like(motion.skip)
-    )
-    assert np.isnan(displacement(copied)).all()
+    assert np.isnan(displacement(with_units(motion, is_inter=1, use_intrabc=1))).all()
 
 
 def test_displacement_of_a_warp_has_its_origin_at_the_pixel_corner() -> None:
@@ -210,11 +187,11 @@ def test_displacement_of_a_warp_has_its_origin_at_the_pixel_corner() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-def global_warp(block: int, **changes: Any) -> FrameMotion:
+def global_warp(block: int) -> FrameMotion:
     motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (1.0, 2.0))], mi_size=block)
     motion.header["gm_type"][0] = 2
     motion.header["gm_params"][0] = similarity_params(0.01, 1.01, (0.0, 0.0))
-    return replace(motion, y_mode=np.full_like(motion.y_mode, GLOBALMV), **changes)
+    return with_units(motion, y_mode=GLOBALMV)
 
 
 def test_global_warp_applies_where_the_specification_says() -> None:
@@ -229,7 +206,7 @@ def test_global_warp_applies_where_the_specification_says() -> None:
         atol=2e-3,
     )
     assert is_translation(global_warp(BLOCK_4X4))
-    assert is_translation(replace(warped, y_mode=np.full_like(warped.y_mode, NEWMV)))
+    assert is_translation(with_units(warped, y_mode=NEWMV))
     assert is_translation(replace(warped, header=warped.header | {"force_integer_mv": 1}))
     scaled = warped.ref_size.copy()
     scaled[LAST] = 128, 96
@@ -242,23 +219,35 @@ def test_global_warp_applies_where_the_specification_says() -> None:
 def test_displacement_refuses_indices_outside_its_tables() -> None:
     motion = frame(1, refs={LAST: (0, 0)}, motion=[(LAST, (0, 0))])
     with pytest.raises(ValueError, match="warp_index"):
-        displacement(replace(motion, warp_index=np.full_like(motion.warp_index, 3)))
+        displacement(with_units(motion, warp_index=3))
     with pytest.raises(ValueError, match="mi_size"):
-        displacement(replace(motion, mi_size=np.full_like(motion.mi_size, 22)))
+        displacement(with_units(motion, mi_size=22))
     with pytest.raises(ValueError, match="ref_frame"):
-        displacement(replace(motion, ref_frame=np.full_like(motion.ref_frame, 8)))
-    with pytest.raises(ValueError, match="y_mode"):
-        displacement(replace(motion, y_mode=motion.y_mode[:-1].copy()))
+        displacement(with_units(motion, ref_frame=8))
+    for outside in (motion.block_index - 1, motion.block_index + 1):
+        with pytest.raises(ValueError, match="block_index"):
+            displacement(replace(motion, block_index=outside))
 
 
 def test_arrays_of_any_memory_layout_are_read_and_of_another_kind_refused() -> None:
     motion = global_warp(BLOCK_8X8)
-    mv = np.asfortranarray(motion.mv)
-    assert not mv.flags.c_contiguous
-    laid_out = replace(motion, mv=mv, mi_size=np.repeat(motion.mi_size, 2, axis=1)[:, ::2])
+    laid_out = replace(
+        motion,
+        blocks=np.repeat(motion.blocks, 2)[::2],
+        block_index=np.asfortranarray(motion.block_index),
+    )
+    assert not laid_out.blocks.flags.c_contiguous
+    assert not laid_out.block_index.flags.c_contiguous
     assert (displacement(laid_out) == displacement(motion)).all()
-    with pytest.raises(TypeError, match=r"mv is not an array int16 \[mi_rows, mi_cols, 2, 2\]"):
-        displacement(replace(motion, mv=motion.mv[0]))
+    shifted = np.empty(motion.blocks.nbytes + 1, np.uint8)[1:].view(BLOCK)
+    shifted[:] = motion.blocks
+    with pytest.raises(ValueError, match="blocks"):
+        displacement(replace(motion, blocks=shifted))
+    for wrong in (motion.blocks["mv"], motion.blocks.tobytes()):
+        with pytest.raises(TypeError, match="blocks"):
+            displacement(replace(motion, blocks=wrong))
+    with pytest.raises(TypeError, match="block_index"):
+        displacement(replace(motion, block_index=motion.block_index[0]))
     with pytest.raises(TypeError, match=r"gm_type is not an array int32 \[7\]"):
         displacement(replace(motion, header=motion.header | {"gm_type": None}))
     with pytest.raises(TypeError, match="frame_width is not an integer"):
@@ -413,8 +402,8 @@ def test_largest_blocks_are_trusted_where_the_whole_frame_moves_evenly(
         motion[48 - elsewhere :] = 0, 40
         frames = low_delay([motion] * 5, width=256, height=192, mi_size=BLOCK_64X64)
         for one in frames:
-            one.skip[...] = uncoded
-            one.mi_size[:detail] = BLOCK_16X16
+            units(one)["skip"] = uncoded
+            units(one)["mi_size"][:detail] = BLOCK_16X16
         return build_tracks(frames, replace(SMALL_PICTURES, smoothness=None)).num_tracks
 
     assert count(0) >= count(4) > 0.8 * 44 * 64
@@ -464,10 +453,10 @@ def test_the_second_list_is_used_where_the_first_finds_no_track() -> None:
 
 def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
     frames = low_delay([(0.0, 0.0)] * 8)
-    hole = frames[4]
-    hole.ref_frame[2:6, 3:7] = (0, -1)
-    hole.is_inter[2:6, 3:7] = 0
-    hole.mv[2:6, 3:7] = 0
+    hole = units(frames[4])[2:6, 3:7]
+    hole["ref_frame"] = (0, -1)
+    hole["is_inter"] = 0
+    hole["mv"] = 0
     tracks = build_tracks(frames, replace(SMALL_PICTURES, bridge=None))
     check_invariants(tracks, 4)
     counts = {}
@@ -484,9 +473,9 @@ def test_tracks_cross_intra_blocks_where_both_sides_move_alike(jump: float, goes
     mv = np.zeros((12, 16, 2), np.int16)
     mv[:, 7:, 1] = round(8 * jump)
     frames = low_delay([(0.0, 0.0)] * 3 + [mv] + [(0.0, 0.0)] * 4)
-    hole = frames[4]
-    hole.ref_frame[:, 3:7] = (0, -1)
-    hole.is_inter[:, 3:7] = 0
+    hole = units(frames[4])[:, 3:7]
+    hole["ref_frame"] = (0, -1)
+    hole["is_inter"] = 0
     tracks = build_tracks(frames, replace(OPEN, min_length=1, bridge=2.0))
     check_invariants(tracks, 1)
     whole = [xy for shown, xy in split(tracks) if len(shown) == 9 and 12 <= xy[0, 0] < 28]
@@ -537,8 +526,8 @@ def test_of_two_tracks_in_one_cell_the_longer_goes_on(
     steps[2, :, 0, 1] = 8 * 2
     frames = low_delay(list(steps))
     for index, col in ((1, 0), (3, 1)):
-        frames[index].ref_frame[:, col] = (0, -1)
-        frames[index].is_inter[:, col] = 0
+        units(frames[index])["ref_frame"][:, col] = (0, -1)
+        units(frames[index])["is_inter"][:, col] = 0
     tracks = build_tracks(frames, replace(OPEN, min_length=2, cell=cell))
     check_invariants(tracks, 2, cell)
     paths = [xy[:, 0].tolist() for shown, xy in split(tracks) if shown[-1] == 3 and xy[-1, 0] < 4]
@@ -672,8 +661,8 @@ def test_large_and_uncoded_blocks_are_not_followed() -> None:
     there[::2], there[1::2] = (0, 4), (0, -4)
     frames = low_delay([there, -there] * 2, mi_size=BLOCK_16X16)
     for f in frames:
-        f.mi_size[:, 8:] = BLOCK_32X32
-        f.skip[:4] = 1
+        units(f)["mi_size"][:, 8:] = BLOCK_32X32
+        units(f)["skip"][:4] = 1
 
     def kept(**options: Any) -> NDArray[np.bool_]:
         tracks = build_tracks(frames, replace(OPEN, **options))
@@ -695,7 +684,7 @@ def test_large_and_uncoded_blocks_are_not_followed() -> None:
 def test_smoothness_takes_out_the_block_that_disagrees() -> None:
     frames = low_delay([(0.0, 0.0)] * 4, mi_size=BLOCK_8X8)
     for f in frames[1:]:
-        f.mv[4:6, 6:8, 0, :] = 24
+        units(f)["mv"][4:6, 6:8, 0, :] = 24
     tracks = build_tracks(frames, replace(OPEN, smoothness=0.5))
     seen = np.zeros((12, 16), bool)
     col, row = (tracks.xy // 4).astype(int).T
@@ -754,10 +743,7 @@ def test_interpolation_keeps_edges_of_motion() -> None:
 def test_expected_errors_follow_the_bitstream() -> None:
     def last_sigma(**changes: Any) -> float:
         frames = low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
-        frames = [
-            replace(f, **{k: np.full_like(f.skip, v) for k, v in changes.items()}) for f in frames
-        ]
-        tracks = build_tracks(frames, OPEN)
+        tracks = build_tracks([with_units(f, **changes) for f in frames], OPEN)
         return float(np.median(tracks.sigma[tracks.offsets[1:] - 1]))
 
     plain = last_sigma()
@@ -800,7 +786,7 @@ def test_cosine_ends_a_track_that_leaves_the_motion_around_it() -> None:
     corner = (slice(8, 16), slice(8, 16))
     for i, f in enumerate(frames[1:]):
         # Back and forth against the rest, by 3 px.
-        f.mv[(*corner, 0)] += np.array([0, 24 if i % 2 else -24], np.int16)
+        units(f)["mv"][(*corner, 0)] += np.array([0, 24 if i % 2 else -24], np.int16)
     strict = build_tracks(frames, replace(OPEN, cosine=0.9))
     free = build_tracks(frames, OPEN)
 
@@ -880,24 +866,24 @@ def random_video(draw: st.DrawFn) -> list[FrameMotion]:
             if slot >= 0
         }
         base = frame(i, shown[i], past, width=width, height=height, shown=bool(at_once[i]))
-        shape = base.skip.shape
+        shape = base.block_index.shape
         if past:
             refs = np.array(sorted(past), np.int8)
-            base.ref_frame[..., 0] = rng.choice(refs, shape)
-            base.ref_frame[..., 1] = rng.choice(np.append(refs, np.int8([-1, 0])), shape)
-            base.is_inter[:] = rng.random(shape) < 0.95
-            base.mv[:] = rng.integers(-spread, spread + 1, base.mv.shape)
-            base.mi_size[:] = rng.integers(0, 22, shape)
-            base.y_mode[:] = rng.integers(13, 25, shape)
-            base.skip[:] = rng.integers(0, 2, shape)
-            base.motion_mode[:] = rng.integers(0, 3, shape)
+            blocks = units(base)
+            blocks["ref_frame"][..., 0] = rng.choice(refs, shape)
+            blocks["ref_frame"][..., 1] = rng.choice(np.append(refs, np.int8([-1, 0])), shape)
+            blocks["is_inter"][:] = rng.random(shape) < 0.95
+            blocks["mv"][:] = rng.integers(-spread, spread + 1, blocks["mv"].shape)
+            blocks["mi_size"][:] = rng.integers(0, 22, shape)
+            blocks["y_mode"][:] = rng.integers(13, 25, shape)
+            blocks["skip"][:] = rng.integers(0, 2, shape)
+            blocks["motion_mode"][:] = rng.integers(0, 3, shape)
             base.header["gm_type"][:] = rng.integers(0, 4, 7)
             base.header["gm_params"][:] += rng.integers(-2000, 2000, (7, 6), np.int32)
             params = np.array([[0, 0, ONE, 0, 0, ONE]], np.int32)
+            blocks["warp_index"] = rng.integers(-1, 1, shape, np.int32)
             base = replace(
-                base,
-                warp_index=rng.integers(-1, 1, shape, np.int32),
-                local_warp_params=params + rng.integers(-3000, 3000, (1, 6), np.int32),
+                base, local_warp_params=params + rng.integers(-3000, 3000, (1, 6), np.int32)
             )
         slots[rng.random(8) < 0.4] = i
         frames.append(replace(base, slot_decode_index=slots.astype(np.int32)))

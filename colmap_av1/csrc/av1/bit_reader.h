@@ -3,6 +3,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <span>
 
 #include "av1/error.h"
 
@@ -10,13 +11,13 @@ namespace colmap_av1::av1 {
 
 class BitReader {
  public:
-  BitReader(const std::uint8_t* data, std::size_t size) : data_(data), size_bits_(size * 8) {}
+  explicit BitReader(std::span<const std::uint8_t> data) : data_(data) {}
 
   // Position in bits from the start of the data.
   std::size_t position() const { return position_; }
 
   int bit() {
-    if (position_ >= size_bits_) throw BitstreamError("header ends inside a field");
+    if (position_ >= 8 * data_.size()) throw BitstreamError("header ends inside a field");
     const int value = (data_[position_ >> 3] >> (7 - (position_ & 7))) & 1;
     ++position_;
     return value;
@@ -63,8 +64,7 @@ class BitReader {
   }
 
  private:
-  const std::uint8_t* data_;
-  std::size_t size_bits_;
+  std::span<const std::uint8_t> data_;
   std::size_t position_ = 0;
 };
 

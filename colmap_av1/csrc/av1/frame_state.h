@@ -11,6 +11,7 @@
 
 #include "av1/cdf.h"
 #include "av1/headers.h"
+#include "av1/spec_tables.h"
 
 namespace colmap_av1::av1 {
 
@@ -25,28 +26,29 @@ struct Mv {
 
 constexpr std::uint8_t kAbsent = 255;  // a syntax element that a block does not have
 
-// One block (decode_block) under the specification's names.
+// One block (decode_block) under the specification's names. Python reads it as it is, by
+// block_dtype( ) in bindings/frame_motion.cc, and hands the core blocks of its own: any bytes are one.
 struct BlockInfo {
   std::array<Mv, 2> mv{};
-  // fill_units() takes the fields up to warp_index at a time.
   std::uint8_t mi_size = 0;
   std::uint8_t y_mode = DC_PRED;
-  bool is_inter = false;
-  bool skip = false;
-  bool skip_mode = false;
+  std::uint8_t is_inter = 0;
+  std::uint8_t skip = 0;
+  std::uint8_t skip_mode = 0;
   std::uint8_t segment_id = 0;
   std::uint8_t motion_mode = SIMPLE;
   std::uint8_t compound_type = kAbsent;
-  bool interintra = false;
-  bool use_intrabc = false;
+  std::uint8_t interintra = 0;
+  std::uint8_t use_intrabc = 0;
   std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
-  std::int32_t warp_index = -1;  // index of the frame's LocalWarp, -1 without a valid one
+  std::int32_t local_warp = -1;  // index of the frame's LocalWarp, -1 without
+  std::int32_t warp_index = -1;  // the same, -1 also where it is not valid
   std::uint16_t mi_row = 0;
   std::uint16_t mi_col = 0;
   std::uint8_t uv_mode = kAbsent;
   std::uint8_t partition = 0;
-  bool use_filter_intra = false;
-  bool has_chroma = false;
+  std::uint8_t use_filter_intra = 0;
+  std::uint8_t has_chroma = 0;
   std::array<std::uint8_t, 2> interp_filter{kAbsent, kAbsent};
   std::array<std::uint8_t, 2> palette_size{};  // PaletteSizeY, PaletteSizeUV
   std::uint8_t comp_group_idx = 0;
@@ -65,14 +67,16 @@ struct BlockInfo {
   std::uint8_t num_samples = 0;
   std::int16_t current_q_index = 0;
   std::array<std::int8_t, FRAME_LF_COUNT> delta_lf{};
-  std::int32_t local_warp = -1;       // index of the tile's LocalWarp, -1 without
-  std::int32_t num_coefficients = 0;  // coded positions (eob) of all transform blocks
+
+  int bw4() const { return kNum4x4BlocksWide[mi_size]; }
+  int bh4() const { return kNum4x4BlocksHigh[mi_size]; }
+  bool is_compound() const { return ref_frame[1] > INTRA_FRAME; }
 };
 
 // LocalWarpParams and LocalValid of one block (7.11.3.8)
 struct LocalWarp {
   bool valid = false;
-  std::array<std::int32_t, 6> params{};
+  WarpParams params{};
 };
 
 // Motion saved for the motion field estimation of later frames, one entry per 8x8 luma
@@ -114,6 +118,23 @@ inline BlockBuffer make_block_buffer(std::size_t size) {
   return BlockBuffer(static_cast<BlockInfo*>(::operator new(size * sizeof(BlockInfo))));
 }
 
+// A tile's place in its frame, in units.
+struct TileBounds {
+  int mi_row_start = 0;
+  int mi_row_end = 0;
+  int mi_col_start = 0;
+  int mi_col_end = 0;
+
+  // is_inside( ) of 5.11.5
+  bool contains(int row, int col) const {
+    return col >= mi_col_start && col < mi_col_end && row >= mi_row_start && row < mi_row_end;
+  }
+};
+
+// Places in a superblock, in units: contexts to the left are kept by the row of the superblock.
+inline constexpr int kMaxSb4 = 32;
+inline constexpr int kSbMask = kMaxSb4 - 1;
+
 // Everything the tiles of one frame share.
 struct FrameContext {
   const SequenceHeader* seq = nullptr;
@@ -128,9 +149,13 @@ struct FrameContext {
   std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};   // is_scaled( )
   std::array<int, TOTAL_REFS_PER_FRAME> ref_distance{};  // this frame's OrderHint less theirs
 
-  BlockInfo*& at(int row, int col) {
-    return grid[static_cast<std::size_t>(row) * static_cast<std::size_t>(header->mi_cols) +
-                static_cast<std::size_t>(col)];
+  BlockInfo*& at(int row, int col) { return grid[unit(row, col)]; }
+  const BlockInfo* at(int row, int col) const { return grid[unit(row, col)]; }
+
+ private:
+  std::size_t unit(int row, int col) const {
+    return static_cast<std::size_t>(row) * static_cast<std::size_t>(header->mi_cols) +
+           static_cast<std::size_t>(col);
   }
 };
 

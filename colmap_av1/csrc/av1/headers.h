@@ -66,7 +66,9 @@ struct SegmentationParams {
   std::array<std::array<std::int16_t, SEG_LVL_MAX>, MAX_SEGMENTS> feature_data{};
 };
 
-using GmParams = std::array<std::array<std::int32_t, 6>, TOTAL_REFS_PER_FRAME>;
+// An affine model with 16 fractional bits: gm_params of one reference, LocalWarpParams
+using WarpParams = std::array<std::int32_t, 6>;
+using GmParams = std::array<WarpParams, TOTAL_REFS_PER_FRAME>;
 
 // gm_params of a frame that has none (setup_past_independence)
 GmParams default_gm_params();

@@ -47,8 +47,7 @@ void TileParser::intra_frame_mode_info() {
     b_->is_inter = true;
     b_->compound_type = COMPOUND_AVERAGE;
     b_->interp_filter = {BILINEAR, BILINEAR};
-    find_mv_stack(false);
-    assign_mv(false);
+    assign_mv(find_mv_stack(*frame_, tile_, *b_), 0);
     return;
   }
   const int above_ctx = kIntraModeContext[above_ ? above_->y_mode : DC_PRED];
@@ -280,41 +279,40 @@ void TileParser::filter_intra_mode_info() {
 // 5.11.23 Inter block mode info syntax
 void TileParser::inter_block_mode_info() {
   read_ref_frames();
-  const bool is_compound = b_->ref_frame[1] > INTRA_FRAME;
-  find_mv_stack(is_compound);
+  const MvStack stack = find_mv_stack(*frame_, tile_, *b_);
   if (b_->skip_mode) {
     b_->y_mode = NEAREST_NEARESTMV;
   } else if (seg_feature_active(SEG_LVL_SKIP) || seg_feature_active(SEG_LVL_GLOBALMV)) {
     b_->y_mode = GLOBALMV;
-  } else if (is_compound) {
-    const int ctx =
-        kCompoundModeCtxMap[ref_mv_context_ >> 1][std::min(new_mv_context_, COMP_NEWMV_CTXS - 1)];
+  } else if (b_->is_compound()) {
+    const int ctx = kCompoundModeCtxMap[stack.ref_mv_context >> 1]
+                                       [std::min(stack.new_mv_context, COMP_NEWMV_CTXS - 1)];
     b_->y_mode = static_cast<std::uint8_t>(NEAREST_NEARESTMV + read(cdf_.compound_mode[ctx]));
-  } else if (!read_flag(cdf_.new_mv[new_mv_context_])) {
+  } else if (!read_flag(cdf_.new_mv[stack.new_mv_context])) {
     b_->y_mode = NEWMV;
-  } else if (!read_flag(cdf_.zero_mv[zero_mv_context_])) {
+  } else if (!read_flag(cdf_.zero_mv[stack.zero_mv_context])) {
     b_->y_mode = GLOBALMV;
   } else {
-    b_->y_mode = read_flag(cdf_.ref_mv[ref_mv_context_]) ? NEARMV : NEARESTMV;
+    b_->y_mode = read_flag(cdf_.ref_mv[stack.ref_mv_context]) ? NEARMV : NEARESTMV;
   }
-  ref_mv_idx_ = 0;
+  int ref_mv_idx = 0;
   if (b_->y_mode == NEWMV || b_->y_mode == NEW_NEWMV) {
-    ref_mv_idx_ = read_drl(0);
+    ref_mv_idx = read_drl(stack, 0);
   } else if (has_nearmv(b_->y_mode)) {
-    ref_mv_idx_ = read_drl(1);
+    ref_mv_idx = read_drl(stack, 1);
   }
-  assign_mv(is_compound);
-  read_interintra_mode(is_compound);
-  read_motion_mode(is_compound);
-  read_compound_type(is_compound);
+  assign_mv(stack, ref_mv_idx);
+  read_interintra_mode();
+  read_motion_mode();
+  read_compound_type();
   read_interp_filters();
 }
 
-int TileParser::read_drl(int first) {
+int TileParser::read_drl(const MvStack& stack, int first) {
   int ref_mv_idx = first;
   for (int idx = first; idx < first + 2; ++idx) {
-    if (num_mv_found_ > idx + 1) {
-      if (!read_flag(cdf_.drl_mode[drl_context_[idx]])) return idx;
+    if (stack.num_mv_found > idx + 1) {
+      if (!read_flag(cdf_.drl_mode[stack.drl_context[idx]])) return idx;
       ref_mv_idx = idx + 1;
     }
   }
@@ -349,7 +347,7 @@ void TileParser::read_interp_filters() {
       }
       return 3;
     };
-    int ctx = ((dir & 1) * 2 + (b_->ref_frame[1] > INTRA_FRAME)) * 4;
+    int ctx = ((dir & 1) * 2 + b_->is_compound()) * 4;
     const int left_type = neighbour_type(left_);
     const int above_type = neighbour_type(above_);
     if (left_type == above_type) {
@@ -367,31 +365,34 @@ void TileParser::read_interp_filters() {
 }
 
 // 5.11.27 Read motion mode syntax
-void TileParser::read_motion_mode(bool is_compound) {
+void TileParser::read_motion_mode() {
   if (b_->skip_mode || !header_->is_motion_mode_switchable || min_block_edge(*b_) < 8) return;
   if (!header_->force_integer_mv && (b_->y_mode == GLOBALMV || b_->y_mode == GLOBAL_GLOBALMV) &&
       header_->gm_type[b_->ref_frame[0]] > TRANSLATION) {
     return;
   }
-  if (is_compound || b_->ref_frame[1] == INTRA_FRAME || !has_overlappable_candidates()) return;
-  find_warp_samples();
-  if (header_->force_integer_mv || num_samples_ == 0 || !header_->allow_warped_motion ||
+  if (b_->ref_frame[1] >= INTRA_FRAME ||
+      !has_overlappable_candidates(*frame_, *b_, above_, left_)) {
+    return;
+  }
+  const WarpSamples found = find_warp_samples(*frame_, tile_, *b_, above_, left_);
+  if (header_->force_integer_mv || found.count == 0 || !header_->allow_warped_motion ||
       frame_->ref_scaled[b_->ref_frame[0]]) {
     b_->motion_mode = read_flag(cdf_.use_obmc[b_->mi_size]) ? OBMC : SIMPLE;
   } else {
     b_->motion_mode = static_cast<std::uint8_t>(read(cdf_.motion_mode[b_->mi_size]));
   }
   if (b_->motion_mode == LOCALWARP) {
-    b_->num_samples = static_cast<std::uint8_t>(num_samples_);
+    b_->num_samples = static_cast<std::uint8_t>(found.count);
     b_->local_warp = static_cast<std::int32_t>(local_warps_.size());
-    local_warps_.push_back(estimate_local_warp(b_->mi_row, b_->mi_col, b_->mi_size, b_->mv[0],
-                                               warp_samples_, num_samples_));
+    local_warps_.push_back(estimate_local_warp(
+        *b_, std::span(found.samples).first(static_cast<std::size_t>(found.count))));
   }
 }
 
 // 5.11.28 Read inter intra syntax
-void TileParser::read_interintra_mode(bool is_compound) {
-  if (b_->skip_mode || !seq_->enable_interintra_compound || is_compound ||
+void TileParser::read_interintra_mode() {
+  if (b_->skip_mode || !seq_->enable_interintra_compound || b_->is_compound() ||
       b_->mi_size < BLOCK_8X8 || b_->mi_size > BLOCK_32X32) {
     return;
   }
@@ -407,11 +408,11 @@ void TileParser::read_interintra_mode(bool is_compound) {
 }
 
 // 5.11.29 Read compound type syntax
-void TileParser::read_compound_type(bool is_compound) {
+void TileParser::read_compound_type() {
   b_->compound_idx = 1;
   b_->compound_type = COMPOUND_AVERAGE;
   if (b_->skip_mode) return;
-  if (!is_compound) {
+  if (!b_->is_compound()) {
     if (b_->interintra) {
       b_->compound_type = b_->wedge_interintra ? COMPOUND_WEDGE : COMPOUND_INTRA;
     }

@@ -73,12 +73,11 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
 
 }  // namespace
 
-void estimate_motion_field(const SequenceHeader& seq, const FrameHeader& header,
-                           const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references,
-                           std::vector<MotionFieldEntry>& motion_field) {
-  motion_field.assign(
-      static_cast<std::size_t>(header.mi_rows >> 1) * static_cast<std::size_t>(header.mi_cols >> 1),
-      MotionFieldEntry{});
+std::vector<MotionFieldEntry> estimate_motion_field(
+    const SequenceHeader& seq, const FrameHeader& header,
+    const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references) {
+  std::vector<MotionFieldEntry> motion_field(static_cast<std::size_t>(header.mi_rows >> 1) *
+                                             static_cast<std::size_t>(header.mi_cols >> 1));
   const auto project_from = [&](int src, int dst_sign) {
     return project(seq, header, references[src], src, dst_sign, motion_field);
   };
@@ -95,14 +94,15 @@ void estimate_motion_field(const SequenceHeader& seq, const FrameHeader& header,
   if (is_backward(ALTREF2_FRAME) && project_from(ALTREF2_FRAME, 1)) --ref_stamp;
   if (is_backward(ALTREF_FRAME) && ref_stamp >= 0 && project_from(ALTREF_FRAME, 1)) --ref_stamp;
   if (ref_stamp >= 0) project_from(LAST2_FRAME, -1);
+  return motion_field;
 }
 
-void save_motion(const SequenceHeader& seq, FrameContext& frame,
-                 std::vector<SavedMotion>& saved_motion) {
+std::vector<SavedMotion> save_motion(const SequenceHeader& seq, const FrameContext& frame) {
   const FrameHeader& header = *frame.header;
   const int h8 = header.mi_rows >> 1;
   const int w8 = header.mi_cols >> 1;
-  saved_motion.resize(static_cast<std::size_t>(h8) * static_cast<std::size_t>(w8));
+  std::vector<SavedMotion> saved_motion(static_cast<std::size_t>(h8) *
+                                        static_cast<std::size_t>(w8));
   std::array<bool, TOTAL_REFS_PER_FRAME> is_forward{};
   for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
     is_forward[ref] = seq.relative_dist(header.order_hints[ref], header.order_hint) < 0;
@@ -110,7 +110,6 @@ void save_motion(const SequenceHeader& seq, FrameContext& frame,
   SavedMotion* saved = saved_motion.data();
   for (int y8 = 0; y8 < h8; ++y8) {
     for (int x8 = 0; x8 < w8; ++x8, ++saved) {
-      *saved = {};
       const BlockInfo& block = *frame.at(2 * y8 + 1, 2 * x8 + 1);
       for (int list = 0; list < 2; ++list) {
         const int ref = block.ref_frame[list];
@@ -122,6 +121,7 @@ void save_motion(const SequenceHeader& seq, FrameContext& frame,
       }
     }
   }
+  return saved_motion;
 }
 
 }  // namespace colmap_av1::av1

@@ -27,13 +27,13 @@ inline Mv project_mv(Mv mv, int factor) {
   return {scale(mv.row), scale(mv.col)};
 }
 
-// 7.9 Motion field estimation process. `references` by RefFrame; entry 0 is not used.
-void estimate_motion_field(const SequenceHeader& seq, const FrameHeader& header,
-                           const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references,
-                           std::vector<MotionFieldEntry>& motion_field);
+// 7.9 Motion field estimation process: [mi_rows / 2][mi_cols / 2]. `references` by RefFrame; entry
+// 0 is not used.
+std::vector<MotionFieldEntry> estimate_motion_field(
+    const SequenceHeader& seq, const FrameHeader& header,
+    const std::array<const FrameState*, TOTAL_REFS_PER_FRAME>& references);
 
 // 7.19 Motion field motion vector storage process
-void save_motion(const SequenceHeader& seq, FrameContext& frame,
-                 std::vector<SavedMotion>& saved_motion);
+std::vector<SavedMotion> save_motion(const SequenceHeader& seq, const FrameContext& frame);
 
 }  // namespace colmap_av1::av1

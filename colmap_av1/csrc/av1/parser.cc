@@ -5,7 +5,9 @@
 #include <algorithm>
 #include <atomic>
 #include <exception>
+#include <system_error>
 #include <thread>
+#include <utility>
 
 #include "av1/error.h"
 #include "av1/motion_field.h"
@@ -13,12 +15,15 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// 4.10.5 leb128( )
-std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t& position) {
+using Bytes = std::span<const std::uint8_t>;
+
+// 4.10.5 leb128( ), taken off the front of the data
+std::size_t take_leb128(Bytes& data) {
   std::uint64_t value = 0;
   for (int i = 0; i < 8; ++i) {
-    if (position >= size) throw BitstreamError("OBU size ends early");
-    const std::uint8_t byte = data[position++];
+    if (data.empty()) throw BitstreamError("OBU size ends early");
+    const std::uint8_t byte = data.front();
+    data = data.subspan(1);
     value |= static_cast<std::uint64_t>(byte & 0x7F) << (i * 7);
     if (!(byte & 0x80)) {
       if (value > 0xFFFFFFFFU) break;
@@ -28,11 +33,36 @@ std::size_t read_leb128(const std::uint8_t* data, std::size_t size, std::size_t&
   throw BitstreamError("OBU size is longer than the specification allows");
 }
 
+// Threads that are waited for where their scope ends, by an exception too.
+class JoinedThreads {
+ public:
+  JoinedThreads() = default;
+  JoinedThreads(const JoinedThreads&) = delete;
+  JoinedThreads& operator=(const JoinedThreads&) = delete;
+  ~JoinedThreads() {
+    for (std::thread& thread : threads_) thread.join();
+  }
+
+  // False where the system has no thread to give.
+  template <typename Work>
+  bool start(Work work) {
+    try {
+      threads_.emplace_back(std::move(work));
+      return true;
+    } catch (const std::system_error&) {
+      return false;
+    }
+  }
+
+ private:
+  std::vector<std::thread> threads_;
+};
+
 }  // namespace
 
-void Parser::parse(const std::uint8_t* data, std::size_t size) {
+void Parser::parse(Bytes data) {
   try {
-    parse_obus(data, size);
+    parse_obus(data);
   } catch (...) {
     // A frame with damage is over: tile groups to come must not complete it.
     seen_frame_header_ = false;
@@ -61,11 +91,12 @@ void Parser::restart(const RestartPoint& point) {
 }
 
 // 5.3 OBU syntax
-void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
-  std::size_t position = 0;
-  while (position < size) {
-    const std::size_t start = position;
-    const std::uint8_t header = data[position++];
+void Parser::parse_obus(Bytes data) {
+  Bytes rest = data;
+  while (!rest.empty()) {
+    obu_offset_ = data.size() - rest.size();
+    const std::uint8_t header = rest.front();
+    rest = rest.subspan(1);
     if (header & 0x80) throw BitstreamError("obu_forbidden_bit is set");
     const int obu_type = (header >> 3) & 15;
     const bool has_extension = header & 4;
@@ -73,17 +104,15 @@ void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
     int temporal_id = 0;
     int spatial_id = 0;
     if (has_extension) {
-      if (position >= size) throw BitstreamError("OBU header ends early");
-      temporal_id = data[position] >> 5;
-      spatial_id = (data[position] >> 3) & 3;
-      ++position;
+      if (rest.empty()) throw BitstreamError("OBU header ends early");
+      temporal_id = rest.front() >> 5;
+      spatial_id = (rest.front() >> 3) & 3;
+      rest = rest.subspan(1);
     }
-    const std::size_t obu_size =
-        has_size_field ? read_leb128(data, size, position) : size - position;
-    if (obu_size > size - position) throw BitstreamError("OBU reaches beyond the end of the data");
-    const std::uint8_t* payload = data + position;
-    position += obu_size;
-    obu_offset_ = start;
+    const std::size_t obu_size = has_size_field ? take_leb128(rest) : rest.size();
+    if (obu_size > rest.size()) throw BitstreamError("OBU reaches beyond the end of the data");
+    const Bytes payload = rest.first(obu_size);
+    rest = rest.subspan(obu_size);
     if (obu_type != OBU_SEQUENCE_HEADER && obu_type != OBU_TEMPORAL_DELIMITER &&
         operating_point_idc_ != 0 && has_extension) {
       const bool in_temporal_layer = (operating_point_idc_ >> temporal_id) & 1;
@@ -91,32 +120,30 @@ void Parser::parse_obus(const std::uint8_t* data, std::size_t size) {
       if (!in_temporal_layer || !in_spatial_layer) continue;
     }
     switch (obu_type) {
-      case OBU_SEQUENCE_HEADER: sequence_header_obu(payload, obu_size); break;
+      case OBU_SEQUENCE_HEADER: sequence_header_obu(payload); break;
       case OBU_TEMPORAL_DELIMITER:
         finish();
         start_temporal_unit();
         break;
       case OBU_FRAME_HEADER:
-      case OBU_REDUNDANT_FRAME_HEADER:
-        frame_header_obu(payload, obu_size, temporal_id, spatial_id);
-        break;
+      case OBU_REDUNDANT_FRAME_HEADER: frame_header_obu(payload, temporal_id, spatial_id); break;
       case OBU_FRAME: {
         if (seen_frame_header_) throw BitstreamError("frame starts inside another frame");
-        const std::size_t bytes = frame_header_obu(payload, obu_size, temporal_id, spatial_id);
+        const std::size_t bytes = frame_header_obu(payload, temporal_id, spatial_id);
         if (!seen_frame_header_) throw BitstreamError("OBU_FRAME holds show_existing_frame");
-        tile_group_obu(payload + bytes, obu_size - bytes);
+        tile_group_obu(payload.subspan(bytes));
         break;
       }
-      case OBU_TILE_GROUP: tile_group_obu(payload, obu_size); break;
+      case OBU_TILE_GROUP: tile_group_obu(payload); break;
       default:  // metadata, tile lists, padding and reserved types do not affect motion
         break;
     }
   }
 }
 
-void Parser::sequence_header_obu(const std::uint8_t* data, std::size_t size) {
+void Parser::sequence_header_obu(Bytes data) {
   if (seen_frame_header_) throw BitstreamError("sequence header inside a frame");
-  BitReader reader(data, size);
+  BitReader reader(data);
   seq_ = std::make_shared<const SequenceHeader>(read_sequence_header(reader));
   const int op = options_.operating_point <= seq_->operating_points_cnt_minus_1
                      ? options_.operating_point
@@ -124,9 +151,8 @@ void Parser::sequence_header_obu(const std::uint8_t* data, std::size_t size) {
   operating_point_idc_ = seq_->operating_point_idc[op];
 }
 
-std::size_t Parser::frame_header_obu(const std::uint8_t* data, std::size_t size, int temporal_id,
-                                     int spatial_id) {
-  if (seen_frame_header_) return size;  // frame_header_copy( )
+std::size_t Parser::frame_header_obu(Bytes data, int temporal_id, int spatial_id) {
+  if (seen_frame_header_) return data.size();  // frame_header_copy( )
   if (!seq_) throw BitstreamError("frame comes before the first sequence header");
   References infos;
   for (int i = 0; i < NUM_REF_FRAMES; ++i) {
@@ -141,7 +167,7 @@ std::size_t Parser::frame_header_obu(const std::uint8_t* data, std::size_t size,
       infos[i].subsampling_y = slot.frame->subsampling_y;
     }
   }
-  BitReader reader(data, size);
+  BitReader reader(data);
   header_ =
       read_frame_header(reader, *seq_, infos, temporal_id, spatial_id, options_.max_frame_size);
   for (int i = 0; i < NUM_REF_FRAMES; ++i) {
@@ -161,7 +187,7 @@ std::size_t Parser::frame_header_obu(const std::uint8_t* data, std::size_t size,
   event_->ref_decode_index.fill(-1);
   if (header_.show_existing_frame) {
     show_existing_frame();
-    return size;
+    return data.size();
   }
   seen_frame_header_ = true;
   tile_num_ = 0;
@@ -236,7 +262,7 @@ void Parser::start_frame() {
     context_.blocks_capacity = units;
   }
   if (header_.use_ref_frame_mvs) {
-    estimate_motion_field(*seq_, header_, refs, context_.motion_field);
+    context_.motion_field = estimate_motion_field(*seq_, header_, refs);
   }
   const std::size_t num_tiles = static_cast<std::size_t>(header_.tile_cols * header_.tile_rows);
   tile_first_block_.assign(num_tiles, 0);
@@ -255,10 +281,10 @@ void Parser::start_frame() {
 }
 
 // 5.11.1 General tile group OBU syntax
-void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
+void Parser::tile_group_obu(Bytes data) {
   if (!seen_frame_header_) throw BitstreamError("tile group without a frame header");
   const int num_tiles = header_.tile_cols * header_.tile_rows;
-  BitReader reader(data, size);
+  BitReader reader(data);
   int tg_start = 0;
   int tg_end = num_tiles - 1;
   if (num_tiles > 1 && reader.flag()) {  // tile_start_and_end_present_flag
@@ -271,25 +297,25 @@ void Parser::tile_group_obu(const std::uint8_t* data, std::size_t size) {
   }
   reader.byte_alignment();
   ++event_->num_tile_groups;
-  std::size_t position = reader.position() / 8;
+  Bytes rest = data.subspan(reader.position() / 8);
   std::vector<TileData> tiles;
   for (; tile_num_ <= tg_end; ++tile_num_) {
-    std::size_t tile_size = size - position;
+    std::size_t tile_size = rest.size();
     if (tile_num_ != tg_end) {
       const std::size_t bytes = static_cast<std::size_t>(header_.tile_size_bytes);
-      if (tile_size < bytes) throw BitstreamError("tile group ends inside a tile size");
+      if (rest.size() < bytes) throw BitstreamError("tile group ends inside a tile size");
       std::size_t minus_1 = 0;
       for (std::size_t i = 0; i < bytes; ++i) {
-        minus_1 |= static_cast<std::size_t>(data[position + i]) << (8 * i);
+        minus_1 |= static_cast<std::size_t>(rest[i]) << (8 * i);
       }
-      position += bytes;
+      rest = rest.subspan(bytes);
       tile_size = minus_1 + 1;
     }
-    if (tile_size > size - position) throw BitstreamError("tile reaches beyond its tile group");
+    if (tile_size > rest.size()) throw BitstreamError("tile reaches beyond its tile group");
     if (tile_size == 0) throw BitstreamError("tile is empty");
-    if (options_.keep_blocks) event_->tile_sizes.push_back(static_cast<int>(tile_size));
-    tiles.push_back({tile_num_, data + position, tile_size});
-    position += tile_size;
+    event_->tile_sizes.push_back(static_cast<int>(tile_size));
+    tiles.push_back({tile_num_, rest.first(tile_size)});
+    rest = rest.subspan(tile_size);
   }
   if (!options_.headers_only) parse_tiles(tiles);
   if (tile_num_ == num_tiles) finish_frame();
@@ -302,7 +328,7 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   // Starting a thread takes about as long as parsing some kilobytes.
   constexpr std::size_t kBytesPerThread = 8192;
   std::size_t bytes = 0;
-  for (const TileData& tile : tiles) bytes += tile.size;
+  for (const TileData& tile : tiles) bytes += tile.data.size();
   const std::size_t num_threads =
       std::min({tiles.size(), static_cast<std::size_t>(std::max(1, options_.num_threads)),
                 1 + bytes / kBytesPerThread});
@@ -318,7 +344,7 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
         const TileData& tile = tiles[i];
         const auto number = static_cast<std::size_t>(tile.number);
         parser.parse(context_, tile.number / header_.tile_cols, tile.number % header_.tile_cols,
-                     tile.data, tile.size, context_.blocks.get() + tile_first_block_[number]);
+                     tile.data, context_.blocks.get() + tile_first_block_[number]);
         tile_num_blocks_[number] = parser.num_blocks();
         tile_local_warps_[number] = parser.local_warps();
         tile_trailing_bits_valid_[number] = parser.trailing_bits_valid();
@@ -336,12 +362,14 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
       }
     }
   };
-  std::vector<std::thread> threads;
-  for (std::size_t i = 1; i < num_threads; ++i) {
-    threads.emplace_back([&work, parser = tile_parsers_[i].get()] { work(*parser); });
+  {
+    JoinedThreads threads;
+    for (std::size_t i = 1; i < num_threads; ++i) {
+      // What no thread takes the others do.
+      if (!threads.start([&work, parser = tile_parsers_[i].get()] { work(*parser); })) break;
+    }
+    work(*tile_parsers_[0]);
   }
-  work(*tile_parsers_[0]);
-  for (std::thread& thread : threads) thread.join();
   for (const auto& error : errors) {
     if (error) std::rethrow_exception(error);
   }
@@ -364,6 +392,32 @@ void Parser::collect_local_warps() {
   }
 }
 
+// The blocks of all tiles in one array, and each unit's place in it
+void Parser::collect_blocks() {
+  std::size_t count = 0;
+  for (const std::size_t num_blocks : tile_num_blocks_) count += num_blocks;
+  event_->blocks.reserve(count);
+  event_->block_index.resize(context_.grid.size());
+  for (int tile_row = 0; tile_row < header_.tile_rows; ++tile_row) {
+    for (int tile_col = 0; tile_col < header_.tile_cols; ++tile_col) {
+      const auto tile = static_cast<std::size_t>(tile_row * header_.tile_cols + tile_col);
+      const BlockInfo* first = context_.blocks.get() + tile_first_block_[tile];
+      const auto base = static_cast<std::ptrdiff_t>(event_->blocks.size());
+      event_->blocks.insert(event_->blocks.end(), first, first + tile_num_blocks_[tile]);
+      const auto begin = static_cast<std::size_t>(header_.mi_col_starts[tile_col]);
+      const auto end = static_cast<std::size_t>(header_.mi_col_starts[tile_col + 1]);
+      for (int row = header_.mi_row_starts[tile_row]; row < header_.mi_row_starts[tile_row + 1];
+           ++row) {
+        const std::size_t row_start =
+            static_cast<std::size_t>(row) * static_cast<std::size_t>(header_.mi_cols);
+        for (std::size_t i = row_start + begin; i < row_start + end; ++i) {
+          event_->block_index[i] = static_cast<std::int32_t>(base + (context_.grid[i] - first));
+        }
+      }
+    }
+  }
+}
+
 // 7.4 Decode frame wrapup process
 void Parser::finish_frame() {
   seen_frame_header_ = false;
@@ -372,7 +426,7 @@ void Parser::finish_frame() {
     event_->num_wrong_trailing_bits = static_cast<int>(
         std::count(tile_trailing_bits_valid_.begin(), tile_trailing_bits_valid_.end(), false));
     if (header_.disable_frame_end_update_cdf) state_->cdfs = context_.cdfs;
-    save_motion(*seq_, context_, state_->saved_motion);
+    state_->saved_motion = save_motion(*seq_, context_);
     const std::size_t units = context_.grid.size();
     if (header_.segmentation_enabled) {
       state_->segment_ids.resize(units);
@@ -384,8 +438,7 @@ void Parser::finish_frame() {
         std::copy_n(context_.prev_segment_ids, units, state_->segment_ids.begin());
       }
     }
-    fill_units(context_.grid, event_->units);
-    if (options_.keep_blocks) keep_blocks();
+    collect_blocks();
   }
   update_references(state_, header_.refresh_frame_flags);
   state_.reset();
@@ -413,13 +466,6 @@ void Parser::update_references(const std::shared_ptr<const FrameState>& state,
   for (int i = 0; i < NUM_REF_FRAMES; ++i) {
     if ((refresh_frame_flags >> i) & 1) slots_[i] = {true, state->header.order_hint, state};
     event_->slot_decode_index[i] = slots_[i].frame ? slots_[i].frame->decode_index : -1;
-  }
-}
-
-void Parser::keep_blocks() {
-  for (std::size_t tile = 0; tile < tile_first_block_.size(); ++tile) {
-    const BlockInfo* first = context_.blocks.get() + tile_first_block_[tile];
-    event_->blocks.insert(event_->blocks.end(), first, first + tile_num_blocks_[tile]);
   }
 }
 

@@ -5,20 +5,18 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "av1/frame_state.h"
 #include "av1/tile_parser.h"
-#include "av1/units.h"
 
 namespace colmap_av1::av1 {
 
 struct ParserOptions {
   int operating_point = 0;
-  // Reads the headers alone; events then hold no units.
+  // Reads the headers alone; events then hold no blocks.
   bool headers_only = false;
-  // Keeps BlockInfo, LocalWarp and tile sizes of every frame in its event.
-  bool keep_blocks = false;
   // Threads that parse the tiles of a tile group side by side; the result is the same.
   int num_threads = 1;
   // Refuses tiles whose trailing bits are not those that the specification demands.
@@ -42,10 +40,10 @@ struct Event {
   std::array<int, TOTAL_REFS_PER_FRAME> ref_order_hint{};
   // Reference slots after the reference frame update process
   std::array<int, NUM_REF_FRAMES> slot_decode_index{};
-  Units units;
+  std::vector<BlockInfo> blocks;          // in decoding order
+  std::vector<std::int32_t> block_index;  // [mi_rows][mi_cols], which block each unit is in
   std::vector<LocalWarp> local_warps;
-  std::vector<BlockInfo> blocks;  // in decoding order
-  std::vector<int> tile_sizes;    // in bytes, in tile order
+  std::vector<int> tile_sizes;  // in bytes, in tile order
 };
 
 // What parsing can start again from at a shown key frame, which refers to no frame before it.
@@ -65,7 +63,7 @@ class Parser {
   // without a size field reaches to the end of the data. Completed frames are appended to
   // events() also when a later one throws BitstreamError or LimitError. That frame is dropped;
   // frames that refer to the slots it would have filled find what was there before.
-  void parse(const std::uint8_t* data, std::size_t size);
+  void parse(std::span<const std::uint8_t> data);
 
   // Throws BitstreamError when the stream ends inside a frame.
   void finish() const;
@@ -92,24 +90,22 @@ class Parser {
     ++temporal_unit_;
     shown_spatial_id_ = -1;
   }
-  void parse_obus(const std::uint8_t* data, std::size_t size);
-  void sequence_header_obu(const std::uint8_t* data, std::size_t size);
+  void parse_obus(std::span<const std::uint8_t> data);
+  void sequence_header_obu(std::span<const std::uint8_t> data);
   // Returns the bytes of the header.
-  std::size_t frame_header_obu(const std::uint8_t* data, std::size_t size, int temporal_id,
-                               int spatial_id);
+  std::size_t frame_header_obu(std::span<const std::uint8_t> data, int temporal_id, int spatial_id);
   void start_frame();
-  void tile_group_obu(const std::uint8_t* data, std::size_t size);
+  void tile_group_obu(std::span<const std::uint8_t> data);
   struct TileData {
     int number;
-    const std::uint8_t* data;
-    std::size_t size;
+    std::span<const std::uint8_t> data;
   };
   void parse_tiles(const std::vector<TileData>& tiles);
   void collect_local_warps();
+  void collect_blocks();
   void finish_frame();
   void show_existing_frame();
   void update_references(const std::shared_ptr<const FrameState>& state, int refresh_frame_flags);
-  void keep_blocks();
   std::array<const FrameState*, TOTAL_REFS_PER_FRAME> references() const;
 
   ParserOptions options_;

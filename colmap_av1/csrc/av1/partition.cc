@@ -8,20 +8,18 @@
 
 namespace colmap_av1::av1 {
 
-void TileParser::parse(FrameContext& frame, int tile_row, int tile_col, const std::uint8_t* data,
-                       std::size_t size, BlockInfo* blocks) {
+void TileParser::parse(FrameContext& frame, int tile_row, int tile_col,
+                       std::span<const std::uint8_t> data, BlockInfo* blocks) {
   frame_ = &frame;
   seq_ = frame.seq;
   header_ = frame.header;
-  mi_row_start_ = header_->mi_row_starts[tile_row];
-  mi_row_end_ = header_->mi_row_starts[tile_row + 1];
-  mi_col_start_ = header_->mi_col_starts[tile_col];
-  mi_col_end_ = header_->mi_col_starts[tile_col + 1];
+  tile_ = {header_->mi_row_starts[tile_row], header_->mi_row_starts[tile_row + 1],
+           header_->mi_col_starts[tile_col], header_->mi_col_starts[tile_col + 1]};
   first_block_ = next_block_ = blocks;
   local_warps_.clear();
   current_q_index_ = header_->base_q_idx;
   cdf_ = frame.cdfs;
-  symbols_.init(data, size, header_->disable_cdf_update);
+  symbols_.init(data, header_->disable_cdf_update);
   decode_tile();
   const TrailingBits trailing_bits = symbols_.trailing_bits();
   if (trailing_bits == TrailingBits::kPastEnd) {
@@ -37,9 +35,7 @@ void TileParser::parse(FrameContext& frame, int tile_row, int tile_col, const st
 void TileParser::decode_tile() {
   // clear_above_context( ); blocks may reach a superblock's width beyond the frame
   const std::size_t columns = static_cast<std::size_t>(header_->mi_cols) + kMaxSb4;
-  for (int plane = 0; plane < seq_->num_planes; ++plane) {
-    above_coef_context_[plane].assign(columns, 0);
-  }
+  coefficients_.start_tile(*seq_, *header_);
   above_seg_pred_.assign(columns, 0);
   above_tx_width_.resize(columns);
   if (header_->allow_screen_content_tools) {
@@ -54,10 +50,10 @@ void TileParser::decode_tile() {
   }
   const int sb_size = seq_->use_128x128_superblock ? BLOCK_128X128 : BLOCK_64X64;
   const int sb_size4 = kNum4x4BlocksWide[sb_size];
-  for (int r = mi_row_start_; r < mi_row_end_; r += sb_size4) {
-    for (auto& context : left_coef_context_) context.fill(0);  // clear_left_context( )
+  for (int r = tile_.mi_row_start; r < tile_.mi_row_end; r += sb_size4) {
+    coefficients_.clear_left_context();
     left_seg_pred_.fill(0);
-    for (int c = mi_col_start_; c < mi_col_end_; c += sb_size4) {
+    for (int c = tile_.mi_col_start; c < tile_.mi_col_end; c += sb_size4) {
       read_deltas_ = header_->delta_q_present;
       clear_cdef();
       read_lr(r, c, sb_size);
@@ -77,8 +73,10 @@ void TileParser::decode_partition(int r, int c, int b_size) {
   int partition = PARTITION_NONE;
   if (b_size >= BLOCK_8X8) {
     const int bsl = kMiWidthLog2[b_size];
-    const bool above = is_inside(r - 1, c) && kMiWidthLog2[frame_->at(r - 1, c)->mi_size] < bsl;
-    const bool left = is_inside(r, c - 1) && kMiHeightLog2[frame_->at(r, c - 1)->mi_size] < bsl;
+    const bool above =
+        tile_.contains(r - 1, c) && kMiWidthLog2[frame_->at(r - 1, c)->mi_size] < bsl;
+    const bool left =
+        tile_.contains(r, c - 1) && kMiHeightLog2[frame_->at(r, c - 1)->mi_size] < bsl;
     const int ctx = left * 2 + above;
     if (has_rows && has_cols) {
       partition = bsl == 1   ? read(cdf_.partition_w8[ctx])
@@ -186,8 +184,8 @@ void TileParser::decode_block(int r, int c, int sub_size, int partition) {
   bh4_ = kNum4x4BlocksHigh[sub_size];
   b_->has_chroma = seq_->num_planes > 1 && !(bh4_ == 1 && seq_->subsampling_y && (r & 1) == 0) &&
                    !(bw4_ == 1 && seq_->subsampling_x && (c & 1) == 0);
-  above_ = is_inside(r - 1, c) ? frame_->at(r - 1, c) : nullptr;
-  left_ = is_inside(r, c - 1) ? frame_->at(r, c - 1) : nullptr;
+  above_ = tile_.contains(r - 1, c) ? frame_->at(r - 1, c) : nullptr;
+  left_ = tile_.contains(r, c - 1) ? frame_->at(r, c - 1) : nullptr;
   if (header_->frame_is_intra) {
     intra_frame_mode_info();
   } else {
@@ -200,7 +198,7 @@ void TileParser::decode_block(int r, int c, int sub_size, int partition) {
     save_palette_colors();
   }
   read_block_tx_size();
-  if (b_->skip) reset_block_context();
+  if (b_->skip) coefficients_.reset_block_context(*b_);
   const int rows = std::min(bh4_, header_->mi_rows - r);
   const int cols = std::min(bw4_, header_->mi_cols - c);
   for (int y = 0; y < rows; ++y) std::fill_n(&frame_->at(r + y, c), cols, b_);

@@ -4,6 +4,7 @@
 #include <bit>
 #include <cstddef>
 #include <cstdint>
+#include <span>
 
 #if defined(__SSE2__) || defined(_M_X64)
 #include <emmintrin.h>
@@ -26,9 +27,9 @@ enum class TrailingBits { kValid, kOther, kData, kPastEnd };
 class SymbolDecoder {
  public:
   // 8.2.2 Initialization process for symbol decoder
-  void init(const std::uint8_t* data, std::size_t size, bool disable_cdf_update) {
-    begin_ = data_ = data;
-    end_ = data + size;
+  void init(std::span<const std::uint8_t> data, bool disable_cdf_update) {
+    begin_ = data_ = data.data();
+    end_ = begin_ + data.size();
     window_ = 0;
     available_ = -15;
     padding_bits_ = 0;
@@ -57,6 +58,12 @@ class SymbolDecoder {
         return symbol;
       }
     }
+  }
+
+  // A symbol of a whole array, which ends with its adaptation counter.
+  template <std::size_t M>
+  int read(std::uint16_t (&icdf)[M]) {
+    return symbol<static_cast<int>(M) - 1>(icdf);
   }
 
   // A symbol of an array of two.

@@ -36,7 +36,7 @@ int ls_product(int a, int b) { return ((a * b) >> 2) + (a + b); }
 
 }  // namespace
 
-bool warp_valid(const std::array<std::int32_t, 6>& p) {
+bool warp_valid(const WarpParams& p) {
   constexpr int kOne = 1 << WARPEDMODEL_PREC_BITS;
   if (p[2] <= 0) return false;
   const auto clip16 = [](std::int64_t v) { return std::clamp<std::int64_t>(v, -32768, 32767); };
@@ -56,22 +56,22 @@ bool warp_valid(const std::array<std::int32_t, 6>& p) {
   return 4 * reduce(gamma0) + 4 * reduce(delta0) < kOne;
 }
 
-LocalWarp estimate_local_warp(int mi_row, int mi_col, int mi_size, Mv mv,
-                              const WarpSamples& samples, int num_samples) {
+LocalWarp estimate_local_warp(const BlockInfo& block, std::span<const WarpSample> samples) {
+  const Mv mv = block.mv[0];
   LocalWarp warp;
   std::int64_t a00 = 0, a01 = 0, a11 = 0;
   std::int64_t bx0 = 0, bx1 = 0, by0 = 0, by1 = 0;
-  const int mid_y = mi_row * 4 + kNum4x4BlocksHigh[mi_size] * 2 - 1;
-  const int mid_x = mi_col * 4 + kNum4x4BlocksWide[mi_size] * 2 - 1;
+  const int mid_y = block.mi_row * 4 + block.bh4() * 2 - 1;
+  const int mid_x = block.mi_col * 4 + block.bw4() * 2 - 1;
   const int suy = mid_y * 8;
   const int sux = mid_x * 8;
   const int duy = suy + mv.row;
   const int dux = sux + mv.col;
-  for (int i = 0; i < num_samples; ++i) {
-    const int sy = samples[i][0] - suy;
-    const int sx = samples[i][1] - sux;
-    const int dy = samples[i][2] - duy;
-    const int dx = samples[i][3] - dux;
+  for (const WarpSample& sample : samples) {
+    const int sy = sample.row - suy;
+    const int sx = sample.col - sux;
+    const int dy = sample.ref_row - duy;
+    const int dx = sample.ref_col - dux;
     if (std::abs(sx - dx) >= LS_MV_MAX || std::abs(sy - dy) >= LS_MV_MAX) continue;
     a00 += ls_product(sx, sx) + 8;
     a01 += ls_product(sx, sy) + 4;

@@ -11,6 +11,7 @@
 #include "av1/error.h"
 #include "av1/parser.h"
 #include "bindings/arrays.h"
+#include "bindings/buffer.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -150,112 +151,21 @@ nb::dict sequence_dict(const SequenceHeader& s, int operating_point_idc) {
   return d;
 }
 
-// The unit arrays of a decoded frame; they are moved out, so this works once.
-nb::dict take_units(Event& event) {
+// The blocks of a decoded frame as bytes, the index of each unit's block, and the local warps. The
+// first two are moved out, so this works once.
+nb::tuple take_blocks(Event& event) {
   const auto rows = static_cast<std::size_t>(event.header.mi_rows);
   const auto cols = static_cast<std::size_t>(event.header.mi_cols);
-  av1::Units& u = event.units;
-  nb::dict d;
-  d["mv"] = adopt<std::int16_t>(std::move(u.mv), {rows, cols, 2, 2});
-  d["ref_frame"] = adopt<std::int8_t>(std::move(u.ref_frame), {rows, cols, 2});
-  const auto bytes = [&](const char* name, av1::UnitVector<std::uint8_t>& data) {
-    d[name] = adopt<std::uint8_t>(std::move(data), {rows, cols});
-  };
-  bytes("mi_size", u.mi_size);
-  bytes("y_mode", u.y_mode);
-  bytes("is_inter", u.is_inter);
-  bytes("skip", u.skip);
-  bytes("skip_mode", u.skip_mode);
-  bytes("segment_id", u.segment_id);
-  bytes("motion_mode", u.motion_mode);
-  bytes("compound_type", u.compound_type);
-  bytes("interintra", u.interintra);
-  bytes("use_intrabc", u.use_intrabc);
-  d["warp_index"] = adopt<std::int32_t>(std::move(u.warp_index), {rows, cols});
   std::vector<std::int32_t> params;
   params.reserve(event.local_warps.size() * 6);
   for (const auto& warp : event.local_warps) {
     params.insert(params.end(), warp.params.begin(), warp.params.end());
   }
-  d["local_warp_params"] =
-      adopt<std::int32_t>(std::move(params), {event.local_warps.size(), std::size_t{6}});
-  return d;
-}
-
-// The bytes of an object that has the buffer protocol, while it lives.
-class Buffer {
- public:
-  explicit Buffer(nb::handle object) {
-    if (PyObject_GetBuffer(object.ptr(), &view_, PyBUF_SIMPLE) != 0) throw nb::python_error();
-  }
-  ~Buffer() { PyBuffer_Release(&view_); }
-  Buffer(const Buffer&) = delete;
-  Buffer& operator=(const Buffer&) = delete;
-
-  const std::uint8_t* data() const { return static_cast<const std::uint8_t*>(view_.buf); }
-  std::size_t size() const { return static_cast<std::size_t>(view_.len); }
-
- private:
-  Py_buffer view_;
-};
-
-// One array per field of the blocks, in decoding order.
-nb::dict blocks_dict(const Event& event) {
-  nb::dict d;
-  const auto& blocks = event.blocks;
-  const auto field = [&](const char* name, auto get) {
-    std::vector<std::int32_t> values;
-    values.reserve(blocks.size());
-    for (const BlockInfo& b : blocks) values.push_back(static_cast<std::int32_t>(get(b)));
-    d[name] = adopt(std::move(values));
-  };
-#define COLMAP_AV1_FIELD(name) field(#name, [](const BlockInfo& b) { return b.name; });
-  COLMAP_AV1_FIELD(partition)
-  COLMAP_AV1_FIELD(uv_mode)
-  COLMAP_AV1_FIELD(angle_delta_y)
-  COLMAP_AV1_FIELD(angle_delta_uv)
-  COLMAP_AV1_FIELD(use_filter_intra)
-  COLMAP_AV1_FIELD(filter_intra_mode)
-  COLMAP_AV1_FIELD(cfl_alpha_idx)
-  COLMAP_AV1_FIELD(cfl_alpha_signs)
-  COLMAP_AV1_FIELD(tx_size)
-  COLMAP_AV1_FIELD(comp_group_idx)
-  COLMAP_AV1_FIELD(compound_idx)
-  COLMAP_AV1_FIELD(interintra_mode)
-  COLMAP_AV1_FIELD(wedge_interintra)
-  COLMAP_AV1_FIELD(wedge_index)
-  COLMAP_AV1_FIELD(wedge_sign)
-  COLMAP_AV1_FIELD(mask_type)
-  COLMAP_AV1_FIELD(num_samples)
-  COLMAP_AV1_FIELD(current_q_index)
-  COLMAP_AV1_FIELD(num_coefficients)
-#undef COLMAP_AV1_FIELD
-  field("row", [](const BlockInfo& b) { return b.mi_row; });
-  field("col", [](const BlockInfo& b) { return b.mi_col; });
-  field("palette_size_y", [](const BlockInfo& b) { return b.palette_size[0]; });
-  field("palette_size_uv", [](const BlockInfo& b) { return b.palette_size[1]; });
-  std::vector<std::int32_t> filters;
-  std::vector<std::int32_t> delta_lf;
-  std::vector<std::int32_t> warp_block;
-  std::vector<std::int32_t> warp_valid;
-  std::vector<std::int32_t> warp_params;
-  for (std::size_t i = 0; i < blocks.size(); ++i) {
-    filters.insert(filters.end(), blocks[i].interp_filter.begin(), blocks[i].interp_filter.end());
-    delta_lf.insert(delta_lf.end(), blocks[i].delta_lf.begin(), blocks[i].delta_lf.end());
-    if (blocks[i].local_warp < 0) continue;
-    const auto& warp = event.local_warps[static_cast<std::size_t>(blocks[i].local_warp)];
-    warp_block.push_back(static_cast<std::int32_t>(i));
-    warp_valid.push_back(warp.valid);
-    warp_params.insert(warp_params.end(), warp.params.begin(), warp.params.end());
-  }
-  const std::size_t num_warps = warp_block.size();
-  d["interp_filter"] = adopt<std::int32_t>(std::move(filters), {blocks.size(), std::size_t{2}});
-  d["delta_lf"] = adopt<std::int32_t>(std::move(delta_lf), {blocks.size(), std::size_t{4}});
-  d["warp_block"] = adopt(std::move(warp_block));
-  d["warp_valid"] = adopt(std::move(warp_valid));
-  d["warp_params"] = adopt<std::int32_t>(std::move(warp_params), {num_warps, std::size_t{6}});
-  d["tile_sizes"] = int32_array(event.tile_sizes);
-  return d;
+  const std::size_t num_bytes = event.blocks.size() * sizeof(BlockInfo);
+  return nb::make_tuple(
+      adopt<std::uint8_t>(std::move(event.blocks), {num_bytes}),
+      adopt<std::int32_t>(std::move(event.block_index), {rows, cols}),
+      adopt<std::int32_t>(std::move(params), {event.local_warps.size(), std::size_t{6}}));
 }
 
 }  // namespace
@@ -280,8 +190,8 @@ void bind_av1(nb::module_& m) {
                             !e.header.show_existing_frame;
                    })
       .def("header", &header_dict)
-      .def("take_units", &take_units)
-      .def("blocks", &blocks_dict)
+      .def("take_blocks", &take_blocks)
+      .def("tile_sizes", [](const Event& e) { return int32_array(e.tile_sizes); })
       .def("ref_decode_index", [](const Event& e) { return int32_array(e.ref_decode_index); })
       .def("ref_size",
            [](const Event& e) {
@@ -297,19 +207,19 @@ void bind_av1(nb::module_& m) {
   nb::class_<Parser>(m, "Parser")
       .def(
           "__init__",
-          [](Parser* self, int operating_point, bool headers_only, bool keep_blocks,
-             int num_threads, bool strict, std::int64_t max_frame_size) {
-            new (self) Parser(ParserOptions{operating_point, headers_only, keep_blocks, num_threads,
-                                            strict, max_frame_size});
+          [](Parser* self, int operating_point, bool headers_only, int num_threads, bool strict,
+             std::int64_t max_frame_size) {
+            new (self) Parser(
+                ParserOptions{operating_point, headers_only, num_threads, strict, max_frame_size});
           },
-          "operating_point"_a = 0, "headers_only"_a = false, "keep_blocks"_a = false,
-          "num_threads"_a = 1, "strict"_a = false, "max_frame_size"_a = std::int64_t{1} << 28)
+          "operating_point"_a = 0, "headers_only"_a = false, "num_threads"_a = 1,
+          "strict"_a = false, "max_frame_size"_a = std::int64_t{1} << 28)
       .def(
           "parse",
           [](Parser& self, nb::object data) {
             const Buffer bytes(data);
             nb::gil_scoped_release release;
-            self.parse(bytes.data(), bytes.size());
+            self.parse(bytes.get());
           },
           "data"_a)
       .def("finish", &Parser::finish)

@@ -2,10 +2,11 @@
 #pragma once
 
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 
-#include <vector>
+#include <optional>
 
+#include "bindings/arrays.h"
+#include "bindings/buffer.h"
 #include "tracks/frame_motion.h"
 
 namespace colmap_av1 {
@@ -19,15 +20,12 @@ class HeldFrameMotion {
   const tracks::FrameMotion& operator*() const { return motion_; }
 
  private:
-  template <typename T, typename Shape>
-  const T* hold(nanobind::handle values, const char* name, const char* expected);
-  void check_units(const char* name) const;
-  void hold_header(nanobind::handle header);
-  void hold_references(nanobind::handle frame);
-  void hold_units(nanobind::handle frame);
+  void hold_blocks(nanobind::handle frame);
 
   tracks::FrameMotion motion_;
-  std::vector<nanobind::ndarray<>> held_;
+  std::optional<Buffer> blocks_;
+  InputArray<std::int32_t, nanobind::ndim<2>> block_index_;
+  InputArray<std::int32_t, nanobind::shape<-1, 6>> local_warp_params_;
 };
 
 void bind_frame_motion(nanobind::module_& m);

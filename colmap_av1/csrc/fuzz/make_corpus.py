@@ -19,9 +19,9 @@ from pathlib import Path
 _IVF_HEADER_SIZE = 32
 _IVF_FRAME_HEADER_SIZE = 12
 
-# Option bytes (see LLVMFuzzerTestOneInput of each): blocks kept; motion parsed from the
+# Option bytes (see LLVMFuzzerTestOneInput of each): one thread; motion parsed from the
 # units, min_length 2 and every trust rule on.
-_PARSER_OPTIONS = bytes([0x02])
+_PARSER_OPTIONS = bytes([0x00])
 _TRACK_BUILDER_OPTIONS = bytes([0x00, 0xFD])
 _NUM_RANDOM = 4
 # Of the model: kinds of input that its first byte says, and bytes of a seed. In every second one

@@ -41,7 +41,7 @@ struct Group {
 bool parse(Parser& parser, const Packet& packet, Events& events) {
   bool whole = true;
   try {
-    parser.parse(packet.data(), packet.size());
+    parser.parse(packet);
   } catch (const BitstreamError&) {
     whole = false;
   } catch (const LimitError&) {
@@ -82,10 +82,15 @@ void check_same(const Event& a, const Event& b) {
         "groups number their frames as the stream does");
   check(a.ref_decode_index == b.ref_decode_index, "groups refer to the same frames");
   check(a.num_wrong_trailing_bits == b.num_wrong_trailing_bits, "groups find the same endings");
-  check(a.units.mv == b.units.mv && a.units.ref_frame == b.units.ref_frame &&
-            a.units.mi_size == b.units.mi_size && a.units.skip == b.units.skip &&
-            a.units.segment_id == b.units.segment_id && a.units.motion_mode == b.units.motion_mode,
-        "groups have the same motion");
+  check(a.block_index == b.block_index && a.blocks.size() == b.blocks.size(),
+        "groups have the same blocks");
+  for (std::size_t i = 0; i < a.blocks.size(); ++i) {
+    check(a.blocks[i].mv == b.blocks[i].mv && a.blocks[i].ref_frame == b.blocks[i].ref_frame &&
+              a.blocks[i].mi_size == b.blocks[i].mi_size && a.blocks[i].skip == b.blocks[i].skip &&
+              a.blocks[i].segment_id == b.blocks[i].segment_id &&
+              a.blocks[i].motion_mode == b.blocks[i].motion_mode,
+          "groups have the same motion");
+  }
 }
 
 }  // namespace

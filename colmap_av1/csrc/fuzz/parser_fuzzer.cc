@@ -39,28 +39,26 @@ void check_event(const Event& event, const ParserOptions& options) {
   }
   check(std::int64_t{header.upscaled_width} * header.frame_height <= kMaxFrameSize,
         "frames are within the limit");
-  const auto& units = event.units;
   const std::size_t n = options.headers_only ? 0
                                              : static_cast<std::size_t>(header.mi_rows) *
                                                    static_cast<std::size_t>(header.mi_cols);
-  check(units.mv.size() == n && units.ref_frame.size() == n, "every unit has its lists");
-  for (const auto* field : {&units.mi_size, &units.y_mode, &units.is_inter, &units.skip,
-                            &units.skip_mode, &units.segment_id, &units.motion_mode,
-                            &units.compound_type, &units.interintra, &units.use_intrabc}) {
-    check(field->size() == n, "every field has every unit");
+  check(event.block_index.size() == n, "every unit has a block");
+  check(event.blocks.size() <= n, "every block has a unit");
+  for (const std::int32_t index : event.block_index) {
+    check(index >= 0 && static_cast<std::size_t>(index) < event.blocks.size(), "blocks are there");
   }
-  check(units.warp_index.size() == n, "every unit has a warp index");
   const auto num_warps = static_cast<std::int64_t>(event.local_warps.size());
-  for (std::size_t i = 0; i < n; ++i) {
-    check(units.mi_size[i] < colmap_av1::av1::BLOCK_SIZES, "mi_size is a block size");
-    check(units.y_mode[i] <= colmap_av1::av1::NEW_NEWMV, "y_mode is a mode");
-    check(units.segment_id[i] < colmap_av1::av1::MAX_SEGMENTS, "segment_id is a segment");
-    for (const int ref : units.ref_frame[i]) {
+  for (const auto& block : event.blocks) {
+    check(block.mi_size < colmap_av1::av1::BLOCK_SIZES, "mi_size is a block size");
+    check(block.y_mode <= colmap_av1::av1::NEW_NEWMV, "y_mode is a mode");
+    check(block.segment_id < colmap_av1::av1::MAX_SEGMENTS, "segment_id is a segment");
+    for (const int ref : block.ref_frame) {
       check(ref >= -1 && ref <= colmap_av1::av1::ALTREF_FRAME, "ref_frame is a reference");
       check(ref <= 0 || event.ref_decode_index[static_cast<std::size_t>(ref)] >= 0,
             "blocks refer to frames that are there");
     }
-    check(units.warp_index[i] >= -1 && units.warp_index[i] < num_warps, "warps are there");
+    check(block.warp_index >= -1 && block.warp_index < num_warps, "warps are there");
+    check(block.warp_index == -1 || block.warp_index == block.local_warp, "warps are the block's");
   }
 }
 
@@ -71,7 +69,6 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   const unsigned choice = input.byte();
   ParserOptions options;
   options.headers_only = (choice & 1) != 0;
-  options.keep_blocks = (choice & 2) != 0;
   options.operating_point = static_cast<int>(choice >> 2 & 31);
   options.num_threads = (choice & 128) != 0 ? 2 : 1;
   options.max_frame_size = kMaxFrameSize;
@@ -82,7 +79,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     // The parser sees a copy: a read past the unit is a read past an allocation.
     const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
     try {
-      parser.parse(copy.data(), copy.size());
+      parser.parse(copy);
     } catch (const BitstreamError&) {  // a caller may go on after an error
     } catch (const LimitError&) {
     }

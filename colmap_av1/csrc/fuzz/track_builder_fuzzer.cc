@@ -20,10 +20,12 @@
 namespace {
 
 using colmap_av1::av1::BitstreamError;
+using colmap_av1::av1::BlockInfo;
 using colmap_av1::av1::Event;
 using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
+using colmap_av1::av1::WarpParams;
 using colmap_av1::fuzz::check;
 using colmap_av1::fuzz::Input;
 using colmap_av1::tracks::FrameMotion;
@@ -35,37 +37,17 @@ using colmap_av1::tracks::TrackBuilderOptions;
 constexpr std::int64_t kMaxFrameSize = 256 * 256;
 constexpr std::size_t kMaxFrames = 24;
 
-// Fields of a frame, owned.
+// A frame with what it borrows.
 struct Frame {
   FrameMotion motion;
-  std::vector<std::int8_t> ref_frame;
-  std::vector<std::int16_t> mv;
-  std::vector<std::uint8_t> mi_size, y_mode, is_inter, use_intrabc, motion_mode, interintra, skip;
-  std::vector<std::int32_t> warp_index, warps;
-  std::array<std::int32_t, 7> gm_type{};
-  std::array<std::int32_t, 42> gm_params{};
-  std::array<std::int32_t, 16> ref_size{};
-  std::array<std::int32_t, 8> ref_decode_index{}, ref_display_index{}, slot_decode_index{};
+  std::vector<BlockInfo> blocks;
+  std::vector<std::int32_t> block_index;
+  std::vector<WarpParams> warps;
 
   const FrameMotion& view() {
-    motion.ref_frame = ref_frame.data();
-    motion.mv = mv.data();
-    motion.mi_size = mi_size.data();
-    motion.y_mode = y_mode.data();
-    motion.is_inter = is_inter.data();
-    motion.use_intrabc = use_intrabc.data();
-    motion.motion_mode = motion_mode.data();
-    motion.interintra = interintra.data();
-    motion.warp_index = warp_index.data();
-    motion.local_warp_params = warps.data();
-    motion.num_local_warps = static_cast<int>(warps.size() / 6);
-    motion.gm_type = gm_type.data();
-    motion.gm_params = gm_params.data();
-    motion.ref_size = ref_size.data();
-    motion.skip = skip.data();
-    motion.ref_decode_index = ref_decode_index.data();
-    motion.ref_display_index = ref_display_index.data();
-    motion.slot_decode_index = slot_decode_index.data();
+    motion.blocks = blocks;
+    motion.block_index = block_index;
+    motion.local_warp_params = warps;
     return motion;
   }
 };
@@ -93,10 +75,7 @@ TrackBuilderOptions read_options(Input& input) {
 bool add(TrackBuilder& builder, const FrameMotion& frame) {
   try {
     colmap_av1::tracks::check_frame_motion(frame);
-    std::vector<float> out(2 * static_cast<std::size_t>(frame.num_units()));
-    for (int list = 0; list < 2; ++list) {
-      colmap_av1::tracks::displacement(frame, list, out.data());
-    }
+    for (int list = 0; list < 2; ++list) colmap_av1::tracks::displacement(frame, list);
     builder.add(frame);
   } catch (const std::invalid_argument&) {
     return false;
@@ -136,7 +115,7 @@ std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only, std::
   try {
     while (!input.empty() && parser.events().size() < max_events) {
       const auto unit = input.unit();
-      parser.parse(unit.data(), unit.size());
+      parser.parse(unit);
     }
   } catch (const BitstreamError&) {
   } catch (const LimitError&) {
@@ -168,7 +147,6 @@ void run_parsed(Input input, TrackBuilder& builder) {
     const auto& header = event->header;
     if (header.show_existing_frame) continue;
     Frame frame;
-    auto& units = event->units;
     frame.motion.mi_rows = header.mi_rows;
     frame.motion.mi_cols = header.mi_cols;
     frame.motion.frame_width = header.frame_width;
@@ -178,39 +156,16 @@ void run_parsed(Input input, TrackBuilder& builder) {
     frame.motion.show_frame = header.show_frame;
     frame.motion.width = header.upscaled_width;
     frame.motion.height = header.frame_height;
-    const auto copy = [](auto& to, const auto& from) { to.assign(from.begin(), from.end()); };
-    for (const auto& refs : units.ref_frame) {
-      frame.ref_frame.insert(frame.ref_frame.end(), refs.begin(), refs.end());
-    }
-    for (const auto& mvs : units.mv) {
-      for (const auto& mv : mvs) {
-        frame.mv.push_back(mv.row);
-        frame.mv.push_back(mv.col);
-      }
-    }
-    copy(frame.mi_size, units.mi_size);
-    copy(frame.y_mode, units.y_mode);
-    copy(frame.is_inter, units.is_inter);
-    copy(frame.use_intrabc, units.use_intrabc);
-    copy(frame.motion_mode, units.motion_mode);
-    copy(frame.interintra, units.interintra);
-    copy(frame.skip, units.skip);
-    copy(frame.warp_index, units.warp_index);
-    for (const auto& warp : event->local_warps) {
-      frame.warps.insert(frame.warps.end(), warp.params.begin(), warp.params.end());
-    }
+    frame.blocks = std::move(event->blocks);
+    frame.block_index = std::move(event->block_index);
+    for (const auto& warp : event->local_warps) frame.warps.push_back(warp.params);
     for (std::size_t ref = 0; ref < 8; ++ref) {
-      if (ref > 0) {
-        frame.gm_type[ref - 1] = header.gm_type[ref];
-        for (std::size_t i = 0; i < 6; ++i) {
-          frame.gm_params[6 * (ref - 1) + i] = header.gm_params[ref][i];
-        }
-      }
-      frame.ref_size[2 * ref] = event->ref_size[ref][0];
-      frame.ref_size[2 * ref + 1] = event->ref_size[ref][1];
-      frame.ref_decode_index[ref] = event->ref_decode_index[ref];
-      frame.ref_display_index[ref] = displayed(event->ref_decode_index[ref]);
-      frame.slot_decode_index[ref] = event->slot_decode_index[ref];
+      frame.motion.gm_type[ref] = header.gm_type[ref];
+      frame.motion.gm_params[ref] = header.gm_params[ref];
+      frame.motion.ref_size[ref] = {event->ref_size[ref][0], event->ref_size[ref][1]};
+      frame.motion.ref_decode_index[ref] = event->ref_decode_index[ref];
+      frame.motion.ref_display_index[ref] = displayed(event->ref_decode_index[ref]);
+      frame.motion.slot_decode_index[ref] = event->slot_decode_index[ref];
     }
     if (!add(builder, frame.view())) return;
   }
@@ -251,52 +206,56 @@ void run_made_up(Input input, TrackBuilder& builder) {
     motion.display_index = wild ? wrong_number(input) : hidden ? -1 : num_shown++;
     const auto n = static_cast<std::size_t>(motion.num_units());
     const unsigned num_warps = input.byte() % 4;
-    for (std::size_t i = 0; i < 6 * num_warps; ++i) {
-      frame.warps.push_back(input.number<std::int32_t>() >> (choice >> 4 & 15));
-    }
-    const unsigned spread = input.byte();  // neighbours alike, as in real block data
+    const auto read_warp = [&] {
+      WarpParams params;
+      for (auto& value : params) value = input.number<std::int32_t>() >> (choice >> 4 & 15);
+      return params;
+    };
+    for (unsigned i = 0; i < num_warps; ++i) frame.warps.push_back(read_warp());
+    const unsigned spread = input.byte();  // neighbours in one block, as in real block data
+    const auto bounded = [&](unsigned bound) {
+      const std::uint8_t value = input.byte();
+      return static_cast<std::uint8_t>(wild_units ? value : value % bound);
+    };
     for (std::size_t i = 0; i < n; ++i) {
-      const bool same = i > 0 && i % (1 + spread) != 0;
-      const auto copy_or = [&](auto& values, auto value) {
-        values.push_back(same ? values.back() : value());
-      };
-      const auto bounded = [&](unsigned bound) {
-        return [&input, wild_units, bound] {
-          const std::uint8_t value = input.byte();
-          return static_cast<std::uint8_t>(wild_units ? value : value % bound);
-        };
-      };
-      copy_or(frame.mi_size, bounded(22));
-      copy_or(frame.y_mode, bounded(25));
-      copy_or(frame.motion_mode, bounded(3));
-      const std::uint8_t flags = input.byte();
-      frame.is_inter.push_back((flags & 1) == 0);
-      frame.use_intrabc.push_back((flags & 6) == 6);
-      frame.interintra.push_back((flags & 24) == 24);
-      frame.skip.push_back((flags & 32) != 0);
-      for (int list = 0; list < 2; ++list) {
-        const int ref = bounded(9)() - (wild_units ? 0 : 1);
-        frame.ref_frame.push_back(static_cast<std::int8_t>(ref));
-        frame.mv.push_back(static_cast<std::int16_t>(input.number<std::int16_t>() >> (flags >> 6)));
-        frame.mv.push_back(input.number<std::int16_t>());
+      if (i == 0 || i % (1 + spread) == 0) {
+        BlockInfo block;
+        block.mi_size = bounded(22);
+        block.y_mode = bounded(25);
+        block.motion_mode = bounded(3);
+        const std::uint8_t flags = input.byte();
+        block.is_inter = (flags & 1) == 0;
+        block.use_intrabc = (flags & 6) == 6;
+        block.interintra = (flags & 24) == 24;
+        block.skip = (flags & 32) != 0;
+        for (std::size_t list = 0; list < 2; ++list) {
+          block.ref_frame[list] = static_cast<std::int8_t>(bounded(9) - (wild_units ? 0 : 1));
+          block.mv[list].row =
+              static_cast<std::int16_t>(input.number<std::int16_t>() >> (flags >> 6));
+          block.mv[list].col = input.number<std::int16_t>();
+        }
+        block.warp_index =
+            wild_units ? wrong_number(input) : input.byte() % static_cast<int>(num_warps + 1) - 1;
+        frame.blocks.push_back(block);
       }
-      frame.warp_index.push_back(wild_units ? wrong_number(input)
-                                            : input.byte() % static_cast<int>(num_warps + 1) - 1);
-    }
-    for (std::size_t i = 0; i < 7; ++i) frame.gm_type[i] = input.byte() % 4;
-    for (auto& value : frame.gm_params) value = input.number<std::int32_t>() >> (choice >> 4 & 15);
-    for (auto& value : frame.ref_size) {
-      value = wild ? wrong_number(input) : 4 * (input.byte() % 17);
+      const auto last = static_cast<std::int32_t>(frame.blocks.size()) - 1;
+      const bool lost = wild_units && input.byte() == 255;
+      frame.block_index.push_back(lost ? wrong_number(input) : last);
     }
     for (std::size_t ref = 0; ref < 8; ++ref) {
+      motion.gm_type[ref] = input.byte() % 4;
+      motion.gm_params[ref] = read_warp();
+      for (auto& value : motion.ref_size[ref]) {
+        value = wild ? wrong_number(input) : 4 * (input.byte() % 17);
+      }
       if (wild) {
-        frame.ref_decode_index[ref] = wrong_number(input);
-        frame.ref_display_index[ref] = wrong_number(input);
-        frame.slot_decode_index[ref] = wrong_number(input);
+        motion.ref_decode_index[ref] = wrong_number(input);
+        motion.ref_display_index[ref] = wrong_number(input);
+        motion.slot_decode_index[ref] = wrong_number(input);
       } else {
-        frame.ref_decode_index[ref] = number - 1 - input.byte() % 4;
-        frame.ref_display_index[ref] = num_shown - 2 - input.byte() % 4;
-        frame.slot_decode_index[ref] = number - input.byte() % 4;
+        motion.ref_decode_index[ref] = number - 1 - input.byte() % 4;
+        motion.ref_display_index[ref] = num_shown - 2 - input.byte() % 4;
+        motion.slot_decode_index[ref] = number - input.byte() % 4;
       }
     }
     add(builder, frame.view());

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstddef>
 #include <limits>
+#include <optional>
 #include <stdexcept>
 
 namespace colmap_av1::geometry {
@@ -143,30 +144,36 @@ class Window {
   std::array<float, 3> inverse_{};
 };
 
-// Looks for a window in a picture from (x, y) on, which become its place there; false where it is
-// not found.
-bool find(const Window<kWindow>& window, const FloatPicture& target, float max_move, float& x,
-          float& y) {
-  const float first_x = x;
-  const float first_y = y;
+struct Place {
+  float x = 0;
+  float y = 0;
+};
+
+// The place of a window in a picture, looked for from a place on.
+std::optional<Place> find(const Window<kWindow>& window, const FloatPicture& target, float max_move,
+                          Place start) {
+  auto [x, y] = start;
   Block<kWindow> block;
   float moved = 0;
   for (int i = 0; i < kMostSteps; ++i) {
     if (!target.sample<kWindow>(x, y, block)) {
-      return false;
+      return std::nullopt;
     }
     const Step step = window.step_to(block);
     x -= step.x;
     y -= step.y;
-    if (!(std::abs(x - first_x) <= max_move && std::abs(y - first_y) <= max_move)) {
-      return false;
+    if (!(std::abs(x - start.x) <= max_move && std::abs(y - start.y) <= max_move)) {
+      return std::nullopt;
     }
     moved = std::max(std::abs(step.x), std::abs(step.y));
     if (moved < kLastStep) {
       break;
     }
   }
-  return moved <= kAtRest;
+  if (!(moved <= kAtRest)) {
+    return std::nullopt;
+  }
+  return Place{x, y};
 }
 
 // The block of pixels that a changed patch shows around its middle; false where it has too few.
@@ -226,15 +233,15 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
     if (patches.index[i] < 0 || patches.index[i] >= num_patches) {
       throw std::invalid_argument("there is no patch of an index");
     }
-    float x = start[2 * i];
-    float y = start[2 * i + 1];
-    if (!sample_patch(patches, i, around) || !sought.set(around) ||
-        !find(sought, picture, max_move, x, y) || !picture.sample<kWindow + 2>(x, y, around) ||
-        !shown.set(around)) {
+    if (!sample_patch(patches, i, around) || !sought.set(around)) {
       continue;
     }
-    found.xy[2 * i] = x;
-    found.xy[2 * i + 1] = y;
+    const auto place = find(sought, picture, max_move, {start[2 * i], start[2 * i + 1]});
+    if (!place || !picture.sample<kWindow + 2>(place->x, place->y, around) || !shown.set(around)) {
+      continue;
+    }
+    found.xy[2 * i] = place->x;
+    found.xy[2 * i + 1] = place->y;
     // The first step on the way back: to where it began, if that is what is shown there.
     const Step back = shown.step_to(sought.grey());
     found.missed[i] = std::max(std::abs(back.x), std::abs(back.y));

@@ -76,19 +76,20 @@ Vector midpoint(const Observation& a, const Observation& b) {
   return found;
 }
 
-Vector first_guess(std::span<const Observation> track, double limit, double& cost) {
+struct Guess {
+  Vector point{};
+  double cost = kInfinite;
+};
+
+Guess first_guess(std::span<const Observation> track, double limit) {
   const auto last = static_cast<double>(track.size() - 1);
-  Vector best{};
-  cost = kInfinite;
+  Guess best;
   for (const auto& [one, two] : kGuesses) {
     const auto a = static_cast<std::size_t>(std::floor(one * last));
     const auto b = static_cast<std::size_t>(std::ceil(two * last));
-    const Vector guess = midpoint(track[a], track[b]);
-    const double now = cost_of(track, guess, limit);
-    if (now < cost) {
-      best = guess;
-      cost = now;
-    }
+    const Vector point = midpoint(track[a], track[b]);
+    const double cost = cost_of(track, point, limit);
+    if (cost < best.cost) best = {point, cost};
   }
   return best;
 }
@@ -145,8 +146,7 @@ Vector gauss_newton_step(std::span<const Observation> track, const Vector& point
 }
 
 Vector locate(std::span<const Observation> track, double limit) {
-  double cost = 0;
-  Vector point = first_guess(track, limit, cost);
+  auto [point, cost] = first_guess(track, limit);
   for (int i = 0; i < kIterations; ++i) {
     const Vector step = gauss_newton_step(track, point, limit);
     const Vector moved{point[0] - step[0], point[1] - step[1], point[2] - step[2]};

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <optional>
 #include <utility>
 
 namespace colmap_av1::tracks {
@@ -150,10 +151,10 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) 
   while (true) {
     Found best;
     if (reach == Reach::kOwn) {
-      find_track(link, asker, current_->motion.lists[list][asker.unit], &best);
+      best = find_track(link, asker, current_->motion.lists[list][asker.unit], best);
     } else {
       note_motion_beside(link, list, asker.unit);
-      for (const UnitMotion* motion : beside_) find_track(link, asker, *motion, &best);
+      for (const UnitMotion* motion : beside_) best = find_track(link, asker, *motion, best);
     }
     if (best.cell < 0) return;
     if (claims_[best.cell].cell < 0) claimed_.push_back(best.cell);
@@ -165,9 +166,9 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) 
 }
 
 // The longest track that a cell has a better claim on than the cell that holds it, by the motion
-// of a unit; what `best` holds already is kept where it is longer.
-void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
-                         Found* best) const {
+// of a unit; `best` where that is longer.
+Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
+                                   Found best) const {
   const ChainedFrame& other = *link.other;
   const Point centre = asker.centre;
   // A valid warp stretches a unit by less than half its size, about the unit's centre.
@@ -180,24 +181,24 @@ void Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion&
       const Cell& found = other.cells[index];
       const Point target{found.position.x * link.from_picture_x,
                          found.position.y * link.from_picture_y};
-      Point position;
-      if (!move_back(current_->motion, motion, target, &position) ||
-          !grid_.is_in_cell(position, centre)) {
-        continue;
-      }
+      const std::optional<Point> position = move_back(current_->motion, motion, target);
+      if (!position || !grid_.is_in_cell(*position, centre)) continue;
       Claim claim;
-      claim.position = position;
+      claim.position = *position;
       claim.cell = asker.cell;
-      claim.cost = distance(position, centre);
+      claim.cost = distance(*position, centre);
       claim.variance = found.variance + motion.variance;
-      if ((best->cell >= 0 && !is_preferred(other, index, claim, best->cell, best->claim)) ||
-          !current_->motion.contains(position) || !is_better(claim, claims_[index]) ||
-          !cosine_.passes(link, index, position, target, &claim.velocity)) {
+      if ((best.cell >= 0 && !is_preferred(other, index, claim, best.cell, best.claim)) ||
+          !current_->motion.contains(*position) || !is_better(claim, claims_[index])) {
         continue;
       }
-      *best = {index, claim};
+      const std::optional<Point> velocity = cosine_.passed(link, index, *position, target);
+      if (!velocity) continue;
+      claim.velocity = *velocity;
+      best = {index, claim};
     }
   }
+  return best;
 }
 
 // The displacements of the units beside a unit that its cells look for tracks by, too: where these
@@ -300,10 +301,10 @@ void Chainer::push_track(const Link& link, int cell, const UnitMotion& motion) {
   if (current_->cells[target].track >= 0) return;
   claim.cost = distance(claim.position, grid_.centre(target_row, target_col));
   const Claim& holder = claims_[target];
-  if ((holder.cell >= 0 && !is_preferred(other, cell, claim, holder.cell, holder)) ||
-      !cosine_.passes(link, cell, from, moved, &claim.velocity)) {
-    return;
-  }
+  if (holder.cell >= 0 && !is_preferred(other, cell, claim, holder.cell, holder)) return;
+  const std::optional<Point> velocity = cosine_.passed(link, cell, from, moved);
+  if (!velocity) return;
+  claim.velocity = *velocity;
   if (holder.cell < 0) claimed_.push_back(target);
   claims_[target] = claim;
 }

@@ -68,8 +68,8 @@ class Chainer {
   void note_motion_beside(const Link& link, int list, int unit);
   bool may_find_track(const Link& link, int unit, const UnitMotion& motion, Reach reach) const;
   void claim_track(const Link& link, int list, Reach reach, Asker asker);
-  void find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
-                  Found* best) const;
+  Found find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
+                   Found best) const;
   bool is_better(const Claim& claim, const Claim& holder) const;
   static Window around(const Link& link, Point position, float reach);
 

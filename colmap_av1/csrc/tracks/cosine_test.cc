@@ -39,26 +39,26 @@ void CosineTest::prepare(const ChainedFrame& current, Link& link) {
   link.dominant = fit_dominant_motion(samples_, frame.coded_width, frame.height, scratch_);
 }
 
-bool CosineTest::passes(const Link& link, int other_cell, Point from, Point moved,
-                        Point* velocity) const {
-  if (!is_on()) return true;
+std::optional<Point> CosineTest::passed(const Link& link, int other_cell, Point from,
+                                        Point moved) const {
+  if (!is_on()) return Point{};
   // Velocities are kept in pixels of the picture they belong to.
   const Point stored = link.other->velocity[other_cell];
   const Point previous{stored.x * link.picture_x, stored.y * link.picture_y};
-  *velocity = previous;
   const bool relative = relative_to_dominant_;
-  if (link.interval == 0 || (relative && !link.dominant.valid)) return true;
+  if (link.interval == 0 || (relative && !link.dominant.valid)) return previous;
 
   const double vx = (moved.x - from.x) * link.to_velocity_x;
   const double vy = (moved.y - from.y) * link.to_velocity_y;
   const double dominant_x = relative ? link.dominant.dx(from.x, from.y) * link.to_velocity_x : 0;
   const double dominant_y = relative ? link.dominant.dy(from.x, from.y) * link.to_velocity_y : 0;
-  *velocity = {static_cast<float>(vx - dominant_x), static_cast<float>(vy - dominant_y)};
-  if (std::isnan(previous.x)) return true;
+  const Point velocity{static_cast<float>(vx - dominant_x), static_cast<float>(vy - dominant_y)};
+  if (std::isnan(previous.x)) return velocity;
   const double px = previous.x + dominant_x;
   const double py = previous.y + dominant_y;
   const double norm = std::sqrt((vx * vx + vy * vy + scale2_) * (px * px + py * py + scale2_));
-  return vx * px + vy * py + scale2_ >= *least_ * norm;
+  if (vx * px + vy * py + scale2_ >= *least_ * norm) return velocity;
+  return std::nullopt;
 }
 
 }  // namespace colmap_av1::tracks

@@ -26,9 +26,9 @@ class CosineTest {
   // Sets the link's dominant motion.
   void prepare(const ChainedFrame& current, Link& link);
   // Whether the track in a cell of the link's other frame may take the step `from` to `moved`, in
-  // coded pixels of the frame whose displacement it is. Sets the track's relative velocity after
-  // the step, in pixels of the current picture.
-  bool passes(const Link& link, int other_cell, Point from, Point moved, Point* velocity) const;
+  // coded pixels of the frame whose displacement it is: the track's relative velocity after the
+  // step, in pixels of the current picture, or nothing. Any velocity where the test is off.
+  std::optional<Point> passed(const Link& link, int other_cell, Point from, Point moved) const;
 
  private:
   std::optional<double> least_;

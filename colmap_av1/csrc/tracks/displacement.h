@@ -2,7 +2,8 @@
 #pragma once
 
 #include <array>
-#include <cstdint>
+#include <optional>
+#include <vector>
 
 #include "tracks/frame_motion.h"
 
@@ -13,10 +14,10 @@ struct Displacement {
   int ref = 0;  // RefFrame, 0: none
   float dx = 0.F;
   float dy = 0.F;
-  const std::int32_t* warp = nullptr;  // affine model in force, null for a translation
+  const av1::WarpParams* warp = nullptr;  // affine model in force, null for a translation
 };
 
-// The rules of 7.11.3.1 that choose between translation, local and global warp.
+// The rules of 7.11.3.1 that choose between translation, local and global warp. Borrows the frame.
 class DisplacementModel {
  public:
   explicit DisplacementModel(const FrameMotion& frame);
@@ -25,17 +26,23 @@ class DisplacementModel {
   Displacement at(int unit, int list) const;
 
  private:
-  FrameMotion frame_;
+  const FrameMotion& frame_;
   std::array<bool, kNumRefs> global_warp_{};
 };
 
-// Position (x, y), corner origin, under an affine warp model (7.11.3.5).
-void apply_warp(const std::int32_t* params, double x, double y, double* out_x, double* out_y);
+// A position in pixels, corner origin.
+struct Position {
+  double x = 0;
+  double y = 0;
+};
 
-// The position that apply_warp takes to (x, y). False for a singular model.
-bool invert_warp(const std::int32_t* params, double x, double y, double* out_x, double* out_y);
+// Where an affine warp model takes a position (7.11.3.5).
+Position apply_warp(const av1::WarpParams& params, Position at);
 
-// Writes float [mi_rows, mi_cols, 2] (x, y), NaN where the list references no frame.
-void displacement(const FrameMotion& frame, int list, float* out);
+// The position that apply_warp takes to `at`; none for a singular model.
+std::optional<Position> invert_warp(const av1::WarpParams& params, Position at);
+
+// [mi_rows, mi_cols, 2] (x, y), NaN where the list references no frame.
+std::vector<float> displacement(const FrameMotion& frame, int list);
 
 }  // namespace colmap_av1::tracks

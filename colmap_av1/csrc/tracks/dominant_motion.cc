@@ -1,8 +1,10 @@
 #include "tracks/dominant_motion.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstddef>
+#include <optional>
 
 namespace colmap_av1::tracks {
 namespace {
@@ -20,15 +22,16 @@ double median(std::vector<float>& values) {
   return *middle;
 }
 
-// Solves the symmetric positive definite system a x = b by Cholesky's method.
-bool solve3(const double (&a)[3][3], const double (&b)[3], double (&x)[3]) {
+// Solves the symmetric positive definite system a x = b by Cholesky's method; nothing where it is
+// not positive definite.
+std::optional<std::array<double, 3>> solve3(const double (&a)[3][3], const double (&b)[3]) {
   double l[3][3] = {};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j <= i; ++j) {
       double sum = a[i][j];
       for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
       if (i == j) {
-        if (sum <= 0) return false;
+        if (sum <= 0) return std::nullopt;
         l[i][i] = std::sqrt(sum);
       } else {
         l[i][j] = sum / l[j][j];
@@ -41,12 +44,13 @@ bool solve3(const double (&a)[3][3], const double (&b)[3], double (&x)[3]) {
     for (int k = 0; k < i; ++k) sum -= l[i][k] * y[k];
     y[i] = sum / l[i][i];
   }
+  std::array<double, 3> x{};
   for (int i = 2; i >= 0; --i) {
     double sum = y[i];
     for (int k = i + 1; k < 3; ++k) sum -= l[k][i] * x[k];
     x[i] = sum / l[i][i];
   }
-  return true;
+  return x;
 }
 
 }  // namespace
@@ -92,7 +96,11 @@ DominantMotion fit_dominant_motion(std::span<const MotionSample> samples, double
     }
     normal[1][1] += kRidge * normal[0][0];
     normal[2][2] += kRidge * normal[0][0];
-    if (!solve3(normal, right_u, motion.u) || !solve3(normal, right_v, motion.v)) return motion;
+    const auto u = solve3(normal, right_u);
+    const auto v = solve3(normal, right_v);
+    if (!u || !v) return motion;
+    motion.u = *u;
+    motion.v = *v;
   }
   motion.valid = true;
   return motion;

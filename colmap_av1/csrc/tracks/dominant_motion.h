@@ -1,6 +1,7 @@
 // The motion that most of a frame shares: what the camera did, shake included.
 #pragma once
 
+#include <array>
 #include <span>
 #include <vector>
 
@@ -19,8 +20,8 @@ struct DominantMotion {
   double center_x = 0;
   double center_y = 0;
   double scale = 1;
-  double u[3] = {};
-  double v[3] = {};
+  std::array<double, 3> u{};
+  std::array<double, 3> v{};
 
   double dx(double x, double y) const {
     return u[0] + u[1] * (x - center_x) * scale + u[2] * (y - center_y) * scale;

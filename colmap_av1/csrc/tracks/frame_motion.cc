@@ -17,15 +17,22 @@ void check_frame_motion(const FrameMotion& frame) {
   if (frame.frame_width > 4 * frame.mi_cols || frame.height > 4 * frame.mi_rows) {
     throw std::invalid_argument("the picture is larger than its 4x4 units cover");
   }
-  const int n = frame.num_units();
-  for (int u = 0; u < n; ++u) {
-    if (frame.mi_size[u] >= kNumBlockSizes) {
+  const auto has = [](std::size_t size, std::int32_t index) {
+    return index >= 0 && static_cast<std::size_t>(index) < size;
+  };
+  for (const std::int32_t index : frame.block_index) {
+    if (!has(frame.blocks.size(), index)) {
+      throw std::invalid_argument("block_index points to no block");
+    }
+  }
+  for (const av1::BlockInfo& block : frame.blocks) {
+    if (block.mi_size >= av1::BLOCK_SIZES) {
       throw std::invalid_argument("mi_size holds a value above 21 (BLOCK_64X16)");
     }
-    if (frame.ref_frame[2 * u] >= kNumRefs || frame.ref_frame[2 * u + 1] >= kNumRefs) {
+    if (block.ref_frame[0] >= kNumRefs || block.ref_frame[1] >= kNumRefs) {
       throw std::invalid_argument("ref_frame holds a value above 7 (ALTREF_FRAME)");
     }
-    if (frame.warp_index[u] >= frame.num_local_warps) {
+    if (block.warp_index >= 0 && !has(frame.local_warp_params.size(), block.warp_index)) {
       throw std::invalid_argument("warp_index points past the rows of local_warp_params");
     }
   }

@@ -1,15 +1,18 @@
 // Block data of one coded frame: the package's FrameMotion, as far as tracks need it.
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
+#include <span>
+
+#include "av1/frame_state.h"
 
 namespace colmap_av1::tracks {
 
-inline constexpr int kNumRefs = 8;         // RefFrame 0..7, 0 is INTRA_FRAME
-inline constexpr int kNumBlockSizes = 22;  // BLOCK_4X4 .. BLOCK_64X16
+inline constexpr int kNumRefs = av1::TOTAL_REFS_PER_FRAME;  // RefFrame 0..7, 0 is INTRA_FRAME
 
-// Borrowed arrays under the specification's names; those of units have one entry per 4x4 luma
-// unit, n = mi_rows * mi_cols in raster order.
+// Values under the specification's names; arrays by RefFrame, and borrowed ones of blocks.
 struct FrameMotion {
   int decode_index = 0;
   int display_index = -1;
@@ -18,32 +21,26 @@ struct FrameMotion {
   int height = 0;       // FrameHeight
   int frame_width = 0;  // FrameWidth: the units lie in the picture before super-resolution
   bool force_integer_mv = false;
-  const std::int32_t* gm_type = nullptr;            // [7], LAST..ALTREF
-  const std::int32_t* gm_params = nullptr;          // [7][6]
-  const std::int32_t* ref_decode_index = nullptr;   // [8]
-  const std::int32_t* ref_display_index = nullptr;  // [8]
-  const std::int32_t* ref_size = nullptr;           // [8][2] (width, height)
-  const std::int32_t* slot_decode_index = nullptr;  // [8]
+  std::array<std::int32_t, kNumRefs> gm_type{};
+  av1::GmParams gm_params{};
+  std::array<std::int32_t, kNumRefs> ref_decode_index{};
+  std::array<std::int32_t, kNumRefs> ref_display_index{};
+  std::array<std::array<std::int32_t, 2>, kNumRefs> ref_size{};  // (width, height)
+  std::array<std::int32_t, kNumRefs> slot_decode_index{};        // by reference slot
   int mi_rows = 0;
   int mi_cols = 0;
-  const std::int8_t* ref_frame = nullptr;  // [n][2]
-  const std::int16_t* mv = nullptr;        // [n][list][0 = row, 1 = column], 1/8 px
-  const std::uint8_t* mi_size = nullptr;
-  const std::uint8_t* y_mode = nullptr;
-  const std::uint8_t* is_inter = nullptr;
-  const std::uint8_t* skip = nullptr;
-  const std::uint8_t* motion_mode = nullptr;
-  const std::uint8_t* interintra = nullptr;
-  const std::uint8_t* use_intrabc = nullptr;
-  const std::int32_t* warp_index = nullptr;
-  const std::int32_t* local_warp_params = nullptr;  // [num_local_warps][6]
-  int num_local_warps = 0;
+  std::span<const av1::BlockInfo> blocks;
+  std::span<const std::int32_t> block_index;  // [mi_rows][mi_cols], the block of each 4x4 luma unit
+  std::span<const av1::WarpParams> local_warp_params;
 
   int num_units() const { return mi_rows * mi_cols; }
+  const av1::BlockInfo& block(int unit) const {
+    return blocks[static_cast<std::size_t>(block_index[static_cast<std::size_t>(unit)])];
+  }
 };
 
 // Throws std::invalid_argument for a size that no frame has or that the units do not cover, and
-// where a unit's value would index outside a table.
+// where a value would index outside a table.
 void check_frame_motion(const FrameMotion& frame);
 
 }  // namespace colmap_av1::tracks

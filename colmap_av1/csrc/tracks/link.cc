@@ -51,20 +51,22 @@ bool leads_to(const TrustedMotion& from, const TrustedMotion& to,
   return false;
 }
 
-void find_links(const ChainedFrame& current, std::span<const std::unique_ptr<ChainedFrame>> frames,
-                const CellGrid& grid, const TrackBuilderOptions& options, std::vector<Link>* out) {
-  out->clear();
+std::vector<Link> find_links(const ChainedFrame& current,
+                             std::span<const std::unique_ptr<ChainedFrame>> frames,
+                             const CellGrid& grid, const TrackBuilderOptions& options) {
+  std::vector<Link> links;
   for (const auto& other : frames) {
     if (!other->is_chained() || other.get() == &current) continue;
     if (leads_to(current.motion, other->motion, options)) {
-      out->push_back(make_link(current.motion, *other, false, grid));
+      links.push_back(make_link(current.motion, *other, false, grid));
     }
     if (leads_to(other->motion, current.motion, options)) {
-      out->push_back(make_link(current.motion, *other, true, grid));
+      links.push_back(make_link(current.motion, *other, true, grid));
     }
   }
-  std::stable_sort(out->begin(), out->end(),
+  std::stable_sort(links.begin(), links.end(),
                    [](const Link& a, const Link& b) { return a.distance < b.distance; });
+  return links;
 }
 
 }  // namespace colmap_av1::tracks

@@ -40,7 +40,8 @@ bool leads_to(const TrustedMotion& from, const TrustedMotion& to,
 
 // The links of the current frame to chained ones, nearest in display first; a frame that is never
 // shown has no place in time and comes last.
-void find_links(const ChainedFrame& current, std::span<const std::unique_ptr<ChainedFrame>> frames,
-                const CellGrid& grid, const TrackBuilderOptions& options, std::vector<Link>* out);
+std::vector<Link> find_links(const ChainedFrame& current,
+                             std::span<const std::unique_ptr<ChainedFrame>> frames,
+                             const CellGrid& grid, const TrackBuilderOptions& options);
 
 }  // namespace colmap_av1::tracks

@@ -53,7 +53,7 @@ TrackArrays TrackBuilder::finish() {
 void TrackBuilder::check_order(const FrameMotion& coded) const {
   const auto is_index = [](int index) { return index < std::numeric_limits<int>::max(); };
   if (coded.width < 1 || !is_index(coded.display_index) ||
-      !std::all_of(coded.ref_display_index, coded.ref_display_index + kNumRefs, is_index)) {
+      !std::all_of(coded.ref_display_index.begin(), coded.ref_display_index.end(), is_index)) {
     throw std::invalid_argument("a width or a display_index is out of range");
   }
   if (std::any_of(frames_.begin(), frames_.end(), [&](const auto& frame) {
@@ -105,8 +105,8 @@ void TrackBuilder::chain_frame(ChainedFrame& frame) {
   frame.cells.assign(static_cast<std::size_t>(frame.cell_rows) * frame.cell_cols, Cell{});
   frame.first_serial = next_serial_;
   next_serial_ += static_cast<std::int64_t>(frame.cells.size());
-  find_links(frame, frames_, grid_, options_, &links_);
-  chainer_.chain(frame, links_, store_);
+  std::vector<Link> links = find_links(frame, frames_, grid_, options_);
+  chainer_.chain(frame, links, store_);
   seed(frame);
   if (frame.is_shown()) store_.observe(frame);
 }
@@ -137,11 +137,12 @@ void TrackBuilder::seed(ChainedFrame& frame) const {
 }
 
 // Lets go of the frames that no frame to come can be linked to.
-void TrackBuilder::release_frames(const std::int32_t* slots) {
+void TrackBuilder::release_frames(std::span<const std::int32_t> slots) {
   const auto is_needed = [&](const ChainedFrame& frame) {
     if (!frame.is_chained()) return true;
-    const std::int32_t* end = slots + kNumRefs;
-    if (std::find(slots, end, frame.motion.decode_index) != end) return true;
+    if (std::find(slots.begin(), slots.end(), frame.motion.decode_index) != slots.end()) {
+      return true;
+    }
     return std::any_of(frames_.begin(), frames_.end(), [&](const auto& other) {
       return !other->is_chained() && (leads_to(other->motion, frame.motion, options_) ||
                                       leads_to(frame.motion, other->motion, options_));

@@ -3,6 +3,7 @@
 
 #include <cstdint>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "tracks/chained_frame.h"
@@ -42,7 +43,7 @@ class TrackBuilder {
   void chain_up_to(int display_index);
   void chain_frame(ChainedFrame& frame);
   void seed(ChainedFrame& frame) const;
-  void release_frames(const std::int32_t* slots);
+  void release_frames(std::span<const std::int32_t> slots);
 
   TrackBuilderOptions options_;
   CellGrid grid_;
@@ -54,9 +55,7 @@ class TrackBuilder {
   std::int64_t next_serial_ = 0;
   std::vector<std::unique_ptr<ChainedFrame>> frames_;       // in bitstream order
   std::vector<std::unique_ptr<ChainedFrame>> idle_frames_;  // their memory is used again
-  // Buffers that are kept from frame to frame.
   TrustScratch scratch_;
-  std::vector<Link> links_;
 };
 
 }  // namespace colmap_av1::tracks

@@ -133,18 +133,19 @@ TrackArrays TrackStore::finish() {
   out.offsets.push_back(0);
   for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
   // One array after the other, the largest first: that takes the least memory.
-  const auto sort = [this](auto& values, std::ptrdiff_t width, auto* sorted) {
-    sorted->resize(values.size());
-    auto end = sorted->begin();
+  const auto take_sorted = [this]<typename T>(std::deque<T>& values, std::ptrdiff_t width) {
+    std::vector<T> sorted(values.size());
+    auto end = sorted.begin();
     for (const Kept& kept : kept_) {
       const auto first = values.begin() + width * kept.first;
       end = std::copy(first, first + width * kept.length, end);
     }
     values = {};
+    return sorted;
   };
-  sort(done_.xy, 2, &out.xy);
-  sort(done_.frame, 1, &out.frame);
-  sort(done_.sigma, 1, &out.sigma);
+  out.xy = take_sorted(done_.xy, 2);
+  out.frame = take_sorted(done_.frame, 1);
+  out.sigma = take_sorted(done_.sigma, 1);
   return out;
 }
 

@@ -35,10 +35,8 @@ struct Agreement {
 };
 
 bool has_compounds(const FrameMotion& frame) {
-  for (int unit = 0; unit < frame.num_units(); ++unit) {
-    if (frame.ref_frame[2 * unit + 1] > 0) return true;
-  }
-  return false;
+  return std::any_of(frame.blocks.begin(), frame.blocks.end(),
+                     [](const av1::BlockInfo& block) { return block.is_compound(); });
 }
 
 void read_frame_values(const FrameMotion& frame, TrustedMotion& motion) {
@@ -58,19 +56,27 @@ void read_frame_values(const FrameMotion& frame, TrustedMotion& motion) {
     motion.ref_interval[ref] =
         display_index >= 0 && frame.display_index >= 0 ? display_index - frame.display_index : 0;
   }
-  motion.mi_size.assign(frame.mi_size, frame.mi_size + frame.num_units());
+  motion.mi_size.resize(frame.block_index.size());
+  for (int unit = 0; unit < frame.num_units(); ++unit) {
+    motion.mi_size[unit] = frame.block(unit).mi_size;
+  }
   motion.num_lists = has_compounds(frame) ? 2 : 1;
   for (auto& list : motion.used_lists()) list.assign(motion.mi_size.size(), UnitMotion{});
 }
 
-// The frame with its warp models where they are kept: local ones, then global ones.
-FrameMotion keep_warps(const FrameMotion& frame, TrustedMotion& motion) {
-  FrameMotion kept = frame;
-  motion.warps.assign(frame.local_warp_params, frame.local_warp_params + 6 * frame.num_local_warps);
-  motion.warps.insert(motion.warps.end(), frame.gm_params, frame.gm_params + 6 * (kNumRefs - 1));
-  kept.local_warp_params = motion.warps.data();
-  kept.gm_params = motion.warps.data() + 6 * frame.num_local_warps;
-  return kept;
+// The local warp models of a frame, then its global ones by RefFrame.
+void keep_warps(const FrameMotion& frame, TrustedMotion& motion) {
+  motion.warps.assign(frame.local_warp_params.begin(), frame.local_warp_params.end());
+  motion.warps.insert(motion.warps.end(), frame.gm_params.begin(), frame.gm_params.end());
+}
+
+// The place of a displacement's warp among the kept ones, -1 for a translation
+std::int32_t kept_warp(const FrameMotion& frame, const Displacement& d) {
+  if (d.warp == nullptr) return -1;
+  const auto num_local = static_cast<std::ptrdiff_t>(frame.local_warp_params.size());
+  const bool global = d.warp == &frame.gm_params[d.ref];
+  return static_cast<std::int32_t>(global ? num_local + d.ref
+                                          : d.warp - frame.local_warp_params.data());
 }
 
 bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool coded) {
@@ -103,7 +109,8 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
-      const bool small = is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
+      const bool small =
+          is_small_enough(options, motion.block_area(unit), frame.block(unit).skip == 0);
       ++(small ? num_small : num_large);
       const Displacement d = model.at(unit, 0);
       if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
@@ -126,7 +133,8 @@ void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& opt
   for (int row = 0; row < motion.visible_rows; ++row) {
     for (int col = 0; col < motion.visible_cols; ++col) {
       const int unit = row * motion.cols + col;
-      const bool small = is_small_enough(options, motion.block_area(unit), frame.skip[unit] == 0);
+      const bool small =
+          is_small_enough(options, motion.block_area(unit), frame.block(unit).skip == 0);
       const Point centre = motion.unit_centre(unit);
       for (int list = 0; list < motion.num_lists; ++list) {
         const Displacement d = model.at(unit, list);
@@ -136,9 +144,8 @@ void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& opt
             !is_within_border(motion, border, centre, {centre.x + d.dx, centre.y + d.dy})) {
           continue;
         }
-        const std::int32_t warp =
-            d.warp == nullptr ? -1 : static_cast<std::int32_t>(d.warp - motion.warps.data());
-        motion.lists[list][unit] = {d.dx, d.dy, warp, 0.F, static_cast<std::int8_t>(d.ref)};
+        motion.lists[list][unit] = {d.dx, d.dy, kept_warp(frame, d), 0.F,
+                                    static_cast<std::int8_t>(d.ref)};
       }
     }
   }
@@ -207,10 +214,10 @@ Verdict judge_block(const FrameMotion& frame, const TrackBuilderOptions& options
   const Agreement around = judge_border(motion, options.smoothness, row, col, list);
   StepTraits traits;
   traits.block_area = motion.block_area(unit);
-  traits.y_mode = frame.y_mode[unit];
-  traits.coded = frame.skip[unit] == 0;
+  traits.y_mode = frame.block(unit).y_mode;
+  traits.coded = frame.block(unit).skip == 0;
   traits.warped = own.warp >= 0;
-  traits.overlapped = frame.motion_mode[unit] == av1::OBMC;
+  traits.overlapped = frame.block(unit).motion_mode == av1::OBMC;
   traits.length = std::hypot(own.dx, own.dy);
   if (around.judged > 0) {
     traits.disagreement = static_cast<float>(around.distance / around.judged);
@@ -255,7 +262,8 @@ int TrustedMotion::block_area(int unit) const {
 void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
                          TrustScratch& scratch, TrustedMotion& motion) {
   read_frame_values(frame, motion);
-  read_displacements(keep_warps(frame, motion), options, motion);
+  keep_warps(frame, motion);
+  read_displacements(frame, options, motion);
   judge_blocks(frame, options, scratch, motion);
   const auto limit = [](std::optional<double> value) {
     return static_cast<float>(value.value_or(0));

@@ -3,6 +3,7 @@
 
 #include <array>
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -17,7 +18,7 @@ namespace colmap_av1::tracks {
 struct UnitMotion {
   float dx = 0.F;  // at the unit's centre, in coded pixels
   float dy = 0.F;
-  std::int32_t warp = -1;  // first of six entries of TrustedMotion::warps
+  std::int32_t warp = -1;  // index in TrustedMotion::warps, -1 for a translation
   float variance = 0.F;    // expected of the displacement, in coded px^2
   std::int8_t ref = 0;
 };
@@ -38,7 +39,7 @@ struct TrustedMotion {
   std::array<std::vector<UnitMotion>, 2> lists;  // the second stays unused without compounds
   int num_lists = 0;
   std::array<int, kNumRefs> num_linked{};  // entries of the lists, by their ref
-  std::vector<std::int32_t> warps;
+  std::vector<av1::WarpParams> warps;
   std::vector<std::uint8_t> mi_size;
 
   std::span<std::vector<UnitMotion>> used_lists() { return std::span(lists).first(num_lists); }
@@ -86,24 +87,17 @@ inline bool moves_alike(const UnitMotion& a, const UnitMotion& b, float limit) {
 // Where a unit's motion takes a position in coded pixels.
 inline Point move(const TrustedMotion& frame, const UnitMotion& motion, Point position) {
   if (motion.warp < 0) return {position.x + motion.dx, position.y + motion.dy};
-  double x = 0;
-  double y = 0;
-  apply_warp(frame.warps.data() + motion.warp, position.x, position.y, &x, &y);
-  return {static_cast<float>(x), static_cast<float>(y)};
+  const Position moved = apply_warp(frame.warps[motion.warp], {position.x, position.y});
+  return {static_cast<float>(moved.x), static_cast<float>(moved.y)};
 }
 
-// The position that `move` takes to `target`. False where the warp has no inverse.
-inline bool move_back(const TrustedMotion& frame, const UnitMotion& motion, Point target,
-                      Point* source) {
-  if (motion.warp < 0) {
-    *source = {target.x - motion.dx, target.y - motion.dy};
-    return true;
-  }
-  double x = 0;
-  double y = 0;
-  if (!invert_warp(frame.warps.data() + motion.warp, target.x, target.y, &x, &y)) return false;
-  *source = {static_cast<float>(x), static_cast<float>(y)};
-  return true;
+// The position that `move` takes to `target`; none where the warp has no inverse.
+inline std::optional<Point> move_back(const TrustedMotion& frame, const UnitMotion& motion,
+                                      Point target) {
+  if (motion.warp < 0) return Point{target.x - motion.dx, target.y - motion.dy};
+  const auto source = invert_warp(frame.warps[motion.warp], {target.x, target.y});
+  if (!source) return std::nullopt;
+  return Point{static_cast<float>(source->x), static_cast<float>(source->y)};
 }
 
 }  // namespace colmap_av1::tracks
