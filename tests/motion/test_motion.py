@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
+import sys
 import threading
 import warnings
 from collections.abc import Iterator
@@ -139,3 +141,36 @@ def test_damage_ends_at_the_same_place(
             assert len(found) == len(expected)
             for a, b in zip(found, expected, strict=True):
                 assert_same(a, b)
+
+
+# Thread stacks of 1 GB, and room for less: no thread can be started.
+_WITHOUT_THREADS = """
+import resource, sys
+from pathlib import Path
+from colmap_av1 import _core
+parser = _core.Parser(num_threads=4)
+data = Path(sys.argv[1]).read_bytes()
+used = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 29), resource.RLIM_INFINITY))
+parser.parse(data)
+print(len(parser.take_events()))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits address space as Linux does")
+def test_tiles_are_read_where_no_thread_can_be_started(tmp_path: Path) -> None:
+    video = tmp_path / "tiles.obu"
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", SOURCE]
+    words = "-c:v libaom-av1 -cpu-used 8 -usage realtime -tiles 2x1 -crf 5 -frames:v 3"
+    subprocess.run([*ffmpeg, *words.split(), str(video)], check=True)
+    command = [sys.executable, "-c", _WITHOUT_THREADS, str(video)]
+    limit = f'ulimit -S -s {1 << 20} && exec "$@"'
+    run = subprocess.run(
+        ["bash", "-c", limit, "bash", *command],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        cwd=Path(__file__).parent,
+    )
+    assert (run.returncode, run.stdout.strip()) == (0, "3"), run.stderr
