@@ -168,7 +168,8 @@ def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
 def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "out")
     one = ["batch", "--inputs", str(clips / "a" / "clip00.mp4"), "--output", out]
-    all_of_them = ["batch", "--inputs", str(clips), "--output", out, "--cores", "99"]
+    other = str(tmp_path / "other")  # an output holds one task
+    all_of_them = ["batch", "--inputs", str(clips), "--output", other, "--cores", "99"]
     assert main([*one, "--task", "match", "--image-name", "%03d.jpg", "--write_images", "0"]) == 0
     printed = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
     assert (printed["videos"], printed["done"], printed["failed"]) == ("1", "1", "0")
