@@ -1,66 +1,72 @@
-"""Dense COLMAP matches read from the motion vectors of an AV1 video."""
+"""Dense COLMAP matches read from the motion vectors of an AV1 video.
 
-from colmap_av1.util import start  # first, so that the program ends quietly
+The public names are imported when they are first used: the package itself imports nothing else,
+and installs nothing.
+"""
 
-if start.is_program():
-    start.import_pycolmap()
+from __future__ import annotations
 
-# isort: split
-from colmap_av1.batch.page import write_page
-from colmap_av1.batch.run import BatchReport, run_batch
-from colmap_av1.check.database import CheckReport, check
-from colmap_av1.densify import DensifyReport, densify
-from colmap_av1.errors import (
-    BitstreamError,
-    ColmapAv1Error,
-    DatabaseError,
-    EncodeError,
-    EvaluationError,
-    HlocError,
-    ImageError,
-    LimitError,
-    ModelError,
-    NotAv1Error,
-    OptionError,
-    VideoError,
-)
-from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
-from colmap_av1.map import MapReport, map_database
-from colmap_av1.match import MatchReport, match
-from colmap_av1.motion.frame_motion import FrameMotion
-from colmap_av1.motion.info import StreamReport, inspect
-from colmap_av1.motion.motion_file import export_motion
-from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import (
-    BatchOptions,
-    CameraOptions,
-    CompareOptions,
-    DensifyOptions,
-    DensityOptions,
-    EncodeOptions,
-    ExportOptions,
-    ImageOptions,
-    LearnedOptions,
-    LinkOptions,
-    MapOptions,
-    MapperOptions,
-    MaskOptions,
-    MatchOptions,
-    PairOptions,
-    PlaceOptions,
-    ReadOptions,
-    ReconstructOptions,
-    RefineOptions,
-    RunOptions,
-    TrackOptions,
-    TriangulateOptions,
-    VerifyOptions,
-    ViewOptions,
-)
-from colmap_av1.reconstruct import ReconstructReport, reconstruct
-from colmap_av1.splats.reconstruct_models import FurtherModel
-from colmap_av1.tracks.tracks import Tracks, build_tracks
-from colmap_av1.video.encode import EncodeReport, encode
+import importlib.util
+import sys
+import types
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from colmap_av1.batch.page import write_page
+    from colmap_av1.batch.run import BatchReport, run_batch
+    from colmap_av1.check.database import CheckReport, check
+    from colmap_av1.densify import DensifyReport, densify
+    from colmap_av1.errors import (
+        BitstreamError,
+        ColmapAv1Error,
+        DatabaseError,
+        EncodeError,
+        EvaluationError,
+        HlocError,
+        ImageError,
+        LimitError,
+        ModelError,
+        NotAv1Error,
+        OptionError,
+        VideoError,
+    )
+    from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
+    from colmap_av1.map import MapReport, map_database
+    from colmap_av1.match import MatchReport, match
+    from colmap_av1.motion.frame_motion import FrameMotion
+    from colmap_av1.motion.info import StreamReport, inspect
+    from colmap_av1.motion.motion_file import export_motion
+    from colmap_av1.motion.reading import read_motion
+    from colmap_av1.options import (
+        BatchOptions,
+        CameraOptions,
+        CompareOptions,
+        DensifyOptions,
+        DensityOptions,
+        EncodeOptions,
+        ExportOptions,
+        ImageOptions,
+        LearnedOptions,
+        LinkOptions,
+        MapOptions,
+        MapperOptions,
+        MaskOptions,
+        MatchOptions,
+        PairOptions,
+        PlaceOptions,
+        ReadOptions,
+        ReconstructOptions,
+        RefineOptions,
+        RunOptions,
+        TrackOptions,
+        TriangulateOptions,
+        VerifyOptions,
+        ViewOptions,
+    )
+    from colmap_av1.reconstruct import ReconstructReport, reconstruct
+    from colmap_av1.splats.reconstruct_models import FurtherModel
+    from colmap_av1.tracks.tracks import Tracks, build_tracks
+    from colmap_av1.video.encode import EncodeReport, encode
 
 __all__ = [
     "BatchOptions",
@@ -126,3 +132,71 @@ __all__ = [
     "run_batch",
     "write_page",
 ]
+
+# The modules of the names that are neither errors nor options.
+_MODULES = {
+    "BatchReport": "batch.run",
+    "CheckReport": "check.database",
+    "DensifyReport": "densify",
+    "EncodeReport": "video.encode",
+    "FrameMotion": "motion.frame_motion",
+    "FurtherModel": "splats.reconstruct_models",
+    "HlocMatches": "interop.hloc",
+    "MapReport": "map",
+    "MatchReport": "match",
+    "ReconstructReport": "reconstruct",
+    "StreamReport": "motion.info",
+    "Tracks": "tracks.tracks",
+    "build_tracks": "tracks.tracks",
+    "check": "check.database",
+    "densify": "densify",
+    "encode": "video.encode",
+    "export_hloc": "interop.hloc",
+    "export_motion": "motion.motion_file",
+    "inspect": "motion.info",
+    "map_database": "map",
+    "match": "match",
+    "read_hloc": "interop.hloc",
+    "read_motion": "motion.reading",
+    "reconstruct": "reconstruct",
+    "run_batch": "batch.run",
+    "write_page": "batch.page",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = _MODULES.get(name)
+    if module is None:
+        module = "errors" if name.endswith("Error") else "options"
+    else:
+        # pycolmap before NumPy breaks the writing of PNG files.
+        importlib.import_module("numpy")
+    value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(types.ModuleType):
+    """Keeps public names from submodules that are called the same.
+
+    The import of `colmap_av1.match` would put the module in the place of the function.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in _MODULES or not isinstance(value, types.ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+if importlib.util.find_spec(f"{__name__}._core") is None:
+    raise ImportError(
+        f"{__path__[0]} holds the source of colmap-av1 without its compiled core: run 'pip install "
+        "-e .' in the folder above, or leave that folder to import an installed package"
+    )

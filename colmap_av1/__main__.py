@@ -1,8 +1,43 @@
-"""`python -m colmap_av1`."""
+"""The program `colmap-av1`, also `python -m colmap_av1`."""
 
+from __future__ import annotations
+
+import os
+import signal
 import sys
 
-from colmap_av1.cli import main
+from colmap_av1.util.signals import ENDING, HEEDED, end_at_once
+
+
+def main() -> int:
+    """Run the command line with the words of this process; its exit status.
+
+    Until a command runs, a signal ends the process at once: Python would answer an interrupt
+    during the imports with a trace.
+    """
+    for number in ENDING:
+        if signal.getsignal(number) in HEEDED:
+            signal.signal(number, end_at_once)
+    _open_closed_streams()
+    from colmap_av1.cli.program import main as run  # noqa: PLC0415 - after the handlers
+
+    return run()
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that are closed, so that no file of a user gets their descriptors.
+
+    What libraries print would end in it. Output that is closed stays one that cannot be written,
+    messages go nowhere.
+    """
+    for name, how in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, how)  # the lowest that is free
+            os.set_inheritable(descriptor, True)
+            mode = "r" if name == "stdin" else "w"
+            stream = os.fdopen(descriptor, mode, encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
+
 
 if __name__ == "__main__":
     sys.exit(main())

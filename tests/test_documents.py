@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from conftest import PROJECT
 
+from colmap_av1.cli.commands import COMMANDS
 from colmap_av1.cli.options import underscored
-from colmap_av1.cli.program import _make_parser
+from colmap_av1.cli.program import make_parser
 
 DOCUMENTS = [PROJECT / "README.md", *sorted((PROJECT / "examples").rglob("*.md"))]
 SCRIPTS = sorted((PROJECT / "examples").rglob("*.sh"))
@@ -24,7 +25,7 @@ PIPELINE = re.compile(r"[\w/]*(?:pipelines/)?\w+\.sh([^`\n]*)")
 
 def commands() -> dict[str, argparse.ArgumentParser]:
     """The parser of each command."""
-    _, parsers = _make_parser()
+    _, parsers = make_parser(list(COMMANDS))
     return dict(parsers)
 
 

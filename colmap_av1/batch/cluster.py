@@ -14,7 +14,7 @@ from colmap_av1.batch.jobs import Ended, Job, Outcome, Row, Work
 from colmap_av1.batch.worker import Worker
 from colmap_av1.errors import OptionError
 from colmap_av1.util.cpus import threads_or_cpus
-from colmap_av1.util.start import handlers_kept
+from colmap_av1.util.signals import handlers_kept
 
 EXTRA = "colmap-av1[cluster]"
 # Tasks that Ray is given ahead of what it can run at a time: enough for every node to have a

@@ -1,28 +1,15 @@
-"""The command line: parses words and calls one function per subcommand."""
+"""The command line: parses words and runs a command."""
 
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 from colmap_av1.cli.addresses import videos_at_hand
-from colmap_av1.cli.commands.batch import add_batch
-from colmap_av1.cli.commands.check import add_check
-from colmap_av1.cli.commands.compare import add_compare
-from colmap_av1.cli.commands.densify import add_densify
-from colmap_av1.cli.commands.encode import add_encode
-from colmap_av1.cli.commands.export import add_export
-from colmap_av1.cli.commands.info import add_info
-from colmap_av1.cli.commands.map import add_map
-from colmap_av1.cli.commands.match import add_match
-from colmap_av1.cli.commands.motion import add_motion
-from colmap_av1.cli.commands.reconstruct import add_reconstruct
-from colmap_av1.cli.commands.shared import ABOUT_NAMES
-from colmap_av1.cli.commands.view import add_view
+from colmap_av1.cli.commands import COMMANDS
 from colmap_av1.cli.options import underscored
 from colmap_av1.cli.parser import BAD_INPUT, Parser
 from colmap_av1.cli.terminal import (
@@ -35,8 +22,13 @@ from colmap_av1.cli.terminal import (
     warnings_as_lines,
 )
 from colmap_av1.errors import ColmapAv1Error
-from colmap_av1.util.signals import ending_in_order
+from colmap_av1.util.cpus import BLAS_THREADS
+from colmap_av1.util.signals import ending_in_order, handlers_kept, held_back
 
+_ABOUT_NAMES = (
+    "'-' and '_' are alike in option names. COLMAP's spellings are accepted, such as "
+    "--ImageReader.camera_model."
+)
 _INTERRUPTED = 130
 _BROKEN_PIPE = 141
 
@@ -59,8 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings_as_lines(), ending_in_order():
             words = sys.argv[1:] if arguments is None else arguments
             namespace = _parse([underscored(word) for word in words])
+            command = COMMANDS[namespace.command]
+            _import_libraries(with_pycolmap=command.pycolmap)
             with videos_at_hand(namespace):
-                status: int | None = namespace.run(namespace)
+                status = command.run(namespace)
     except ColmapAv1Error as error:
         print_error(error)
         return BAD_INPUT
@@ -83,37 +77,64 @@ def _reason(error: BaseException | None) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
+def _import_libraries(*, with_pycolmap: bool) -> None:
+    """Import NumPy, before pycolmap where that is needed, too.
+
+    NumPy's matrix products get one thread: others would wait for work in a loop. pycolmap installs
+    a handler of its own for SIGTERM, which prints a stack trace of C++ and may hang: it is undone.
+    """
+    given = os.environ.get(BLAS_THREADS)
+    with held_back(), handlers_kept():
+        os.environ.setdefault(BLAS_THREADS, "1")
+        import numpy as np  # noqa: F401
+
+        if given is None:
+            del os.environ[BLAS_THREADS]  # programs that are started have their own
+        if with_pycolmap:
+            import pycolmap  # noqa: F401
+
+
 def _parse(words: Sequence[str]) -> argparse.Namespace:
     """The words as a namespace; argparse exits by itself, with status 2, on what it refuses."""
-    parser, commands = _make_parser()
-    command = commands.get(words[0]) if words else None
-    if command is None:
+    name = words[0] if words and words[0] in COMMANDS else None
+    parser, commands = make_parser([name] if name else [])
+    if name is None:
         return parser.parse_args(words)
-    command.refuse_unknown(words[1:])
+    commands[name].refuse_unknown(words[1:])
     namespace, others = parser.parse_known_args(words)
     if others:
-        command.error(f"unrecognized arguments: {' '.join(others)}")
+        commands[name].error(f"unrecognized arguments: {' '.join(others)}")
     return namespace
 
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print_text(f"{PROGRAM} {importlib.metadata.version(PROGRAM)}\n")
+        from importlib.metadata import version  # slow to import
+
+        print_text(f"{PROGRAM} {version(PROGRAM)}\n")
         parser.exit()
 
 
-def _make_parser() -> tuple[Parser, Mapping[str, Parser]]:
-    """The program's parser, and those of its commands by their names."""
+def make_parser(names: Collection[str]) -> tuple[Parser, Mapping[str, Parser]]:
+    """The program's parser, and those of its commands, of which the named ones know arguments."""
     parser = Parser(
         prog=PROGRAM,
         description="Dense COLMAP matches read from the motion vectors of an AV1 video.",
-        epilog=ABOUT_NAMES,
+        epilog=_ABOUT_NAMES,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for add in (
-        *(add_match, add_map, add_reconstruct, add_densify, add_batch, add_compare),
-        *(add_encode, add_info, add_check, add_motion, add_export, add_view),
-    ):
-        add(commands)
-    return parser, commands.choices
+    parsers = parser.add_subparsers(
+        title="commands", required=True, metavar="COMMAND", dest="command"
+    )
+    for name, command in COMMANDS.items():
+        added: Parser = parsers.add_parser(
+            name,
+            help=command.summary,
+            description=f"{command.summary[0].upper()}{command.summary[1:]}.",
+            usage=f"%(prog)s {command.needed} [options]",
+            epilog=_ABOUT_NAMES,
+            full_help=command.full_help,
+        )
+        if name in names:
+            command.add_to(added)
+    return parser, parsers.choices

@@ -7,19 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from colmap_av1.batch.run import BatchReport
-from colmap_av1.check.database import CheckReport
-from colmap_av1.check.model import ModelCheck
-from colmap_av1.densify import DensifyReport
-from colmap_av1.map import MapReport
-from colmap_av1.match import MatchReport
-from colmap_av1.matching.links import LinkReport, gap_in_video
-from colmap_av1.matching.shutter.of_video import VideoReadOut
-from colmap_av1.motion.info import StreamReport
-from colmap_av1.reconstruct import ReconstructReport
-
-if TYPE_CHECKING:  # the comparison is slow to import
+if TYPE_CHECKING:  # each is slow to import
+    from colmap_av1.batch.run import BatchReport
+    from colmap_av1.check.database import CheckReport
+    from colmap_av1.check.model import ModelCheck
+    from colmap_av1.densify import DensifyReport
     from colmap_av1.evaluate.report.results import CompareReport
+    from colmap_av1.map import MapReport
+    from colmap_av1.match import MatchReport
+    from colmap_av1.matching.links import LinkReport
+    from colmap_av1.matching.shutter.of_video import VideoReadOut
+    from colmap_av1.motion.info import StreamReport
+    from colmap_av1.reconstruct import ReconstructReport
 
 Rows = list[tuple[str, str]]
 
@@ -185,6 +184,8 @@ def _link_rows(links: LinkReport) -> Rows:
 
 def _named(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> str:
     """The frames of a gap, counted in their own video where there are several."""
+    from colmap_av1.matching.links import gap_in_video
+
     name, before, after = gap_in_video(gap, videos)
     return f"{name} {before}-{after}".strip()
 

@@ -7,19 +7,16 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBars
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING, Any
 
 from colmap_av1.cli.reports import Rows
-from colmap_av1.match import MatchReport
-from colmap_av1.util.progress import Progress, no_progress
+
+if TYPE_CHECKING:
+    from colmap_av1.match import MatchReport
+    from colmap_av1.util.progress import Progress
 
 PROGRAM = "colmap-av1"
 
@@ -32,8 +29,12 @@ class StreamError(Exception):
 def progress_bars(quiet: bool) -> Iterator[Progress]:
     """Progress bars on standard error where it is a terminal, one for each stage."""
     if quiet or not sys.stderr.isatty():
-        yield no_progress
+        yield lambda *_: None
         return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as ProgressBars
+
     columns = (
         TextColumn("{task.description:12}"),
         BarColumn(),
@@ -59,11 +60,23 @@ def print_summary(rows: Rows) -> None:
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(show_header=False)
     for name, value in rows:
         table.add_row(Text(name), Text(value))  # as they are: in brackets is no markup
     with _writing():
         Console().print(table)
+
+
+def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ()) -> None:
+    """Print the warnings, and a summary unless it is not wanted."""
+    for warning in warnings:
+        print_warning(warning)
+    if not namespace.quiet:
+        print_summary(rows)
 
 
 def print_next(report: MatchReport) -> None:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from colmap_av1.errors import OptionError
+from colmap_av1.options.commands import DensifyOptions, MatchOptions, ReconstructOptions
 from colmap_av1.options.fields import Options, option
+from colmap_av1.options.video import ReadOptions
 
 _SHARD = re.compile(r"(\d+)/(\d+)", re.ASCII)
 
@@ -86,3 +88,12 @@ class BatchOptions(Options):
             return 1, 1
         found = _SHARD.fullmatch(self.shard)
         return (int(found[1]), int(found[2])) if found else (0, 0)
+
+
+# The tasks of a batch: the options of each.
+TASK_OPTIONS: dict[str, type[Options]] = {
+    "reconstruct": ReconstructOptions,
+    "match": MatchOptions,
+    "densify": DensifyOptions,
+    "info": ReadOptions,
+}

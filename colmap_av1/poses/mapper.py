@@ -17,12 +17,11 @@ from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
 from colmap_av1.options import MapOptions
 from colmap_av1.poses import mapper_process as child
 from colmap_av1.poses.mapper_process import run_mapping
-from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.cpus import BLAS_THREADS, threads_or_cpus
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
-from colmap_av1.util.start import BLAS_THREADS
 
 # The robust loss makes progress slow: steps that each lower the error by less than a thousandth
 # still bring far views of one place together.

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 
 from threadpoolctl import threadpool_limits
 
+# As OpenBLAS reads it when it is loaded.
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+
 
 def threads_or_cpus(num_threads: int | None) -> int:
     """The number of threads; None: one per CPU that this process may use."""

@@ -15,7 +15,7 @@ from batch_output import files_of, rows_of, workers_of
 import colmap_av1
 from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
 from colmap_av1.batch.run import Counts
-from colmap_av1.util.start import handlers_kept
+from colmap_av1.util.signals import handlers_kept
 
 # The folder that the package under test is installed in.
 PACKAGES = Path(colmap_av1.__file__).parents[1]

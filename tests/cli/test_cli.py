@@ -22,14 +22,21 @@ def read_table(text: str) -> dict[str, str]:
     return dict(line.split("\t") for line in text.splitlines())
 
 
-def test_start_waits_for_nothing_that_only_comparisons_need(tmp_path: Path) -> None:
-    listing = "import sys, colmap_av1.cli; print(*{name.split('.')[0] for name in sys.modules})"
-    run = subprocess.run(
-        [sys.executable, "-c", listing], cwd=tmp_path, capture_output=True, text=True, check=True
+@pytest.mark.parametrize("words", ["--version", "--help", "match --help", "info --video {clip}"])
+def test_short_commands_import_no_large_libraries(words: str, clip: Path, tmp_path: Path) -> None:
+    listing = (
+        "import sys\nfrom colmap_av1.cli import main\ntry: main(sys.argv[1:])\nfinally: "
+        "print(*{name.split('.')[0] for name in sys.modules})"
     )
-    loaded = set(run.stdout.split())
-    assert "pycolmap" in loaded
-    assert not loaded & {"scipy", "matplotlib"}
+    run = subprocess.run(
+        [sys.executable, "-c", listing, *words.format(clip=clip).split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    loaded = set(run.stdout.splitlines()[-1].split())
+    assert not loaded & {"pycolmap", "cv2", "scipy", "h5py", "rich"}
 
 
 def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:

@@ -164,7 +164,7 @@ def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixtur
     assert options_in(help_of("match", "-h", capsys)) == {
         *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
         *(
-            "images",
+            "photos",
             "mask_path",
             "image_path",
             "num_images",

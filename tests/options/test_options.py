@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
-import sys
 import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -286,20 +283,3 @@ def test_parts_that_are_unused_exist() -> None:
                 part = field.default
                 for name in path.split("."):
                     part = getattr(part, name)
-
-
-def test_options_need_neither_pycolmap_nor_sources(tmp_path: Path) -> None:
-    script = """
-import sys, types
-package = types.ModuleType("colmap_av1")
-package.__path__ = [sys.argv[1]]
-sys.modules["colmap_av1"] = package
-from colmap_av1.options import CompareOptions
-CompareOptions()
-print("pycolmap" in sys.modules, "numpy" in sys.modules)
-"""
-    folder = os.path.dirname(colmap_av1.__file__)
-    run = subprocess.run(
-        [sys.executable, "-c", script, folder], capture_output=True, text=True, check=True
-    )
-    assert run.stdout.split() == ["False", "False"]

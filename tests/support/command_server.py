@@ -14,7 +14,7 @@ from typing import Any
 _SERVER = """
 import json, os, signal, sys, time
 from colmap_av1.cli import main
-from colmap_av1.util.start import ENDING, end_at_once
+from colmap_av1.util.signals import ENDING, end_at_once
 
 def run(task, said):
     os.chdir(task["folder"])

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 from colmap_av1.errors import ColmapAv1Error, EvaluationError
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.processes import bind
-from colmap_av1.util.start import held_back, let_through
+from colmap_av1.util.signals import held_back, let_through
 
 _Result = TypeVar("_Result")
 

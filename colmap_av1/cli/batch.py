@@ -1,33 +1,23 @@
-"""The subcommand `batch`."""
+"""The command `batch`."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from colmap_av1.batch.page import write_page
-from colmap_av1.batch.run import run_batch
-from colmap_av1.batch.tasks import TASKS
-from colmap_av1.cli.batch_progress import batch_progress
-from colmap_av1.cli.commands.shared import add_command, add_output, add_quiet, print_result
+import colmap_av1
 from colmap_av1.cli.options import add_options, add_options_of_any, given, given_of_any
+from colmap_av1.cli.parser import Parser
 from colmap_av1.cli.reports import batch_rows
+from colmap_av1.cli.terminal import print_result
 from colmap_av1.errors import OptionError
 from colmap_av1.options import BatchOptions
+from colmap_av1.options.batch import TASK_OPTIONS
 
 _SOME_FAILED = 1
 
 
-def add_batch(commands: Any) -> None:
-    """Add `batch`."""
-    command = add_command(
-        commands,
-        "batch",
-        _run,
-        "do one task on many videos, on this machine or a cluster; 'batch report' makes a page",
-        "[report] --inputs PATH ... --output PATH --task TASK",
-        full_help=True,
-    )
+def add_arguments(command: Parser) -> None:
+    """Add the arguments to the parser of the command."""
     command.add_argument(
         "verb", nargs="?", choices=("report",), help="write report.html into the output of a batch"
     )
@@ -38,30 +28,40 @@ def add_batch(commands: Any) -> None:
         help="lists (a path or URL on each line, and if wanted a tab and a name), quoted patterns, "
         "folders, tar files and videos; paths or URLs",
     )
-    add_output(command, "folder or URL for a folder of each video, batch.csv and batch.json")
-    command.add_argument("--task", choices=tuple(TASKS), help="what is done with each video")
+    command.add_argument(
+        "--output",
+        "--output_path",
+        required=True,
+        metavar="PATH",
+        help="folder or URL for a folder of each video, batch.csv and batch.json",
+    )
+    command.add_argument("--task", choices=tuple(TASK_OPTIONS), help="what is done with each video")
     command.add_argument(
         "--models",
         metavar="PATH",
         help="of densify: folder or URL with a model for each video, under its name",
     )
     add_options(command, BatchOptions)
-    add_options_of_any(command, *(task.kind for task in TASKS.values()))
-    add_quiet(command)
+    add_options_of_any(command, *TASK_OPTIONS.values())
 
 
-def _run(namespace: argparse.Namespace) -> int | None:
+def run(namespace: argparse.Namespace) -> int | None:
+    """Run a batch, or make its page; the exit status."""
     if namespace.verb == "report":
-        print_result(namespace, [("report", write_page(namespace.output))])
+        print_result(namespace, [("report", colmap_av1.write_page(namespace.output))])
         return None
     if namespace.inputs is None or namespace.task is None:
         missing = "inputs" if namespace.inputs is None else "task"
         raise OptionError(f"nothing to do: give --{missing} (see colmap-av1 batch --help)")
-    task = given_of_any(namespace, TASKS[namespace.task].kind, f"the task {namespace.task}")
+    task = given_of_any(namespace, TASK_OPTIONS[namespace.task], f"the task {namespace.task}")
     options = given(namespace, BatchOptions)
+    from colmap_av1.cli.batch_progress import batch_progress
+
     with batch_progress(namespace.quiet) as (hear, watch):
-        report = run_batch(
-            *(namespace.inputs, namespace.output, task),
+        report = colmap_av1.run_batch(
+            namespace.inputs,
+            namespace.output,
+            task,
             models=namespace.models,
             options=options,
             hear=hear,

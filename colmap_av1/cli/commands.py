@@ -1,0 +1,547 @@
+"""The commands: the options of each, the function that it calls, what it prints.
+
+What a command alone needs is imported when it runs, so that help and short commands start fast.
+"""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import colmap_av1
+from colmap_av1.cli import batch, reports
+from colmap_av1.cli.options import add_options, given
+from colmap_av1.cli.parser import Parser
+from colmap_av1.cli.terminal import (
+    print_next,
+    print_result,
+    print_summary,
+    print_text,
+    print_warning,
+    progress_bars,
+)
+from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.options import (
+    CompareOptions,
+    DensifyOptions,
+    EncodeOptions,
+    ExportOptions,
+    MapOptions,
+    MatchOptions,
+    PlaceOptions,
+    ReadOptions,
+    ReconstructOptions,
+    TrackOptions,
+    ViewOptions,
+)
+from colmap_av1.options.fields import Options
+
+_FAILED_CHECK = 1
+# A model was made, but a trainer failed on one.
+_FAILED_TRAINING = 3
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument of a command that is no field of its options.
+
+    Attributes:
+        names: its spellings.
+        how: further arguments of `add_argument`.
+    """
+
+    names: tuple[str, ...]
+    how: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Attributes:
+        run: does what the command is for; returns the exit status, None for 0.
+        summary: what that is.
+        needed: the options that its usage names.
+        arguments: its arguments, besides --quiet.
+        options: the dataclasses whose fields are its options.
+        full_help: leave the help of rare options to --help-all.
+        pycolmap: it needs pycolmap.
+        add_more: adds the arguments that the list cannot describe, before these.
+    """
+
+    run: Callable[[argparse.Namespace], int | None]
+    summary: str
+    needed: str
+    arguments: Sequence[Argument] = ()
+    options: Sequence[type[Options]] = ()
+    full_help: bool = False
+    pycolmap: bool = True
+    add_more: Callable[[Parser], None] | None = None
+
+    def add_to(self, parser: Parser) -> None:
+        """Add the arguments to the command's parser."""
+        if self.add_more is not None:
+            self.add_more(parser)
+        for argument in self.arguments:
+            parser.add_argument(*argument.names, **argument.how)
+        add_options(parser, *self.options)
+        parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
+
+
+def _path(name: str, what: str, *, required: bool = True, **how: Any) -> Argument:
+    """A path, with COLMAP's spelling of its name."""
+    how = {"required": required, "metavar": "PATH", "help": what, **how}
+    return Argument((f"--{name}", f"--{name}_path"), how)
+
+
+def _optional_path(name: str, what: str) -> Argument:
+    return Argument((f"--{name}",), {"metavar": "PATH", "help": what})
+
+
+def _flag(name: str, what: str) -> Argument:
+    return Argument((f"--{name}",), {"action": "store_true", "help": what})
+
+
+def _videos(what: str) -> tuple[Argument, ...]:
+    """Several videos, and photos; --images is another spelling that help does not show."""
+    return (
+        _path("video", f"{what}; several videos: give it for each", action="append"),
+        _optional_path("photos", "folder of photos of the same scene, which are added"),
+        Argument(("--images",), {"dest": "photos", "help": argparse.SUPPRESS}),
+    )
+
+
+_ANY_VIDEO = "a video; one that is not AV1 is converted first"
+_VIDEO = _path("video", "an AV1 video")
+_DATABASE = _path("database", "a COLMAP database")
+_OVERWRITE = _flag("overwrite", "replace files that exist, not only earlier output of this command")
+_OVERWRITE_MODELS = _flag("overwrite", "replace an output that exists and holds nothing but models")
+_GAUSSIANS = _optional_path(
+    "gaussians", "also write initial Gaussians to this .ply, for trainers that start from them"
+)
+
+
+def _match(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.match(
+            namespace.database,
+            namespace.video,
+            photos=namespace.photos,
+            image_path=namespace.image_path,
+            options=given(namespace, MatchOptions),
+            progress=report,
+        )
+    print_result(namespace, reports.match_rows(result), result.warnings)
+    if not namespace.quiet:
+        print_next(result)
+
+
+def _map(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.map_database(
+            namespace.database,
+            namespace.image_path,
+            namespace.output,
+            options=given(namespace, MapOptions),
+            place=given(namespace, PlaceOptions),
+            progress=report,
+            overwrite=namespace.overwrite,
+        )
+    print_result(namespace, reports.map_rows(result), result.warnings)
+
+
+def _reconstruct(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.reconstruct(
+            namespace.video,
+            namespace.output,
+            photos=namespace.photos,
+            gaussians=namespace.gaussians,
+            overwrite=namespace.overwrite,
+            options=given(namespace, ReconstructOptions),
+            progress=report,
+        )
+    print_result(namespace, reports.reconstruct_rows(result), result.warnings)
+
+
+def _densify(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.densify(
+            namespace.model,
+            namespace.video,
+            namespace.output,
+            photos=namespace.photos,
+            image_path=namespace.image_path,
+            gaussians=namespace.gaussians,
+            options=given(namespace, DensifyOptions),
+            progress=report,
+            overwrite=namespace.overwrite,
+        )
+    print_result(namespace, reports.densify_rows(result), result.warnings)
+
+
+def _compare(namespace: argparse.Namespace) -> int:
+    from colmap_av1.compare import compare
+
+    with progress_bars(namespace.quiet) as report:
+        result = compare(
+            namespace.video,
+            namespace.output,
+            image_path=namespace.image_path,
+            reference=namespace.reference,
+            options=given(namespace, CompareOptions),
+            progress=report,
+        )
+    for column in result.columns:
+        if column.error:
+            print_warning(f"{column.name}: {column.error}")
+        if column.training_error:
+            print_warning(f"{column.name}: nothing is trained: {column.training_error}")
+    print_result(namespace, reports.compare_rows(result), result.warnings)
+    if all(column.model is None for column in result.columns):
+        raise EvaluationError(f"{result.output}: no front-end gave a model: see report.html there")
+    return _FAILED_TRAINING if any(column.training_error for column in result.columns) else 0
+
+
+def _encode(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.encode(
+            namespace.video,
+            namespace.output,
+            overwrite=namespace.overwrite,
+            strict=namespace.strict,
+            options=given(namespace, EncodeOptions),
+            progress=report,
+        )
+    rows = [("frames", str(result.num_frames)), ("encoder", result.encoder)]
+    print_result(namespace, [*rows, ("output", str(result.output))])
+
+
+def _info(namespace: argparse.Namespace) -> None:
+    options = given(namespace, ReadOptions)
+    read_out = None
+    with progress_bars(namespace.quiet) as report:
+        result = colmap_av1.inspect(
+            namespace.video, options, lambda done: report("motion", done, None)
+        )
+        if namespace.rolling_shutter == "estimate":
+            from colmap_av1.matching.shutter.of_video import estimate_video_read_out
+
+            read_out = estimate_video_read_out(namespace.video, options, report)
+    print_summary([*reports.info_rows(result), *reports.read_out_rows(read_out)])
+
+
+def _check(namespace: argparse.Namespace) -> int:
+    if namespace.database is None and namespace.model is None:
+        raise OptionError("nothing to check: give --database, or --model with --image_path")
+    if (namespace.model is None) != (namespace.image_path is None):
+        raise OptionError("a model is checked by its pictures: give both --model and --image_path")
+    good = True
+    if namespace.database is not None:
+        result = colmap_av1.check(namespace.database)
+        print_result(namespace, reports.check_rows(result))
+        good = result.mappable and not result.damaged
+    if namespace.model is not None:
+        good = _check_model(namespace) and good
+    return 0 if good or not namespace.strict else _FAILED_CHECK
+
+
+def _check_model(namespace: argparse.Namespace) -> bool:
+    """Print what a model is like; whether it holds together."""
+    from colmap_av1.check.model import check_model
+    from colmap_av1.geometry.colmap_model import read_model
+
+    model = read_model(namespace.model)
+    database = None if namespace.database is None else Path(namespace.database)
+    with progress_bars(namespace.quiet) as report:
+        found = check_model(
+            model,
+            image_path=Path(namespace.image_path),
+            database=database,
+            progress=report,
+        )
+    print_result(namespace, reports.model_rows(found), found.warnings)
+    return not found.warnings
+
+
+def _motion(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        count = colmap_av1.export_motion(
+            namespace.video,
+            namespace.output,
+            given(namespace, ReadOptions),
+            lambda done: report("motion", done, None),
+            overwrite=namespace.overwrite,
+        )
+    print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
+
+
+def _export(namespace: argparse.Namespace) -> None:
+    with progress_bars(namespace.quiet) as report:
+        num_images, num_pairs = colmap_av1.export_hloc(
+            namespace.database,
+            namespace.output,
+            given(namespace, ExportOptions),
+            report,
+            overwrite=namespace.overwrite,
+        )
+    rows = [("images", str(num_images)), ("pairs", str(num_pairs))]
+    print_result(namespace, [*rows, ("output", namespace.output)])
+
+
+def _add_subject(parser: Parser) -> None:
+    """Add what `view` draws."""
+    subject = parser.add_mutually_exclusive_group(required=True)
+    for name, what in (
+        ("video", "draw motion and tracks of an AV1 video"),
+        ("database", "draw the matches of two images"),
+        ("model", "draw points and camera path of a model"),
+    ):
+        subject.add_argument(f"--{name}", f"--{name}_path", metavar="PATH", help=what)
+
+
+def _view(namespace: argparse.Namespace) -> None:
+    from colmap_av1.view.matches import view_database
+    from colmap_av1.view.model import view_model
+    from colmap_av1.view.pictures import check_picture, write_picture
+    from colmap_av1.view.video import view_video
+
+    if namespace.model is not None and namespace.interactive:
+        _serve(namespace)
+        return
+    if namespace.output is None:
+        raise OptionError("nowhere to draw: give --output")
+    output, overwrite = namespace.output, namespace.overwrite
+    if namespace.model is not None:
+        check_picture(output, [namespace.model], overwrite=overwrite)
+        write_picture(view_model(namespace.model), output, overwrite=overwrite)
+        return
+    if namespace.database is not None:
+        if namespace.image_path is None:
+            raise OptionError("nothing to draw the matches on: give --image_path")
+        inputs = [namespace.database, namespace.image_path]
+        check_picture(output, inputs, overwrite=overwrite)
+        picture = view_database(namespace.database, namespace.image_path, namespace.pair)
+        write_picture(picture, output, overwrite=overwrite)
+        return
+    with progress_bars(namespace.quiet) as report:
+        count = view_video(
+            namespace.video,
+            output,
+            options=given(namespace, ViewOptions),
+            tracks=given(namespace, TrackOptions),
+            read=given(namespace, ReadOptions),
+            progress=report,
+            overwrite=overwrite,
+        )
+    print_result(namespace, [("frames", str(count)), ("output", output)])
+
+
+def _serve(namespace: argparse.Namespace) -> None:
+    from colmap_av1.view.model import serve_model
+
+    server = serve_model(namespace.model, port=namespace.port)
+    try:
+        print_text(f"http://127.0.0.1:{namespace.port} (end with Ctrl-C)\n")
+        threading.Event().wait()
+    finally:
+        server.stop()
+
+
+COMMANDS = {
+    "match": Command(
+        _match,
+        "fill a COLMAP database from a video",
+        "--database PATH --video PATH [--video PATH] [--photos PATH] [--image_path PATH]",
+        (
+            _path("database", "COLMAP database; its images are used, or it is created"),
+            *_videos(_ANY_VIDEO),
+            _optional_path(
+                "image_path",
+                "folder to write the images to; existing ones of the right size are kept",
+            ),
+        ),
+        (MatchOptions,),
+        full_help=True,
+    ),
+    "map": Command(
+        _map,
+        "make a model of a COLMAP database with one of COLMAP's mappers",
+        "--database PATH --image_path PATH --output PATH",
+        (
+            _DATABASE,
+            Argument(
+                ("--image_path",),
+                {"required": True, "metavar": "PATH", "help": "folder of the database's images"},
+            ),
+            _path("output", "new folder for the models; 0 is the one with the most images"),
+            _OVERWRITE_MODELS,
+        ),
+        (MapOptions, PlaceOptions),
+    ),
+    "reconstruct": Command(
+        _reconstruct,
+        "reconstruct a dense model for 3D Gaussian splatting",
+        "--video PATH [--video PATH] [--photos PATH] --output PATH",
+        (
+            *_videos(_ANY_VIDEO),
+            _path("output", "folder for images/ and sparse/0/; that of an earlier run is resumed"),
+            _GAUSSIANS,
+            _flag("overwrite", "replace a file of --gaussians that exists"),
+        ),
+        (ReconstructOptions,),
+        full_help=True,
+    ),
+    "densify": Command(
+        _densify,
+        "triangulate dense points on the poses of an existing model",
+        "--model PATH --video PATH [--video PATH] [--photos PATH] --output PATH",
+        (
+            _path("model", "folder of a COLMAP model"),
+            *_videos("the video from which its images were taken"),
+            _path("output", "new folder for the model"),
+            _OVERWRITE_MODELS,
+            _optional_path(
+                "image_path", "folder of its images, where their names do not determine the frames"
+            ),
+            _GAUSSIANS,
+        ),
+        (DensifyOptions,),
+        full_help=True,
+    ),
+    "batch": Command(
+        batch.run,
+        "do one task on many videos, on this machine or a cluster; 'batch report' makes a page",
+        "[report] --inputs PATH ... --output PATH --task TASK",
+        full_help=True,
+        add_more=batch.add_arguments,
+    ),
+    "compare": Command(
+        _compare,
+        "compare with SIFT and others on a video, with a report",
+        "--video PATH --output PATH [--reference PATH]",
+        (
+            _path("video", _ANY_VIDEO),
+            _path("output", "folder for the report; that of an earlier run is resumed"),
+            _optional_path(
+                "image_path", "folder of existing images, or for new ones [within the output]"
+            ),
+            _optional_path(
+                "reference",
+                "ground truth: a COLMAP model, or a file with lines of 'name tx ty tz qx qy qz "
+                "qw', camera to world [the model of sift-exhaustive]",
+            ),
+        ),
+        (CompareOptions,),
+        full_help=True,
+    ),
+    "encode": Command(
+        _encode,
+        "convert a video to an AV1 stream that is good for matching",
+        "--video PATH --output PATH",
+        (
+            _path("video", "a video that ffmpeg decodes"),
+            _path("output", "the stream: .mp4, .mkv, .webm or .ivf"),
+            _flag("overwrite", "replace an output that exists"),
+            _flag(
+                "strict",
+                "fail on a damaged video instead of using the frames before the damage",
+            ),
+        ),
+        (EncodeOptions,),
+        pycolmap=False,
+    ),
+    "info": Command(
+        _info,
+        "report a stream's structure and whether it is good for matching",
+        "--video PATH",
+        (
+            _VIDEO,
+            Argument(
+                ("--rolling_shutter",),
+                {
+                    "choices": ("none", "estimate"),
+                    "default": "none",
+                    "help": "estimate: also the time in which the shutter reads the rows of a "
+                    "picture, from the tracks, which takes as long as to match them",
+                },
+            ),
+        ),
+        (ReadOptions,),
+        pycolmap=False,
+    ),
+    "check": Command(
+        _check,
+        "report what COLMAP's mappers will make of a database, or whether a model holds together",
+        "{--database PATH | --model PATH --image_path PATH}",
+        (
+            _path("database", "a COLMAP database", required=False),
+            _path(
+                "model",
+                "folder of a COLMAP model: pictures of places seen again are held against its "
+                "poses, and with --database the matches it was mapped from",
+                required=False,
+            ),
+            _optional_path("image_path", "folder of the model's images"),
+            _flag(
+                "strict",
+                "exit with status 1 if the mappers cannot use the database, it is damaged, or the "
+                "model bends",
+            ),
+        ),
+    ),
+    "motion": Command(
+        _motion,
+        "write the motion of every frame",
+        "--video PATH --output PATH",
+        (_VIDEO, _path("output", "a .npz or .h5 file"), _OVERWRITE),
+        (ReadOptions,),
+        pycolmap=False,
+    ),
+    "export": Command(
+        _export,
+        "write a database's features and matches for hloc",
+        "--database PATH --output PATH",
+        (_DATABASE, _path("output", "folder for the files"), _OVERWRITE),
+        (ExportOptions,),
+    ),
+    "view": Command(
+        _view,
+        "draw motion, tracks, matches or a model",
+        "(--video PATH | --database PATH | --model PATH) --output PATH",
+        (
+            _path(
+                "output",
+                "an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
+                required=False,
+            ),
+            _OVERWRITE,
+            _optional_path("image_path", "folder of the database's images"),
+            Argument(
+                ("--pair",),
+                {
+                    "nargs": 2,
+                    "metavar": "NAME",
+                    "help": "the images to draw [the pair with the most inliers]",
+                },
+            ),
+            _flag("interactive", "show the model in the browser (needs the viewer extra)"),
+            Argument(
+                ("--port",),
+                {
+                    "type": int,
+                    "default": 8080,
+                    "metavar": "N",
+                    "help": "port of the interactive viewer [8080]",
+                },
+            ),
+        ),
+        (ViewOptions, TrackOptions, ReadOptions),
+        full_help=True,
+        add_more=_add_subject,
+    ),
+}

@@ -1,1 +1,0 @@
-"""One subcommand each: its options, the function it calls, what it prints."""
