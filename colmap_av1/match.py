@@ -138,7 +138,7 @@ class MatchReport:
         densify = [
             *("colmap-av1", "densify", "--model", f"{output}/0"),
             *(word for video in self.videos for word in ("--video", _no_option(video))),
-            *(("--images", _no_option(self.photos)) if self.photos is not None else ()),
+            *(("--photos", _no_option(self.photos)) if self.photos is not None else ()),
             *(("--image_path", images) if self.image_path is not None else ()),
             *("--output", _no_option(self.database.with_name(f"{self.database.stem}_splats"))),
         ]

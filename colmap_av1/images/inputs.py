@@ -206,7 +206,7 @@ def _check_options(num_videos: int, photos: Path | None, options: MatchOptions) 
     if photos is not None and options.links.links == "none":
         raise OptionError(
             "links 'none': photos have no motion, only links connect them: leave out --links or "
-            "--images"
+            "--photos"
         )
     if num_videos == 1:
         return

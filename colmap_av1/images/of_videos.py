@@ -46,7 +46,7 @@ def images_of_videos(
         if label not in of_label:
             raise ModelError(
                 f"{model}: image '{name}' lies in no folder of a video, "
-                f"{', '.join(of_label)}: give the video it comes from, or the photos as --images"
+                f"{', '.join(of_label)}: give the video it comes from, or the photos as --photos"
             )
         of_label[label][own] = sizes[name]
     found = []

@@ -14,6 +14,7 @@ import pytest
 from colmap_av1.cli import main
 from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.parser import Parser
+from colmap_av1.cli.program import make_parser
 from colmap_av1.options import (
     CompareOptions,
     DensifyOptions,
@@ -290,3 +291,14 @@ def test_one_name_cannot_set_two_options() -> None:
     command = Parser(prog="test")
     with pytest.raises(argparse.ArgumentError, match="--strength"):
         add_options(command, type("Twice", (_Twice,), {"__module__": __name__}))
+
+
+@pytest.mark.parametrize("command", ["match", "reconstruct", "densify"])
+@pytest.mark.parametrize("spelling", ["--photos", "--images"])
+def test_photos_have_two_spellings_of_which_help_shows_one(
+    command: str, spelling: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parser, _ = make_parser([command])
+    namespace = parser.parse_args([command, *NEEDED[command], spelling, "album"])
+    assert namespace.photos == "album"
+    assert "images" not in options_in(help_of(command, "--help-all", capsys))
