@@ -28,8 +28,7 @@ from colmap_av1.evaluate.training.trainers import check_trainer, train, write_sp
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
-from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.outputs import check_folder
+from colmap_av1.util.files import check_apart
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
@@ -66,7 +65,6 @@ class _Reference:
     is_truth: bool = False
 
 
-@checks_arguments
 def compare(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -115,7 +113,7 @@ def compare(
     if options.trainer is not None:
         check_trainer(options.trainer)
     files = [file for frontend in frontends.values() for file in frontend.files]
-    check_folder(output, [video, image_path, options.match.images.frame_list, *files])
+    check_apart(output, [video, image_path, options.match.images.frame_list, *files])
     _check_reference(output, reference)
     video = read_video(video, options.match.read.operating_point)
     check_is_plane(video.path, video.projection, video.picture_size[0])
@@ -183,7 +181,7 @@ def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> 
     """Refuse a truth within the output; the model of a front-end is one that stays."""
     models = (output / _FRONTENDS).resolve()
     if reference is not None and not Path(reference).resolve().is_relative_to(models):
-        check_folder(output, [reference])
+        check_apart(output, [reference])
 
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:

@@ -52,10 +52,8 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
-from colmap_av1.util.outputs import check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
@@ -110,7 +108,6 @@ class _TrackedImages:
     warnings: tuple[str, ...]
 
 
-@checks_arguments
 @one_blas_thread()
 def densify(
     model: str | os.PathLike[str],
@@ -137,10 +134,10 @@ def densify(
             there are none.
         image_path: folder of the model's images, to recognise by their content which frames
             they are where their names leave doubt.
-        gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
+        gaussians: file, .ply, for initial Gaussians of the points.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
-        overwrite: replace an output that holds a model and nothing else.
+        overwrite: replace an output that holds a model and nothing else, and a file of Gaussians.
 
     Raises:
         ModelError: there is no readable model with poses, it is not of these videos, or the
@@ -361,8 +358,7 @@ def _check_outputs(
     overwrite: bool,
 ) -> None:
     """Refuse what must not or cannot be written, before the long work."""
-    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
-    check_folder(output, inputs)
+    check_new_folder(output, MODEL_FILES, inputs, overwrite=overwrite)
     check_gaussians_path(gaussians, inputs, overwrite=overwrite)
 
 

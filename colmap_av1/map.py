@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ from colmap_av1.images.names import image_file
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import FarViews
-from colmap_av1.poses.mapper import is_mapper_log, map_poses
+from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.placing.placement import (
     Placement,
     Surroundings,
@@ -32,9 +35,7 @@ from colmap_av1.poses.placing.placement import (
     write_place,
 )
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.files import check_new_folder, whole_folder
-from colmap_av1.util.outputs import check_files, check_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 
 
@@ -74,7 +75,6 @@ class MapReport:
         return self.output / "0"
 
 
-@checks_arguments
 def map_database(
     database: str | os.PathLike[str],
     image_path: str | os.PathLike[str],
@@ -101,7 +101,7 @@ def map_database(
     Raises:
         DatabaseError: the database is missing, unreadable, or nothing that mappers can use.
         ImageError: an image of the database is not in the folder, or of another size.
-        ModelError: the mapper fails or finds no model; `OUTPUT.log` is what it printed.
+        ModelError: the mapper fails or finds no model; the message names its log.
         OptionError: the output is not empty, or must not be replaced, or the known distance is
             none of the model.
     """
@@ -110,14 +110,11 @@ def map_database(
     progress = progress if progress is not None else no_progress
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
-    check_new_folder(output, MODEL_FILES, overwrite=overwrite)
-    check_folder(output, [database, image_path])
-    log = output.resolve().with_name(f"{output.resolve().name}.log")
-    check_files([log], [database, image_path], is_own=is_mapper_log, overwrite=overwrite)
+    check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)
     num_images, thin_gaps = _check_input(database, image_path)
 
     try:
-        with whole_folder(output, overwrite=overwrite) as partial:
+        with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
             with clock.measure("poses"):
                 copy = partial / "mapped.db"
                 copy_database(database, copy)
@@ -134,10 +131,10 @@ def map_database(
             if not num_registered:
                 raise ModelError(
                     f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
-                    "share too few matches, or too little parallax: see 'colmap-av1 check', "
-                    "try the other --mapper, or give --camera_params when matching"
+                    "share too few matches, or too little parallax: see 'colmap-av1 check' and "
+                    f"{log}, try the other --mapper, or give --camera_params when matching"
                 )
-            log.replace(partial / "mapper.log")
+            shutil.copyfile(log, partial / "mapper.log")
             with clock.measure("place"):
                 placement = _place(partial, database, image_path, place, options.seed)
     except OSError as error:
@@ -169,6 +166,21 @@ def map_database(
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )
+
+
+@contextmanager
+def _log() -> Iterator[Path]:
+    """A file for what the mapper prints, which stays where that fails."""
+    descriptor, name = tempfile.mkstemp(prefix="colmap-av1-map-", suffix=".log")
+    os.close(descriptor)
+    try:
+        yield Path(name)
+    except ModelError:
+        raise
+    except BaseException:
+        os.unlink(name)
+        raise
+    os.unlink(name)
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:

@@ -36,7 +36,6 @@ from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
@@ -146,7 +145,6 @@ class MatchReport:
         return with_colmap, shlex.join(ours), shlex.join(densify)
 
 
-@checks_arguments
 @one_blas_thread()
 def match(
     database: str | os.PathLike[str],

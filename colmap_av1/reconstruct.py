@@ -30,10 +30,8 @@ from colmap_av1.splats.gaussians import check_gaussians_path, write_model_gaussi
 from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import scratch_folder, whole_file
-from colmap_av1.util.outputs import check_folder
+from colmap_av1.util.files import check_apart, scratch_folder, whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import count_shown
@@ -122,7 +120,6 @@ class ReconstructReport:
     warnings: tuple[str, ...]
 
 
-@checks_arguments
 @one_blas_thread()
 def reconstruct(
     video: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
@@ -150,8 +147,8 @@ def reconstruct(
             resumed run uses again, in the folder or where `options.match.keep_stream` says.
         output: the folder; new, empty, or that of an earlier run.
         photos: folder of photos of the same scene; None: there are none.
-        gaussians: file, .ply, for initial Gaussians of the points; one from before is replaced.
-        overwrite: replace a file of Gaussians that was not written here, too.
+        gaussians: file, .ply, for initial Gaussians of the points.
+        overwrite: replace a file of Gaussians that exists.
         options: options of every stage.
         progress: called with a stage's name, what is done, and of how much where known.
 
@@ -167,7 +164,7 @@ def reconstruct(
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()
-    check_folder(output, [*paths_of(video), photos, *options.match.files])
+    check_apart(output, [*paths_of(video), photos, *options.match.files])
     inputs = read_inputs(video, photos, options.match, flat=True)
     # What can be refused is refused before the long work.
     checked = [*(own.path for own in inputs.videos), *options.match.files]

@@ -70,12 +70,15 @@ COMMANDS = {
         once=True,
     ),
     "convert": Command("match --database h.db --video h.mp4", ("h.db",), ("h.mp4",), once=True),
-    "motion": Command("motion --video v.mp4 --output motion.npz", ("motion.npz",), ("v.mp4",)),
-    "draw": Command("view --video v.mp4 --output drawn.mp4", ("drawn.mp4",), ("v.mp4",)),
-    "export": Command("export --database a.db --output hloc", ("hloc",), ("a.db",)),
+    "motion": Command(
+        "motion --video v.mp4 --output motion.npz", ("motion.npz",), ("v.mp4",), once=True
+    ),
+    "draw": Command("view --video v.mp4 --output drawn.mp4", ("drawn.mp4",), ("v.mp4",), once=True),
+    "export": Command("export --database a.db --output hloc", ("hloc",), ("a.db",), once=True),
     "pair": Command(
         "view --database a.db --image_path frames --output pair.png",
         *(("pair.png",), ("a.db", "frames")),
+        once=True,
     ),
     "map": Command(
         "map --database a.db --image_path frames --output model --num_threads 1",
@@ -95,11 +98,11 @@ VIDEOS = ("v.mp4", "h.mp4")
 # Where files of the user may lie in the way.
 PLACES = (
     *("a.db", "frames/frame_000004.png", "frames/notes.txt", "hloc/pairs.txt", "hloc/notes.txt"),
-    *("motion.npz", "drawn.mp4", "pair.png", "model/notes.txt", "model.log", "dense/cameras.bin"),
+    *("motion.npz", "drawn.mp4", "pair.png", "model/notes.txt", "dense/cameras.bin"),
     *("out/notes.txt", "h.db"),
 )
 # What says when and how long, and records that only the same folder can be resumed by.
-UNLIKE = {"report.json", "mapper.log", "model.log"}
+UNLIKE = {"report.json", "mapper.log"}
 
 
 def contents(folder: Path, *roots: str) -> dict[str, str]:
@@ -264,10 +267,7 @@ class CommandMachine(RuleBasedStateMachine):
         damaged = found.items() - self.world.made(*command.outputs).items()
         folders = any((self.folder / name).is_dir() for name in self.files_made(command))
         there = bool(found) and (command.once or bool(damaged))
-        mine = any(
-            place.split("/")[0] in (*command.outputs, *(f"{o}.log" for o in command.outputs))
-            for place in self.mine
-        )
+        mine = any(place.split("/")[0] in command.outputs for place in self.mine)
         return (there and not command.resumes) or folders or mine
 
     def files_made(self, command: Command) -> list[str]:

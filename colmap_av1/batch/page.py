@@ -21,7 +21,6 @@ from colmap_av1.batch.outputs import PAGE, ROWS, Output, output_at
 from colmap_av1.batch.rows import read_json
 from colmap_av1.batch.tasks import THUMBNAIL
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.util.arguments import checks_arguments
 
 # Rows that browsers sort at once; of more videos, failures come first.
 MOST_ROWS = 2000
@@ -114,7 +113,6 @@ class _Totals:
             self.video_seconds += row.video_seconds
 
 
-@checks_arguments
 def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) -> str:
     """Write `report.html` into the output of a batch: it needs no other file and no network.
 

@@ -32,7 +32,6 @@ from colmap_av1.batch.tasks import matching_of, task_of
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.options import BatchOptions, DensifyOptions
 from colmap_av1.options.fields import Options
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.digests import package_version
 
 # Rows are written at most so often, and for at most this share of the time: those of a million
@@ -100,7 +99,6 @@ class BatchReport:
 Watch = Callable[[Counts, "Row | None"], None]
 
 
-@checks_arguments
 def run_batch(
     inputs: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],

@@ -33,7 +33,6 @@ from colmap_av1.errors import DatabaseError
 from colmap_av1.images.names import video_of
 from colmap_av1.matching.gaps import Gap, few_match_gaps
 from colmap_av1.matching.two_view_geometry import config_name
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.graphs import connected_components
 
 
@@ -99,7 +98,6 @@ class CheckReport:
         return any(finding.damage for finding in self.findings)
 
 
-@checks_arguments
 def check(database: str | os.PathLike[str]) -> CheckReport:
     """Read a COLMAP database of any version and say what the mappers will make of it.
 

@@ -118,7 +118,7 @@ def _videos(what: str) -> tuple[Argument, ...]:
 _ANY_VIDEO = "a video; one that is not AV1 is converted first"
 _VIDEO = _path("video", "an AV1 video")
 _DATABASE = _path("database", "a COLMAP database")
-_OVERWRITE = _flag("overwrite", "replace files that exist, not only earlier output of this command")
+_OVERWRITE = _flag("overwrite", "replace an output that exists")
 _OVERWRITE_MODELS = _flag("overwrite", "replace an output that exists and holds nothing but models")
 _GAUSSIANS = _optional_path(
     "gaussians", "also write initial Gaussians to this .ply, for trainers that start from them"
@@ -446,7 +446,7 @@ COMMANDS = {
         (
             _path("video", "a video that ffmpeg decodes"),
             _path("output", "the stream: .mp4, .mkv, .webm or .ivf"),
-            _flag("overwrite", "replace an output that exists"),
+            _OVERWRITE,
             _flag(
                 "strict",
                 "fail on a damaged video instead of using the frames before the damage",

@@ -7,9 +7,7 @@ anywhere: it is opened so that nothing in it is run, and read only if it has COL
 from __future__ import annotations
 
 import contextlib
-import glob
 import itertools
-import secrets
 import sqlite3
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +15,7 @@ from pathlib import Path
 
 from colmap_av1.database.layout import SCHEMA, USER_VERSION, check_layout
 from colmap_av1.errors import DatabaseError, cannot_write
+from colmap_av1.util.files import remove_leftovers, whole_file
 
 # Seconds to wait for another writer: one that is only closing a file is soon done.
 _BUSY_TIMEOUT = 2.0
@@ -171,51 +170,23 @@ def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
 def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
     """Make a database under another name in the same folder, then give it its own."""
     target = _target(path)
-    _remove_leftovers(target)
-    partial = target.with_name(f".{target.name}.{secrets.token_hex(8)}.partial")
+    remove_leftovers(target.parent, target.name)
     try:
-        partial.touch(exist_ok=False)
-        with _connect(partial, "mode=rw", path) as connection:
-            connection.set_progress_handler(None, 0)  # there is nothing to read yet
-            # The file is thrown away on any failure: nothing needs to be rolled back.
-            connection.execute("PRAGMA journal_mode = OFF")
-            connection.execute("BEGIN EXCLUSIVE")
-            if not partial.exists():  # taken for a leftover before it was locked
-                raise DatabaseError(f"{path} is made by another process: run again")
-            for statement in SCHEMA:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {USER_VERSION}")
-            fill(connection)
-            connection.execute("COMMIT")
-        if not is_new(path):
-            raise DatabaseError(f"{path} was made by another process meanwhile: run again")
-        partial.replace(target)
+        with whole_file(target) as partial:
+            with _connect(partial, "mode=rw", path) as connection:
+                connection.set_progress_handler(None, 0)  # there is nothing to read yet
+                # The file is thrown away on any failure: nothing needs to be rolled back.
+                connection.execute("PRAGMA journal_mode = OFF")
+                connection.execute("BEGIN EXCLUSIVE")
+                for statement in SCHEMA:
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA user_version = {USER_VERSION}")
+                fill(connection)
+                connection.execute("COMMIT")
+            if not is_new(path):
+                raise DatabaseError(f"{path} was made by another process meanwhile: run again")
     except OSError as error:
         raise DatabaseError(cannot_write(path, error)) from error
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _remove_leftovers(target: Path) -> None:
-    """Remove what killed processes left of this file while they made it.
-
-    A process that still makes it holds a lock on its own.
-    """
-    pattern = f".{glob.escape(target.name)}.{'[0-9a-f]' * 16}.partial"
-    for name in glob.glob(pattern, root_dir=target.parent):
-        leftover = target.parent / name
-        with (
-            contextlib.suppress(OSError, sqlite3.Error),
-            contextlib.closing(
-                sqlite3.connect(f"{leftover.as_uri()}?mode=rw", uri=True, timeout=0)
-            ) as connection,
-        ):
-            try:
-                connection.execute("BEGIN EXCLUSIVE")
-            except sqlite3.DatabaseError as error:
-                if "locked" in str(error):
-                    continue
-            leftover.unlink()
 
 
 def write_existing(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:

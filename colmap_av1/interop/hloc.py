@@ -9,7 +9,6 @@ centres are whole numbers; where it fills COLMAP's databases it adds 0.5.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,10 +23,8 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
 from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
 from colmap_av1.options import ExportOptions
-from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.files import remove_leftovers, whole_file
-from colmap_av1.util.hdf5 import mark_of, new_hdf5
-from colmap_av1.util.outputs import check_files, made_by
+from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
+from colmap_av1.util.hdf5 import new_hdf5
 from colmap_av1.util.progress import Progress, no_progress
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
@@ -36,8 +33,6 @@ FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 # files of its first versions.
 _SEPARATOR, _OLD_SEPARATOR = "/", "_"
 _NO_MATCH = -1
-_MARK = made_by("export")
-_PAIRS_DIGEST = "pairs_sha256"
 # HDF5's filters pack zeros to a thousandth of their size, and nothing further.
 _DENSEST = 1100
 # What h5py raises where a file is damaged.
@@ -68,7 +63,6 @@ class HlocMatches:
     scores: list[NDArray[np.float32]]
 
 
-@checks_arguments
 def export_hloc(
     database: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -87,11 +81,10 @@ def export_hloc(
 
     Args:
         database: the database file.
-        output: folder of the files; made where it is missing. Those of an earlier export in it
-            are replaced.
+        output: folder of the files; made where it is missing.
         options: which matches are written.
         progress: called with a stage's name, what is done, and of how much.
-        overwrite: replace other files of these names, too.
+        overwrite: replace files of these names that exist.
 
     Returns:
         The numbers of images and of pairs.
@@ -106,8 +99,8 @@ def export_hloc(
     report = progress if progress is not None else no_progress
     if is_new(path):
         raise DatabaseError(f"{path}: no such file, or empty: give the path of a COLMAP database")
-    files = [folder / name for name in (FEATURES, MATCHES, PAIRS)]
-    check_files(files, [path], is_own=_is_own, overwrite=overwrite)
+    for name in (FEATURES, MATCHES, PAIRS):
+        check_new_file(folder / name, [path], overwrite=overwrite)
     with open_unaltered(path) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images").fetchall())
         _check_names(path, sorted(names.values()))
@@ -120,17 +113,6 @@ def export_hloc(
                 options=options, report=report,
             )  # fmt: skip
     return len(counts), num_pairs
-
-
-def _is_own(path: Path) -> bool:
-    """Whether a file is of an earlier export; of a list, the matches beside it say so."""
-    if path.name != PAIRS:
-        return mark_of(path) == _MARK
-    if mark_of(path.with_name(MATCHES)) != _MARK:
-        return False
-    with h5py.File(path.with_name(MATCHES), "r") as file:
-        digest = file.attrs.get(_PAIRS_DIGEST, hashlib.sha256().hexdigest())
-    return bool(digest == hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
@@ -167,8 +149,8 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
         with contextlib.ExitStack() as files:
             partial = [files.enter_context(whole_file(folder / name)) for name in names]
             with (
-                new_hdf5(partial[0], _MARK) as features,
-                new_hdf5(partial[1], _MARK) as matches,
+                new_hdf5(partial[0]) as features,
+                new_hdf5(partial[1]) as matches,
                 open(partial[2], "w", encoding="utf-8", newline="\n") as pairs,
             ):
                 yield features, matches, pairs
@@ -227,7 +209,6 @@ def _write_pairs(
     pair_ids = connection.execute(
         f"SELECT pair_id FROM {table} WHERE rows > 0 ORDER BY pair_id"
     ).fetchall()
-    listed = hashlib.sha256()
     for done, (pair_id,) in enumerate(pair_ids, 1):
         i, j = image_ids_from_pair_id(pair_id)
         num_rows, data = connection.execute(
@@ -249,17 +230,12 @@ def _write_pairs(
         matches0[found[:, 0]] = found[:, 1]
         group = f"{_pair_part(names[i])}{_SEPARATOR}{_pair_part(names[j])}"
         write(f"{group}/matches0", matches0)
-        scores = write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
-        line = f"{names[i]} {names[j]}\n"
-        pairs.write(line)
-        listed.update(line.encode())
-        if done == len(pair_ids):
-            scores.file.attrs[_PAIRS_DIGEST] = listed.hexdigest()
+        write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
+        pairs.write(f"{names[i]} {names[j]}\n")
         report("pairs", done, len(pair_ids))
     return len(pair_ids)
 
 
-@checks_arguments
 def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str]) -> HlocMatches:
     """Read features and matches from files that hloc, or a program like it, wrote.
 

@@ -17,7 +17,6 @@ from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video, read_video
@@ -84,7 +83,6 @@ class StreamReport:
         return not self.reasons
 
 
-@checks_arguments
 def inspect(
     video: str | os.PathLike[str],
     options: ReadOptions | None = None,

@@ -17,17 +17,13 @@ from colmap_av1.errors import OptionError, VideoError, cannot_write
 from colmap_av1.motion.frame_motion import UNIT_FIELDS, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
-from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.files import remove_leftovers, whole_file
-from colmap_av1.util.hdf5 import mark_of, new_hdf5
-from colmap_av1.util.outputs import check_files, made_by
+from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
+from colmap_av1.util.hdf5 import new_hdf5
 
 # Zip members carry a date; a fixed one keeps the bytes the same.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-_MARK = made_by("motion")
 
 
-@checks_arguments
 def export_motion(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -49,7 +45,7 @@ def export_motion(
         output: the file; its extension .npz, .h5 or .hdf5 says the format.
         options: how the bitstream is read.
         progress: called with the number of frames written so far.
-        overwrite: replace an output that exists, if this function did not write it either.
+        overwrite: replace an output that exists.
 
     Returns:
         The number of coded frames.
@@ -63,7 +59,7 @@ def export_motion(
     writers: dict[str, _Opener] = {".npz": _open_npz, ".h5": _open_h5, ".hdf5": _open_h5}
     if path.suffix.lower() not in writers:
         raise OptionError(f"{path}: give an output file that ends in .npz or .h5")
-    check_files([path], [video], is_own=_is_own, overwrite=overwrite)
+    check_new_file(path, [video], overwrite=overwrite)
     count = 0
     try:
         remove_leftovers(path.parent, path.name)
@@ -82,15 +78,6 @@ def export_motion(
     return count
 
 
-def _is_own(path: Path) -> bool:
-    """Whether a file is an earlier output."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.comment == _MARK.encode()
-    except (OSError, zipfile.BadZipFile):
-        return mark_of(path) == _MARK
-
-
 class _Opener(Protocol):
     def __call__(
         self, path: Path
@@ -100,7 +87,6 @@ class _Opener(Protocol):
 @contextmanager
 def _open_npz(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.comment = _MARK.encode()
 
         def write(name: str, array: NDArray[Any]) -> None:
             info = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
@@ -113,7 +99,7 @@ def _open_npz(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
 
 @contextmanager
 def _open_h5(path: Path) -> Iterator[Callable[[str, NDArray[Any]], None]]:
-    with new_hdf5(path, _MARK) as write_dataset:
+    with new_hdf5(path) as write_dataset:
 
         def write(name: str, array: NDArray[Any]) -> None:
             how = {"compression": "gzip", "compression_opts": 1} if array.size > 1 else {}

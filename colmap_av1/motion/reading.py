@@ -18,7 +18,6 @@ from colmap_av1 import _core
 from colmap_av1.errors import BitstreamError, LimitError, OptionError
 from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.options import ReadOptions
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.container import check_process, open_stream
 
@@ -56,7 +55,6 @@ class _Index:
     num_units: int
 
 
-@checks_arguments
 def read_motion(
     video: str | PathLike[str], options: ReadOptions | None = None
 ) -> Iterator[FrameMotion]:

@@ -19,7 +19,6 @@ from colmap_av1.poses import mapper_process as child
 from colmap_av1.poses.mapper_process import run_mapping
 from colmap_av1.util.cpus import BLAS_THREADS, threads_or_cpus
 from colmap_av1.util.memory import give_back_free_memory
-from colmap_av1.util.outputs import made_by
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
@@ -36,7 +35,6 @@ _MOST_DENSE_IMAGES = 400
 # pose, unless all see few: then this share of what is usual. An image that a pillar fills saw 8
 # where others saw 300 and more, and was off by 300 times as much as they.
 FEW_SEEN = (30, 0.1)
-_LOG_START = f"{made_by('map')}\n".encode()
 
 # The file by itself: the whole package takes twice as long to import as pycolmap. Without '' on the
 # path: what lies in the working folder would be imported in place of libraries.
@@ -216,12 +214,6 @@ def _check_whole(model: Path) -> None:
         ) from error
 
 
-def is_mapper_log(path: Path) -> bool:
-    """Whether a file is a log that a mapper left here before."""
-    with path.open("rb") as file:
-        return file.read(len(_LOG_START)) == _LOG_START
-
-
 def _run_apart(
     settings: dict[str, Any],
     hear: Callable[[str, str], None] | None,
@@ -235,10 +227,9 @@ def _run_apart(
     path, num_threads = os.pathsep.join(sys.path), str(settings["num_threads"])
     environment = {**os.environ, "PYTHONPATH": path, BLAS_THREADS: num_threads}
     done, reason = False, ""
-    log.write_bytes(_LOG_START)
     give_back_free_memory()  # the process needs its own beside this one's
     with (
-        log.open("ab") as file,
+        log.open("wb") as file,
         subprocess.Popen(
             bound([sys.executable, "-c", _CHILD, child.__file__, json.dumps(settings)]),
             stdout=subprocess.PIPE,

@@ -21,8 +21,7 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import distance_uncertainty
-from colmap_av1.util.files import whole_file
-from colmap_av1.util.outputs import check_files, made_by
+from colmap_av1.util.files import check_new_file, whole_file
 from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
@@ -49,8 +48,6 @@ _OPACITY = 0.5
 _SH0 = 0.28209479177387814
 # Further coefficients, of degrees 1 to 3: readers of the reference implementation insist on them.
 _REST = 45
-# By this comment at the head of a file it is known again.
-_MADE_BY, _HEAD = made_by("--gaussians"), 200
 # Points worked on at a time; bounds memory.
 _CHUNK = 100_000
 
@@ -170,8 +167,8 @@ def check_gaussians_path(
 
     Args:
         given: the file.
-        inputs: files and folders that are read; None: not given.
-        overwrite: replace a file that exists, if it was not written here either.
+        inputs: files that are read; None: not given.
+        overwrite: replace a file that exists.
 
     Raises:
         OptionError: its name does not end in .ply, it is an input or exists, or nothing can be made
@@ -182,16 +179,10 @@ def check_gaussians_path(
     path = Path(given)
     if path.suffix.lower() != ".ply":
         raise OptionError(f"{path}: trainers know Gaussians by .ply: give a name that ends so")
-    check_files([path], inputs, is_own=_is_own, overwrite=overwrite)
+    check_new_file(path, inputs, overwrite=overwrite)
     above = next(p for p in path.absolute().parents if p.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise OptionError(f"{path}: cannot be written: give another file")
-
-
-def _is_own(path: Path) -> bool:
-    """Whether `write_gaussians` wrote a file."""
-    with path.open("rb") as file:
-        return f"\ncomment {_MADE_BY}\n".encode() in file.read(_HEAD)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
@@ -210,7 +201,7 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(_REST)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    header = ["ply", "format binary_little_endian 1.0", f"comment {_MADE_BY}"]
+    header = ["ply", "format binary_little_endian 1.0", "comment made by colmap-av1 --gaussians"]
     header += [f"element vertex {len(gaussians.xyz)}"]
     header += [*(f"property float {name}" for name in names), "end_header"]
     try:

@@ -17,7 +17,7 @@ from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
 from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
-from colmap_av1.util.stages import Kept, run_stage
+from colmap_av1.util.stages import Kept, remove_products, run_stage
 
 # Folders of further models, each followed by its number.
 _FOLDER = "model_"
@@ -161,8 +161,8 @@ def _poses_of_model(
 
 
 def _remove_further_models(run: Run, first: int) -> None:
-    """Remove the folders of further models, from a number on, that an earlier run made."""
+    """Remove further models, from a number on, that an earlier run made."""
     for folder in run.output.glob(f"{_FOLDER}*"):
         number = folder.name.removeprefix(_FOLDER)
         if number.isdecimal() and int(number) >= first and (folder / run.stages.name).is_dir():
-            shutil.rmtree(folder)
+            remove_products(folder, folder / run.stages.name)

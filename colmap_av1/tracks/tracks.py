@@ -14,7 +14,6 @@ from colmap_av1 import _core
 from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
-from colmap_av1.util.arguments import checks_arguments
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.video.display import Display, shown_points, shown_size
 
@@ -282,7 +281,6 @@ class Tracks:
         )
 
 
-@checks_arguments
 def build_tracks(
     motion: Iterable[FrameMotion],
     options: TrackOptions | None = None,

@@ -1,4 +1,8 @@
-"""Files and folders that appear under their names only when complete; one run in each."""
+"""Outputs: refused where something exists, written beside their place, one run in each.
+
+What is being written lies in a hidden file or folder beside its place, which the process holds a
+lock on. One that nobody holds was left by a killed process.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,11 @@ import errno
 import glob
 import os
 import re
+import secrets
 import shutil
-from collections.abc import Iterator
+import socket
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +25,80 @@ try:
     import fcntl
 except ImportError:  # there is none on Windows
     fcntl = None  # type: ignore[assignment]
+
+_Path = str | os.PathLike[str]
+
+# Some file systems of clusters have locks that only one machine knows: each cleans up after itself.
+_OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
+
+
+def check_new_file(
+    path: Path, inputs: Iterable[_Path | None] = (), *, overwrite: bool = False
+) -> None:
+    """Refuse a file that a command must not write, before its work.
+
+    Args:
+        path: the file.
+        inputs: files that are read, which are never written over; None: not given.
+        overwrite: replace another file that exists.
+
+    Raises:
+        OptionError: it is an input, or it exists and must not be replaced.
+    """
+    if not os.path.lexists(path):
+        return
+    if path.is_dir() or (path.exists() and not path.is_file()):
+        raise OptionError(f"{path}: exists and is no file: give another output")
+    if any(_is_same(path, given) for given in inputs if given is not None):
+        raise OptionError(f"{path}: is the input itself: give another output")
+    if not overwrite:
+        raise OptionError(f"{path}: exists: give another output, or --overwrite")
+
+
+def check_new_folder(
+    path: Path,
+    own: re.Pattern[str],
+    inputs: Iterable[_Path | None] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
+
+    Args:
+        path: the folder.
+        own: paths of files in folders that may be replaced.
+        inputs: files and folders that are read, see `check_apart`.
+        overwrite: replace a folder that holds nothing else.
+
+    Raises:
+        OptionError: it is there and not empty, or nothing can be made where it is to be.
+    """
+    if path.exists() and not path.is_dir():
+        raise OptionError(f"{path}: is a file: give a new folder")
+    remove_leftovers(path.resolve().parent, path.resolve().name)
+    if path.is_dir() and any(path.iterdir()):
+        if not overwrite:
+            raise OptionError(f"{path}: is there and not empty: give a new folder, or --overwrite")
+        held = (p.relative_to(path).as_posix() for p in path.rglob("*") if not _is_folder(p))
+        other = next((name for name in held if not own.fullmatch(name)), None)
+        if other is not None:
+            raise OptionError(f"{path}: holds {other}, which stays: give a new folder")
+    check_apart(path, inputs)
+    path = path.resolve()
+    above = next(folder for folder in path.parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise OptionError(f"{path}: cannot be made in {above}: give another folder")
+
+
+def check_apart(output: Path, inputs: Iterable[_Path | None]) -> None:
+    """Refuse an output folder that is an input or holds one.
+
+    Raises:
+        OptionError: so it is.
+    """
+    for given in inputs:
+        if given is not None and Path(given).resolve().is_relative_to(output.resolve()):
+            raise OptionError(f"{output}: is or holds the input {given}: give another folder")
 
 
 @contextmanager
@@ -30,10 +111,12 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be given its name.
     """
-    partial = _partial(path)
+    partial = _hidden(path)
     try:
-        yield partial
-        partial.replace(path)
+        partial.touch(exist_ok=False)
+        with _held(partial):
+            yield partial
+            partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -44,37 +127,22 @@ def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
     Args:
         path: the folder.
-        overwrite: replace one that is not empty, see `check_new_folder`.
+        overwrite: replace the content of one that is not empty, see `check_new_folder`. A process
+            that is killed meanwhile loses neither the old nor the new content: `remove_leftovers`
+            puts one of them in place.
 
     Raises:
         OSError: the folder cannot be made or given its name.
     """
     path = path.resolve()
-    partial, before = _partial(path), _partial(path.with_name(f"{path.name}.before"))
-    try:
-        partial.mkdir(parents=True)
+    with _hidden_folder(path) as partial:
         yield partial
         if not path.exists():
             partial.replace(path)
-            return
-        # The folder stays: it may be where a disk is mounted, or where the user is.
-        if any(path.iterdir()) and not overwrite:
+        elif any(path.iterdir()) and not overwrite:
             raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY), str(path))
-        before.mkdir()
-        _move_entries(path, before)
-        try:
-            _move_entries(partial, path)
-        except OSError:
-            _move_entries(before, path)
-            raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(before, ignore_errors=True)
-
-
-def _move_entries(source: Path, target: Path) -> None:
-    for entry in source.iterdir():
-        entry.replace(target / entry.name)
+        else:  # the folder stays: it may be where the user is
+            _exchange(path, partial)
 
 
 @contextmanager
@@ -88,60 +156,127 @@ def scratch_folder(beside: Path) -> Iterator[Path]:
     """
     beside = beside.resolve()
     remove_leftovers(beside.parent, beside.name)
-    scratch = _partial(beside.with_name(f"{beside.name}.scratch"))
-    # Of a process that had this one's number: it is gone, for this one has only begun.
-    shutil.rmtree(scratch, ignore_errors=True)
-    try:
-        scratch.mkdir(parents=True)
+    with _hidden_folder(beside) as scratch:
         yield scratch
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
-def check_new_folder(path: Path, own: re.Pattern[str], *, overwrite: bool = False) -> None:
-    """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
+def remove_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove what killed processes of this machine left of what they wrote by the functions above.
+
+    A folder whose replacement was stopped gets its old or its new content, whichever is complete.
 
     Args:
-        path: the folder.
-        own: paths of files in folders that may be replaced.
-        overwrite: replace a folder that holds nothing else.
-
-    Raises:
-        OptionError: it is there and not empty, or nothing can be made where it is to be.
+        folder: where that is.
+        name: of the file or folder; None: any.
     """
-    if path.exists() and not path.is_dir():
-        raise OptionError(f"{path}: is a file: give a new folder")
-    if path.is_dir() and any(path.iterdir()):
-        if not overwrite:
-            raise OptionError(f"{path}: is there and not empty: give a new folder, or --overwrite")
-        held = (p.relative_to(path).as_posix() for p in path.rglob("*") if not _is_folder(p))
-        other = next((name for name in held if not own.fullmatch(name)), None)
-        if other is not None:
-            raise OptionError(f"{path}: holds {other}, which stays: give a new folder")
-    path = path.resolve()
-    above = next(folder for folder in path.parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{path}: cannot be made in {above}: give another folder")
-    remove_leftovers(path.parent, path.name)
+    pattern = f".{'*' if name is None else glob.escape(name)}.{_OURS}{'[0-9a-f]' * 8}"
+    for old in glob.glob(f"{pattern}.old", root_dir=folder):
+        _finish_exchange(folder / old)
+    for before in glob.glob(f"{pattern}.before", root_dir=folder):
+        _undo_exchange(folder / before)
+    for leftover in glob.glob(f"{pattern}.partial", root_dir=folder):
+        path = folder / leftover
+        if _is_left(path):
+            with contextlib.suppress(OSError):  # what cannot be removed does no harm
+                shutil.rmtree(path) if _is_folder(path) else path.unlink()
 
 
-def may_read(path: Path) -> bool:
-    """Whether the system lets this process read a file; True where it is not there, too."""
+def _exchange(path: Path, partial: Path) -> None:
+    """Replace a folder's content. Its old content lies in `.before` until it is all there.
+
+    From then on it lies in `.old`, and the new content goes into the folder.
+    """
+    before, old = partial.with_suffix(".before"), partial.with_suffix(".old")
+    before.mkdir()
     try:
-        path.open("rb").close()
-    except PermissionError:
-        return False
+        _move_entries(path, before)
+        before.rename(old)
+        _move_entries(partial, path)
     except OSError:
-        return True
-    return True
+        if old.exists():
+            _move_entries(path, partial)
+            old.rename(before)
+        _move_entries(before, path)
+        before.rmdir()
+        raise
+    partial.rmdir()
+    shutil.rmtree(old, ignore_errors=True)
 
 
-def _is_folder(path: Path) -> bool:
-    return path.is_dir() and not path.is_symlink()
+def _undo_exchange(before: Path) -> None:
+    """Put the old content of a folder back."""
+    if _is_left(before.with_suffix(".partial")):
+        with contextlib.suppress(OSError):
+            _move_entries(before, _place_of(before))
+            before.rmdir()
 
 
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+def _finish_exchange(old: Path) -> None:
+    """Put the rest of the new content of a folder in place, and remove the old one."""
+    partial = old.with_suffix(".partial")
+    if partial.exists() and not _is_left(partial):
+        return
+    with contextlib.suppress(OSError):
+        if partial.exists():
+            _move_entries(partial, _place_of(old))
+            partial.rmdir()
+        shutil.rmtree(old)
+
+
+def _place_of(hidden: Path) -> Path:
+    """The place that a hidden file or folder lies beside."""
+    return hidden.with_name(hidden.name[1:].rpartition(f".{_OURS}")[0])
+
+
+def _move_entries(source: Path, target: Path) -> None:
+    for entry in source.iterdir():
+        if os.path.lexists(target / entry.name):  # of a user, meanwhile
+            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(target / entry.name))
+        entry.replace(target / entry.name)
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{_OURS}{secrets.token_hex(4)}.partial")
+
+
+@contextmanager
+def _hidden_folder(path: Path) -> Iterator[Path]:
+    partial = _hidden(path)
+    try:
+        partial.mkdir(parents=True)
+        with _held(partial):
+            yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Hold a lock on a file or folder, where there are locks."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_left(path: Path) -> bool:
+    """Whether nobody holds a hidden file or folder any more; False where that cannot be known."""
+    if fcntl is None:
+        return False
+    with contextlib.suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        finally:
+            os.close(descriptor)
+    return False
 
 
 @contextmanager
@@ -165,29 +300,23 @@ def only_run(lock: Path) -> Iterator[bool]:
         yield held
 
 
-def remove_leftovers(folder: Path, name: str | None = None) -> None:
-    """Remove what killed processes left of what they wrote by `whole_file` and `whole_folder`.
-
-    Args:
-        folder: where that is.
-        name: of the file or folder; None: any.
-    """
-    if os.name != "posix":  # elsewhere asking for a process may end it
-        return
-    names = "*" if name is None else glob.escape(name)
-    for leftover in glob.glob(f".{names}.*.partial", root_dir=folder):
-        writer = leftover.split(".")[-2]
-        if writer.isdecimal() and not _is_running(int(writer)):
-            path = folder / leftover
-            with contextlib.suppress(OSError):  # what cannot be removed does no harm
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-
-def _is_running(process: int) -> bool:
+def may_read(path: Path) -> bool:
+    """Whether the system lets this process read a file; True where it is not there, too."""
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+        path.open("rb").close()
+    except PermissionError:
         return False
-    except OSError:  # it is someone else's
-        pass
+    except OSError:
+        return True
     return True
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _is_same(one: Path, two: _Path) -> bool:
+    try:
+        return one.samefile(two)
+    except OSError:  # one is not there
+        return False

@@ -10,8 +10,6 @@ from typing import Any
 
 import h5py
 
-_MARK = "made_by"
-
 
 class _Storage(io.FileIO):
     """A file that hides its first failure from the HDF5 library, which would crash."""
@@ -37,12 +35,11 @@ class _Storage(io.FileIO):
 
 
 @contextmanager
-def new_hdf5(path: Path, mark: str) -> Iterator[Callable[..., h5py.Dataset]]:
+def new_hdf5(path: Path) -> Iterator[Callable[..., h5py.Dataset]]:
     """Make an HDF5 file; the same data in the same order gives the same bytes.
 
     Args:
         path: the file.
-        mark: what it says of who made it, see `mark_of`.
 
     Yields:
         Writes a dataset, made of its path in the file, its data and h5py's further options.
@@ -63,7 +60,6 @@ def new_hdf5(path: Path, mark: str) -> Iterator[Callable[..., h5py.Dataset]]:
             return dataset
 
         try:
-            file.attrs[_MARK] = mark
             yield write
         finally:
             try:
@@ -73,13 +69,3 @@ def new_hdf5(path: Path, mark: str) -> Iterator[Callable[..., h5py.Dataset]]:
                     raise
         if storage.failure is not None:
             raise storage.failure
-
-
-def mark_of(path: Path) -> str | None:
-    """What an HDF5 file says of who made it; None where it says nothing, or is no such file."""
-    try:
-        with h5py.File(path, "r") as file:
-            mark = file.attrs.get(_MARK)
-    except (OSError, RuntimeError, ValueError):
-        return None
-    return mark if isinstance(mark, str) else None

@@ -3,6 +3,7 @@
 A stage's record is written when all it makes is there: a key of what the result depends on, the
 result, and the digests of the products. A later run takes over the stage where the key is the
 same and the products are as recorded. All else is made again, damaged records and products too.
+Files of a user among the products stay.
 The key holds options and inputs by their content, and this package's code and version.
 """
 
@@ -107,7 +108,7 @@ def run_stage(
     """Run a stage, unless an earlier run finished it with the same input.
 
     What it makes appears under its name when it is complete, never in part; what was there until
-    then stays.
+    then stays. Of what is there only files of an earlier run are replaced.
 
     Args:
         stages: the folder of the stages.
@@ -121,6 +122,7 @@ def run_stage(
 
     Raises:
         ModelError: something cannot be written.
+        OptionError: a file of a user is in the way.
     """
     key = _stage_key(depends_on)
     record = stages / f"{name}.json"
@@ -133,11 +135,7 @@ def run_stage(
         partial.mkdir()
         give_back_free_memory()  # what earlier stages had
         result = make(partial)
-        _remove(record)
-        for product in products:
-            _remove(into / product)
-            (partial / product).replace(into / product)
-        made = [into / product for product in products]
+        made = _put_in_place(record, partial, into, products)
         return _record(record, key, result, kind, into=into, products=made)
     except OSError as error:
         if error.filename is not None and stages.parent not in Path(error.filename).parents:
@@ -196,17 +194,108 @@ def _stage_key(
 
 def _finished(record: Path, key: str, into: Path, kind: type[_Result]) -> Kept[_Result] | None:
     """The stage as recorded; None where it is another, or the record or a product is damaged."""
+    body = _read_record(record)
+    if body is None or body["key"] != key:
+        return None
+    if not all(is_as_recorded(into / name, file) for name, file in body["files"].items()):
+        return None
+    return _kept(body, kind, resumed=True)
+
+
+def _read_record(record: Path) -> dict[str, Any] | None:
+    """The record of a stage; None where there is none, or it is damaged."""
     try:
         body = json.loads(record.read_text())
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(body, dict) or body.pop("digest", None) != _json_digest(body):
         return None
-    if body["key"] != key:
-        return None
-    if not all(is_as_recorded(into / name, file) for name, file in body["files"].items()):
-        return None
-    return _kept(body, kind, resumed=True)
+    return body
+
+
+def _write_record(record: Path, body: dict[str, Any]) -> None:
+    if record.is_dir():
+        shutil.rmtree(record)
+    with whole_file(record) as partial:
+        partial.write_text(json.dumps({**body, "digest": _json_digest(body)}, indent=1))
+
+
+def _put_in_place(record: Path, made: Path, into: Path, products: Sequence[str]) -> list[Path]:
+    """Put products in their places, where those of an earlier run make room; their files there.
+
+    The record lists the files of both until a new one is written, so that a run that is killed
+    meanwhile leaves none that the next one takes for a user's.
+    """
+    body = _read_record(record)
+    listed = [] if body is None else body["files"]
+    earlier = {
+        name
+        for name in listed
+        if _is_inside(into, name) and any(Path(name).is_relative_to(p) for p in products)
+    }
+    files = [path.relative_to(made) for product in products for path in _files_of(made / product)]
+    new = {path.as_posix() for path in files}
+    if body is not None:  # else nothing says whose the files are that have the new ones' names
+        theirs = [n for n in new - earlier if _is_inside(into, n) and (into / n).is_file()]
+        if theirs:
+            raise OptionError(
+                f"{into / min(theirs)}: is in the way and not of an earlier run: move it away"
+            )
+    _write_record(record, {"key": "", "result": None, "files": dict.fromkeys({*listed, *new})})
+    for name in sorted(earlier):
+        _remove_one(into / name)
+        _remove_empty((into / name).parent, into)
+    for product in products:
+        place = into / product
+        if place.is_symlink() or (made / product).is_file():
+            _remove_one(place)
+        if not place.exists():
+            (made / product).replace(place)
+    for path in files:
+        if (made / path).exists():  # not moved with its folder
+            (into / path).parent.mkdir(parents=True, exist_ok=True)
+            (made / path).replace(into / path)
+    return [into / path for path in files]
+
+
+def _is_inside(folder: Path, name: str) -> bool:
+    """Whether a recorded name leads nowhere else: a record may be of another origin."""
+    return (folder / name).parent.resolve().is_relative_to(folder.resolve())
+
+
+def _remove_one(path: Path) -> None:
+    """Remove a file, a link or an empty folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _remove_empty(folder: Path, root: Path) -> None:
+    """Remove a folder and those above it, below a root, that hold nothing."""
+    while folder != root and root in folder.parents:
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+        folder = folder.parent
+
+
+def remove_products(output: Path, stages: Path) -> None:
+    """Remove what the stages of an earlier run made in a folder, and their records.
+
+    Raises:
+        OSError: something cannot be removed.
+    """
+    for record in stages.glob("*.json"):
+        files = (_read_record(record) or {"files": {}})["files"]
+        for name, file in files.items():
+            path = output / name
+            if file is not None and _is_inside(output, name) and is_as_recorded(path, file):
+                path.unlink()
+                _remove_empty(path.parent, output)
+    shutil.rmtree(stages)
+    _remove_empty(output, output.parent)
 
 
 def _record(
@@ -228,8 +317,7 @@ def _record(
     # Read back, so that this run goes on from what a later run will read.
     plain = {"key": key, "result": cattrs.unstructure(result), "files": files}
     body = json.loads(json.dumps(plain))
-    with whole_file(record) as partial:
-        partial.write_text(json.dumps({**body, "digest": _json_digest(body)}, indent=1))
+    _write_record(record, body)
     return _kept(body, kind, resumed=False)
 
 

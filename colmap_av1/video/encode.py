@@ -24,9 +24,7 @@ from colmap_av1.errors import (
     cannot_write,
 )
 from colmap_av1.options import EncodeOptions
-from colmap_av1.util.arguments import checks_arguments
-from colmap_av1.util.files import may_read, remove_leftovers, whole_file
-from colmap_av1.util.outputs import check_files
+from colmap_av1.util.files import check_new_file, may_read, remove_leftovers, whole_file
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.coded_size import scaling
@@ -71,7 +69,6 @@ class EncodeReport:
     reused: bool = False
 
 
-@checks_arguments
 def encode(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -111,7 +108,7 @@ def encode(
     path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
-    check_files([output], [path], overwrite=overwrite)
+    check_new_file(output, [path], overwrite=overwrite)
     if not output.parent.is_dir():
         raise EncodeError(f"{output}: the folder does not exist: make it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
@@ -18,19 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.util.files import remove_leftovers, whole_file
-from colmap_av1.util.outputs import check_files, made_by
+from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 
 Image = NDArray[np.uint8]
 # Set, because x264's output depends on their number.
 _ENCODER_THREADS = 4
 # With `mbtree` it depends on what lies in memory that x264 never wrote.
 _ENCODER_OPTIONS = {"crf": "18", "x264-params": "mbtree=0"}
-_MARK = made_by("view")
-# Signature and header of a PNG file, with its checksum.
-_PNG_HEADER = 33
-# Bytes of a picture within which its mark is.
-_HEAD = 256
 
 
 def check_picture(
@@ -44,15 +36,15 @@ def check_picture(
     Args:
         output: the file.
         inputs: what is drawn.
-        overwrite: replace a file that exists, if it was not drawn here either.
+        overwrite: replace a file that exists.
 
     Raises:
-        OptionError: another extension, an input, or a file that is not drawn here.
+        OptionError: another extension, an input, or a file that must not be replaced.
     """
     path = Path(output)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise OptionError(f"{path}: give an output that ends in .png or .jpg")
-    check_files([path], inputs, is_own=is_drawn, overwrite=overwrite)
+    check_new_file(path, inputs, overwrite=overwrite)
 
 
 def write_picture(
@@ -67,40 +59,11 @@ def write_picture(
     _write_picture(picture, Path(output))
 
 
-def is_drawn(path: Path) -> bool:
-    """Whether a picture or video says that it was drawn here."""
-    if path.suffix.lower() == ".mp4":
-        try:
-            with av.open(os.path.abspath(path)) as container:
-                return bool(container.metadata.get("comment") == _MARK)
-        except (av.error.FFmpegError, OSError, ValueError):
-            return False
-    try:
-        with path.open("rb") as file:
-            return _MARK.encode() in file.read(_HEAD)
-    except OSError:
-        return False
-
-
 def _write_picture(picture: Image, path: Path) -> None:
     suffix = path.suffix.lower()
     _, encoded = cv2.imencode(suffix, picture)
     with _output(path) as partial:
-        partial.write_bytes(_marked(encoded.tobytes(), suffix))
-
-
-def _marked(content: bytes, suffix: str) -> bytes:
-    """A picture with a comment: a chunk of PNG after its header, or a segment of JPEG."""
-    words = _MARK.encode()
-    if suffix == ".png":
-        body = b"tEXtSoftware\0" + words
-        size, check = len(body) - 4, zlib.crc32(body)
-        comment, start = struct.pack(">I", size) + body + struct.pack(">I", check), _PNG_HEADER
-    else:
-        # After the first segment, which says that it is a JFIF file.
-        comment = b"\xff\xfe" + struct.pack(">H", len(words) + 2) + words
-        start = 4 + int.from_bytes(content[4:6], "big")
-    return content[:start] + comment + content[start:]
+        partial.write_bytes(encoded.tobytes())
 
 
 def side_by_side(panels: Sequence[Image]) -> Image:
@@ -148,7 +111,6 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
         yield write_file
         return
     with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
-        container.metadata["comment"] = _MARK
         rate = Fraction(frame_rate).limit_denominator(1001)
         stream: Any = container.add_stream("libx264", rate, options=_ENCODER_OPTIONS)
         stream.pix_fmt = "yuv420p"

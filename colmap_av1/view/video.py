@@ -15,7 +15,7 @@ from colmap_av1.errors import OptionError
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.tracks.tracks import Tracks, build_tracks
-from colmap_av1.util.outputs import check_files
+from colmap_av1.util.files import check_new_file
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
@@ -25,7 +25,6 @@ from colmap_av1.view.pictures import (
     Image,
     bgr,
     existing_pictures,
-    is_drawn,
     open_pictures,
     side_by_side,
 )
@@ -71,7 +70,7 @@ def view_video(
         tracks: how the motion is chained.
         read: how the bitstream is read.
         progress: called with a stage's name, what is done, and of how much where known.
-        overwrite: replace files that exist, if they were not drawn here either.
+        overwrite: replace files that exist.
 
     Returns:
         The number of frames drawn.
@@ -92,7 +91,8 @@ def view_video(
             raise OptionError(
                 f"{path}: give an output that ends in .mp4, or a folder for PNG files"
             )
-        check_files(existing_pictures(path), [video], is_own=is_drawn, overwrite=overwrite)
+        for existing in existing_pictures(path):
+            check_new_file(existing, [video], overwrite=overwrite)
         total = file.likely_num_packets
         chained = build_tracks(
             read_motion(video, read), tracks, lambda done: report("tracks", done, total)

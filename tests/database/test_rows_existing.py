@@ -524,10 +524,10 @@ def test_leftover_of_a_killed_new_file_is_removed(tmp_path: Path) -> None:
         kill(process)
     assert partial.exists()
     path.unlink()
-    (tmp_path / ".other.db.0123456789abcdef.partial").touch()
+    (tmp_path / ".new [1].db.1.partial").touch()
     write_matches(path, NAMES, CAMERA, **OURS)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        ".other.db.0123456789abcdef.partial",
+        ".new [1].db.1.partial",
         path.name,
     ]
 

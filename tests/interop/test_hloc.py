@@ -142,7 +142,7 @@ def test_many_keypoints_need_wider_numbers(tmp_path: Path) -> None:
 
 def test_same_database_gives_the_same_bytes(tmp_path: Path) -> None:
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
-    for folder in ("a", "b", "b"):  # the second time, files are replaced
+    for folder in ("a", "b"):
         export_hloc(tmp_path / "a.db", tmp_path / folder)
     for name in FILES:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

@@ -1,20 +1,70 @@
 from __future__ import annotations
 
-import subprocess
+import os
+import re
 import sys
 from pathlib import Path
 
 import pytest
+from killed_runs import kill_while_replacing, kill_while_writing
 
 from colmap_av1.errors import OptionError
-from colmap_av1.util.files import remove_leftovers, whole_folder
+from colmap_av1.util.files import (
+    check_apart,
+    check_new_file,
+    check_new_folder,
+    remove_leftovers,
+    scratch_folder,
+    whole_file,
+    whole_folder,
+)
 from colmap_av1.util.stages import open_stages
 
+locks = pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
 
-def dead_process() -> int:
-    with subprocess.Popen([sys.executable, "-c", ""]) as process:
-        process.wait()
-    return process.pid
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, with an input file, a folder of inputs and a file of nobody."""
+    (tmp_path / "images" / "far").mkdir(parents=True)
+    for name in ("video.mp4", "images/a.png", "notes.txt"):
+        (tmp_path / name).write_text(name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_what_exists_is_refused_unless_it_may_be_overwritten(folder: Path) -> None:
+    check_new_file(Path("new.txt"), ["video.mp4", "absent", None])
+    check_new_file(Path("notes.txt"), ["video.mp4"], overwrite=True)
+    with pytest.raises(OptionError, match="--overwrite"):
+        check_new_file(Path("notes.txt"))
+    for output in ("images", os.devnull):
+        with pytest.raises(OptionError, match="is no file"):
+            check_new_file(Path(output), overwrite=True)
+
+
+@pytest.mark.parametrize("output", ["video.mp4", "images/../video.mp4", "link", "hard"])
+def test_an_input_is_refused_by_any_name(folder: Path, output: str) -> None:
+    (folder / "link").symlink_to("video.mp4")
+    (folder / "hard").hardlink_to("video.mp4")
+    for path in (Path(output), folder / output):
+        with pytest.raises(OptionError, match="input"):
+            check_new_file(path, ["video.mp4"], overwrite=True)
+
+
+def test_folders_that_are_or_hold_an_input(folder: Path) -> None:
+    (folder / "here").symlink_to(".", target_is_directory=True)
+    check_apart(Path("new"), ["video.mp4", "images", None])
+    check_apart(Path("images/far/new"), ["video.mp4", "images"])
+    for output in ("images", ".", "here", "images/..", folder):
+        with pytest.raises(OptionError, match="input images"):
+            check_apart(Path(output), ["images"])
+    with pytest.raises(OptionError, match="input"):
+        check_apart(Path("absent"), [folder / "absent" / "images"])
 
 
 def test_a_folder_appears_when_whole(tmp_path: Path) -> None:
@@ -49,21 +99,77 @@ def test_a_folder_that_is_there_gets_the_content(tmp_path: Path) -> None:
     assert (output / "points2").read_text() == "2"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="leftovers stay there")
-def test_what_the_killed_left_is_removed(tmp_path: Path) -> None:
-    killed = tmp_path / f".model.{dead_process()}.partial"
-    other = tmp_path / f".other.{dead_process()}.partial"
-    killed.mkdir()
-    (killed / "points3D.bin").write_bytes(b"half")
-    other.write_bytes(b"half")
-    with whole_folder(tmp_path / "model"):
-        remove_leftovers(tmp_path, "model")
-        assert len(list(tmp_path.glob(".model.*"))) == 1  # the one being written
-    assert not killed.exists()
-    assert other.exists()
+@locks
+@pytest.mark.parametrize("how", ["whole_file", "whole_folder", "scratch_folder"])
+def test_what_the_killed_left_is_removed(how: str, tmp_path: Path) -> None:
+    for name in ("model [1]", "other"):
+        kill_while_writing(how, tmp_path / name)
+    assert len(names_in(tmp_path)) == 2
+    with whole_file(tmp_path / "model [1]"):
+        remove_leftovers(tmp_path, "model [1]")
+        # What is being written stays, also what another thread or process writes.
+        assert len(names_in(tmp_path)) == 2
+    assert [name for name in names_in(tmp_path) if "other" not in name] == ["model [1]"]
+    remove_leftovers(tmp_path)
+    assert names_in(tmp_path) == ["model [1]"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+@locks
+def test_what_others_made_stays(tmp_path: Path) -> None:
+    """Also where its name looks as if a process that has ended had left it."""
+    others = [".model.1.partial", ".model.99999999999999999999999.partial", ".model.partial"]
+    others += [".model.x.partial", ".model.colmap-av1-0000ffffffff.partial"]
+    for name in others:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine").touch()
+    remove_leftovers(tmp_path)
+    remove_leftovers(tmp_path, "model")
+    with scratch_folder(tmp_path / "model"):
+        pass
+    assert names_in(tmp_path) == sorted(others)
+    assert all(names_in(tmp_path / name) == ["mine"] for name in others)
+
+
+@locks
+@pytest.mark.parametrize("steps", range(9))
+def test_a_replacement_that_is_killed_loses_neither_content(steps: int, tmp_path: Path) -> None:
+    output = tmp_path / "model"
+    output.mkdir()
+    old, new = {"a": "old", "b": "old"}, {"a": "new", "c": "new"}
+    for name, text in old.items():
+        (output / name).write_text(text)
+    kill_while_replacing(output, steps)
+    remove_leftovers(tmp_path, "model")
+    assert {p.name: p.read_text() for p in output.iterdir()} in (old, new)
+    assert names_in(tmp_path) == ["model"]
+
+
+@locks
+def test_what_a_user_adds_to_a_folder_half_replaced_stays(tmp_path: Path) -> None:
+    output = tmp_path / "model"
+    output.mkdir()
+    (output / "a").write_text("old")
+    kill_while_replacing(output, 2)
+    (output / "a").write_text("mine")
+    remove_leftovers(tmp_path, "model")
+    assert (output / "a").read_text() == "mine"
+    texts = [p.read_text() for p in tmp_path.rglob("a")]
+    assert sorted(texts) == ["mine", "old"]
+
+
+def test_a_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "a.bin").touch()
+    own = re.compile(r"\w+\.bin")
+    with pytest.raises(OptionError, match="--overwrite"):
+        check_new_folder(tmp_path / "model", own)
+    check_new_folder(tmp_path / "model", own, overwrite=True)
+    (tmp_path / "model" / "notes.txt").touch()
+    with pytest.raises(OptionError, match=r"notes.txt"):
+        check_new_folder(tmp_path / "model", own, overwrite=True)
+
+
+@locks
 def test_one_run_at_a_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with open_stages(output, "a"):
@@ -76,7 +182,6 @@ def test_one_run_at_a_time(tmp_path: Path) -> None:
             pass
     with pytest.raises(OptionError, match="is the output of a:"), open_stages(output, "b"):
         pass
-    left = output / f".report.json.{dead_process()}.partial"
-    left.write_text("half")
+    kill_while_writing("whole_file", output / "report.json")
     with open_stages(output, "a"):
-        assert not left.exists()
+        assert names_in(output) == [".stages"]

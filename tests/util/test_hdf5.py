@@ -18,7 +18,7 @@ from colmap_av1.util.hdf5 import new_hdf5
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 rng = np.random.default_rng(0)
 try:
-    with new_hdf5(Path(sys.argv[1]), "made by a test") as write:
+    with new_hdf5(Path(sys.argv[1])) as write:
         for i in range(1000):
             write(f"{i}/a", rng.random(int(sys.argv[2])), compression="gzip")
 except OSError as error:
@@ -28,7 +28,7 @@ except OSError as error:
 
 def test_groups_and_what_is_written(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        with new_hdf5(tmp_path / name, "made by a test") as write:
+        with new_hdf5(tmp_path / name) as write:
             write("x/y/z", np.arange(70_000)).attrs["unit"] = 2.0
             write("x/one", 3)
     with h5py.File(tmp_path / "a") as file:

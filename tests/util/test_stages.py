@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from colmap_av1.errors import OptionError
 from colmap_av1.options import MapOptions, MatchOptions, ReadOptions, RunOptions
 from colmap_av1.util import digests, stages
 from colmap_av1.util.digests import code_digest, digest_of, file_digest
@@ -297,3 +299,85 @@ def test_a_file_is_read_once_while_it_stays(
     assert file_digest(path) == second
     path.touch()
     assert file_digest(path) == "read again"
+
+
+def run_with(output: Path, key: int, names: list[str]) -> Kept:
+    """A stage that makes the given files, which hold the key."""
+
+    def make(folder: Path) -> Found:
+        for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(str(key))
+        return Found(key, ())
+
+    products = sorted({name.split("/")[0] for name in names})
+    with open_stages(output, "test") as folder:
+        return run_stage(folder, "a", [key], Found, into=output, products=products, make=make)
+
+
+def texts(folder: Path) -> dict[str, str]:
+    files = [p for p in folder.rglob("*") if p.is_file() and ".stages" not in p.parts]
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in files}
+
+
+def test_another_run_replaces_its_own_files_alone(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/0.png", "images/1.png", "sparse/0/points3D.bin"])
+    mine = ["images/mine.png", "sparse/0/points3D.ply", "sparse/1/points3D.bin"]
+    for name in mine:
+        (output / name).parent.mkdir(exist_ok=True)
+        (output / name).write_text("mine")
+    run_with(output, 2, ["images/0.png", "images/2.png", "sparse/0/points3D.bin"])
+    theirs = dict.fromkeys(["images/0.png", "images/2.png", "sparse/0/points3D.bin"], "2")
+    assert texts(output) == {**theirs, **dict.fromkeys(mine, "mine")}
+
+
+def test_a_file_of_a_user_in_the_way_is_refused(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/0.png"])
+    (output / "images" / "1.png").write_text("mine")
+    before = texts(output)
+    with pytest.raises(OptionError, match=r"images/1.png: is in the way"):
+        run_with(output, 2, ["images/0.png", "images/1.png"])
+    assert texts(output) == before
+    (output / "images" / "1.png").unlink()
+    run_with(output, 2, ["images/0.png", "images/1.png"])
+
+
+@pytest.mark.parametrize("stopped_at", range(1, 5))
+def test_a_run_that_is_stopped_between_its_files_is_made_up_for(
+    stopped_at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/0.png", "images/1.png"])
+    (output / "images" / "mine.png").write_text("mine")
+    move, moves = Path.replace, itertools.count()
+
+    def stop(self: Path, target: Path) -> Path:
+        if next(moves) == stopped_at:
+            raise KeyboardInterrupt
+        return move(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_with(output, 2, ["images/1.png", "images/2.png", "images/3.png"])
+    for key, names in ((3, ["images/2.png"]), (1, ["images/0.png"])):
+        run_with(output, key, names)
+        wanted = {"images/mine.png": "mine", **dict.fromkeys(names, str(key))}
+        assert texts(output) == wanted
+
+
+def test_a_record_of_another_origin_removes_nothing_elsewhere(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/0.png"])
+    (tmp_path / "mine.txt").write_text("mine")
+    (output / "images" / "link").symlink_to(tmp_path)
+    record = output / ".stages" / "a.json"
+    body = json.loads(record.read_text())
+    del body["digest"]
+    for name in ("images/../../mine.txt", "images/link/mine.txt", str(tmp_path / "mine.txt")):
+        body["files"][name] = body["files"]["images/0.png"]
+    record.write_text(json.dumps({**body, "digest": stages._json_digest(body)}))
+    run_with(output, 2, ["images/0.png"])
+    assert (tmp_path / "mine.txt").read_text() == "mine"

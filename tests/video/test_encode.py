@@ -266,14 +266,10 @@ def test_nothing_is_left_of_a_conversion(phone: Path, tmp_path: Path) -> None:
     def look(stage: str, done: int, total: int | None) -> None:
         seen.update(p.name for p in (tmp_path / "work").iterdir() if stage == "motion")
 
-    # As a killed run left it that had this process's number.
-    leftover = tmp_path / "work" / f".a.db.scratch.{os.getpid()}.partial"
-    leftover.mkdir()
-    (leftover / "stream.mp4").touch()
     report = match(tmp_path / "work" / "a.db", video, progress=look)
     assert report.streams == (None,)
     assert report.num_images == 12
-    assert seen == {leftover.name}
+    assert len(seen) == 1
     assert [p.name for p in (tmp_path / "work").iterdir()] == ["a.db"]
     assert list(video.parent.iterdir()) == [video]
 
@@ -428,7 +424,7 @@ def test_killed_conversion_ends_and_is_cleaned_up_after(
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert list(tmp_path.glob(".out.mp4.*.partial"))
-    others = [f".out.mp4.{os.getppid()}.partial", ".out.mp4.backup.partial", ".in.mp4.1.partial"]
+    others = [".out.mp4.1.partial", ".out.mp4.backup.partial", ".in.mp4.1.partial"]
     for name in others:
         (tmp_path / name).touch()
     encode_video(phone, tmp_path / "out.mp4", options=EncodeOptions(encoder="svt"))
@@ -446,7 +442,7 @@ def test_killed_match_is_cleaned_up_after(
         process.kill()
         process.wait(30)
     left = [p.name for p in tmp_path.iterdir() if p.name != "long.mp4"]
-    assert left == [f".a.db.scratch.{process.pid}.partial"]
+    assert len(left) == 1
     match(tmp_path / "a.db", video)
     assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "a.db"}
 
