@@ -450,12 +450,20 @@ def test_only_what_changes_the_result_redoes(
 
 def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> None:
     before = (made.output / "sparse" / "0" / "points3D.bin").read_bytes()
+    mine = [made.output / n for n in ("images/mine.png", "sparse/0/points3D.ply", "sparse/1/mine")]
+    mine[-1].parent.mkdir()
+    for file in mine:
+        file.write_text("of a user or a trainer")
     strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
     fewer = reconstruct(SCENE, made.output, options=strict)
     assert fewer.resumed == STAGES[:-1]
     assert fewer.num_points < made.num_points
     assert reconstruct(SCENE, made.output, options=OPTIONS).num_points == made.num_points
     assert (made.output / "sparse" / "0" / "points3D.bin").read_bytes() == before
+    for file in mine:
+        assert file.read_text() == "of a user or a trainer"
+        file.unlink()
+    mine[-1].parent.rmdir()
 
 
 def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -214,7 +214,7 @@ def _undo_exchange(before: Path) -> None:
 def _finish_exchange(old: Path) -> None:
     """Put the rest of the new content of a folder in place, and remove the old one."""
     partial = old.with_suffix(".partial")
-    if partial.exists() and not _is_left(partial):
+    if not _is_left(partial):
         return
     with contextlib.suppress(OSError):
         if partial.exists():
@@ -269,14 +269,17 @@ def _is_left(path: Path) -> bool:
     """Whether nobody holds a hidden file or folder any more; False where that cannot be known."""
     if fcntl is None:
         return False
-    with contextlib.suppress(OSError):
+    try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        finally:
-            os.close(descriptor)
-    return False
+    except OSError:
+        return not os.path.lexists(path)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
 
 
 @contextmanager
