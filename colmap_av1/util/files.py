@@ -113,8 +113,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     partial = _hidden(path)
     try:
-        partial.touch(exist_ok=False)
-        with _held(partial):
+        with _held(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR):
             yield partial
             partial.replace(path)
     finally:
@@ -244,21 +243,21 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
     partial = _hidden(path)
     try:
         partial.mkdir(parents=True)
-        with _held(partial):
+        with _held(partial, os.O_RDONLY):
             yield partial
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager
-def _held(path: Path) -> Iterator[None]:
-    """Hold a lock on a file or folder, where there are locks."""
+def _held(path: Path, how: int) -> Iterator[None]:
+    """Open a file or folder, and hold a lock on it, where there are locks."""
     if fcntl is None:
         yield
         return
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, how, 0o666)
     try:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
@@ -269,8 +268,9 @@ def _is_left(path: Path) -> bool:
     """Whether nobody holds a hidden file or folder any more; False where that cannot be known."""
     if fcntl is None:
         return False
+    how = os.O_RDONLY if _is_folder(path) else os.O_RDWR  # as some file systems want it
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        descriptor = os.open(path, how | os.O_NOFOLLOW)
     except OSError:
         return not os.path.lexists(path)
     try:
