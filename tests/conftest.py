@@ -106,17 +106,16 @@ def clip(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def clips(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of 40 clips: 36 of AV1 in 3 lengths, 2 damaged in the first frame, 2 of text."""
+    """A folder of 8 clips: 6 of AV1 in 3 lengths, 1 damaged in the first frame, 1 of text."""
     folder = tmp_path_factory.mktemp("batch") / "clips"
     for part in ("a", "b"):
         (folder / part).mkdir(parents=True)
     lengths = [encode(make_frames(n), folder.parent / f"{n}.mp4") for n in (6, 7, 8)]
-    for i in range(36):
-        shutil.copyfile(lengths[i % 3], folder / "ab"[i % 2] / f"clip{i:02}.mp4")
-    for i in range(2):
-        content = bytearray(lengths[i].read_bytes())
-        start = content.index(b"mdat") + 4
-        content[start : start + 100] = bytes(100)
-        (folder / "a" / f"damaged{i}.mp4").write_bytes(content)
-        (folder / "b" / f"text{i}.mp4").write_text("no video")
+    for i in range(6):
+        shutil.copyfile(lengths[i % 3], folder / "ab"[i % 2] / f"clip{i}.mp4")
+    content = bytearray(lengths[0].read_bytes())
+    start = content.index(b"mdat") + 4
+    content[start : start + 100] = bytes(100)
+    (folder / "a" / "damaged.mp4").write_bytes(content)
+    (folder / "b" / "text.mp4").write_text("no video")
     return folder

@@ -41,7 +41,11 @@ def test_wheel_holds_the_package_and_no_sources(wheel: Path) -> None:
     outside = [name for name in sizes if name.split("/")[0].partition("-")[0] != "colmap_av1"]
     assert outside == []
     assert {Path(name).suffix for name in sizes if ".dist-info" not in name} == {
-        *(".py", ".pyi", ".so", ".typed")
+        ".html",
+        ".py",
+        ".pyi",
+        ".so",
+        ".typed",
     }
     assert "colmap_av1/py.typed" in sizes
     (extension,) = (name for name in sizes if name.endswith(".so"))

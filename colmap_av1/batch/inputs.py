@@ -1,101 +1,143 @@
-"""The videos that are given as lists, patterns, folders, tar files and URLs, with their names."""
+"""The videos that are given as lists, patterns, folders and URLs, with their names."""
 
 from __future__ import annotations
 
 import glob
 import os
 import posixpath
-import tarfile
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
 
-from colmap_av1.batch.files import (
+from colmap_av1.batch.output import HIDDEN, PAGE, ROWS
+from colmap_av1.errors import OptionError
+from colmap_av1.util.remote import (
+    absolute,
     filesystem,
     is_url,
     open_to_read,
     unless_stalled,
     without_secrets,
 )
-from colmap_av1.batch.jobs import Source
-from colmap_av1.errors import OptionError
 
-# What a folder or tar file is searched for; lists and patterns may name others.
-VIDEO_SUFFIXES = frozenset(
-    (
-        *(".mp4", ".m4v", ".mov", ".3gp", ".mkv", ".webm", ".ivf", ".obu", ".avi", ".wmv", ".flv"),
-        *(".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".y4m"),
-    )
+# What a folder is searched for; lists and patterns may name others.
+VIDEO_SUFFIXES = (
+    ".mp4",
+    ".m4v",
+    ".mov",
+    ".3gp",
+    ".mkv",
+    ".webm",
+    ".ivf",
+    ".obu",
+    ".avi",
+    ".wmv",
+    ".flv",
+    ".ts",
+    ".m2ts",
+    ".mts",
+    ".mpg",
+    ".mpeg",
+    ".y4m",
 )
-_TAR = ".tar"
 _SPECIAL = frozenset("*?[")
 _LONGEST_LINE = 1 << 16
+_LONGEST_PART = 240  # bytes of a file name, with room for a suffix
 
-Named = tuple[str, Source]
+
+@dataclass(frozen=True)
+class Video:
+    """A video of a batch.
+
+    Attributes:
+        name: path of its folder in the output, with '/' between parts.
+        address: absolute path or URL.
+    """
+
+    name: str
+    address: str
 
 
-def list_videos(inputs: Sequence[str], output: str, stall: float) -> Iterator[Named]:
-    """The videos of a batch in the order in which they are given, and a name for each.
+def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[Video], int]:
+    """The videos of a batch in the order in which they are given, and how many are repeated.
 
-    A folder is searched for videos and tar files, in the order of their paths; a pattern names
-    files; any other file that is neither a video nor a tar file is a list: a line for each video,
-    its path or URL, relative to the list, and if wanted a tab and its name. The name is the path
-    without its suffix below the folder, the fixed part of the pattern or the folder of the list;
-    of other files it is that of the file.
+    A folder is searched for videos, in the order of their paths; a pattern names files; any other
+    file that is not a video is a list: a line for each video, its path or URL, relative to the
+    list, and if wanted a tab and its name. The name is the path without its suffix below the
+    folder, the fixed part of the pattern or the folder of the list; of other files it is that of
+    the file.
 
     Args:
         inputs: paths, patterns and URLs.
-        output: the output, as an absolute path or URL, which no folder among them may hold.
+        output: absolute path or URL of the output, which no searched folder may hold.
         stall: seconds without data after which a URL is given up.
 
     Raises:
-        OptionError: there is nothing of the name, no video, a list that is none, or the output is
-            in a folder that is searched.
+        OptionError: there is no such file, no video, a list that is not one, the output is in a
+            folder that is searched, or names cannot be those of folders or clash.
         OSError: something cannot be read.
     """
+    videos: dict[str, Video] = {}
+    num_repeated = 0
     for word in inputs:
-        count = 0
-        for named in _list_one(word, output, stall):
-            count += 1
-            yield named
-        if count == 0:
+        found = [Video(name, absolute(address)) for name, address in _listed(word, output, stall)]
+        if not found:
             raise OptionError(
                 f"{without_secrets(word)}: holds no video: give a list, pattern or folder with one"
             )
-
-
-def _list_one(word: str, output: str, stall: float) -> Iterator[Named]:
-    place = _Url(word, stall) if is_url(word) else _Local(word)
-    if place.is_folder():
-        root = place.address.rstrip("/") if is_url(word) else os.path.abspath(word)
-        if f"{output.rstrip('/')}/".startswith(f"{root.rstrip('/')}/"):
-            raise OptionError(
-                f"{output}: the output is in {word}, which is searched for videos: give one outside"
-            )
-        yield from _named(place.videos_below(), root, stall)
-    elif place.is_file():
-        suffix = _suffix_of(word)
-        if suffix == _TAR or suffix in VIDEO_SUFFIXES:
-            yield from _named([word], os.path.dirname(word), stall)
-        else:
-            yield from _of_list(word, stall)
-    elif _SPECIAL & set(word):
-        fixed = word[: next(i for i, letter in enumerate(word) if letter in _SPECIAL)]
-        yield from _named(place.matches(), fixed.rpartition("/")[0], stall)
-    else:
+        for video in found:
+            _check_name(video)
+            there = videos.setdefault(video.name, video)
+            if there.address != video.address:
+                raise OptionError(
+                    f"{without_secrets(there.address)} and {without_secrets(video.address)} would "
+                    f"both be '{video.name}' in the output: give a list with a tab and a name of "
+                    "its own after each"
+                )
+            num_repeated += there is not video
+    folders = {str(folder) for name in videos for folder in PurePosixPath(name).parents}
+    nested = next((name for name in videos if name in folders), None)
+    if nested is not None:
         raise OptionError(
-            f"{without_secrets(word)}: no such file or folder: give a list, pattern, folder or URL"
+            f"'{nested}' is a video and the folder of others, which would be in its output: "
+            "give a list with a tab and a name of its own after each"
+        )
+    return list(videos.values()), num_repeated
+
+
+def _check_name(video: Video) -> None:
+    parts = video.name.split("/")
+    unfit = {"", ".", ".."} & set(parts) or parts[0] in (HIDDEN, PAGE)
+    unfit = unfit or parts[0].startswith(f"{ROWS}.") or "\n" in video.name
+    if unfit or any(len(os.fsencode(part)) > _LONGEST_PART for part in parts):
+        raise OptionError(
+            f"{without_secrets(video.address)}: '{video.name}' cannot be the name of its folder: "
+            "give another after a tab in a list"
         )
 
 
-def _named(addresses: Sequence[str] | Iterator[str], root: str, stall: float) -> Iterator[Named]:
-    """Videos with their names below a folder; those in tar files each for itself."""
-    for address in addresses:
-        name = _name_below(address, root)
-        if _suffix_of(address) == _TAR:
-            yield from _members(address, name, stall)
-        else:
-            yield name, Source(address)
+def _listed(word: str, output: str, stall: float) -> Iterable[tuple[str, str]]:
+    """Names and addresses of the videos that one word of the inputs stands for."""
+    place = _Url(word, stall) if is_url(word) else _Local(word)
+    if place.is_folder():
+        root = absolute(word).rstrip("/")
+        if f"{output.rstrip('/')}/".startswith(f"{root}/"):
+            raise OptionError(
+                f"{without_secrets(output)}: the output is in {without_secrets(word)}, which is "
+                "searched for videos: give one outside"
+            )
+        return ((_name_below(address, root), address) for address in place.videos_below())
+    if place.is_file():
+        if _suffix_of(word) in VIDEO_SUFFIXES:
+            return [(_name_below(word, os.path.dirname(word)), word)]
+        return _of_list(word)
+    if _SPECIAL & set(word):
+        fixed = word[: next(i for i, letter in enumerate(word) if letter in _SPECIAL)]
+        root = fixed.rpartition("/")[0]
+        return ((_name_below(address, root), address) for address in place.matches())
+    raise OptionError(
+        f"{without_secrets(word)}: no such file or folder: give a list, pattern, folder or URL"
+    )
 
 
 def _name_below(address: str, root: str) -> str:
@@ -114,29 +156,8 @@ def _suffix_of(address: str) -> str:
     return posixpath.splitext(path)[1].lower()
 
 
-def _members(address: str, name: str, stall: float) -> Iterator[Named]:
-    """The videos in a tar file, as WebDataset lays them out."""
-
-    def read(beat: Callable[[], None]) -> list[Named]:
-        found = []
-        try:
-            with open_to_read(address) as file, tarfile.open(fileobj=file, mode="r:") as tar:
-                for member in tar:
-                    beat()
-                    if member.isfile() and _suffix_of(member.name) in VIDEO_SUFFIXES:
-                        stem = _name_below(member.name.lstrip("./"), "")
-                        part = Source(address, member.name, member.offset_data, member.size)
-                        found.append((f"{name}/{stem}", part))
-        except tarfile.TarError as error:
-            what = f"{without_secrets(address)}: no tar file, or damaged: {error}: give another"
-            raise OptionError(what) from error
-        return found
-
-    yield from unless_stalled(read, address, stall)
-
-
-def _of_list(word: str, stall: float) -> Iterator[Named]:
-    """The videos on the lines of a list, which is read as it is needed."""
+def _of_list(word: str) -> Iterator[tuple[str, str]]:
+    """The videos on the lines of a list."""
     folder = word.rpartition("/")[0]
     with open_to_read(word) as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
@@ -149,82 +170,67 @@ def _of_list(word: str, stall: float) -> Iterator[Named]:
             address, tab, name = os.fsdecode(line.rstrip(b"\r\n")).partition("\t")
             if not address.strip():
                 continue
-            if not is_url(address):
-                address = f"{folder}/{address}" if folder and address[0] != "/" else address
-            if tab:
-                if _suffix_of(address) == _TAR:
-                    yield from _members(address, name, stall)
-                else:
-                    yield name, Source(address)
-            else:
-                yield from _named([address], folder, stall)
+            if not is_url(address) and folder and address[0] != "/":
+                address = f"{folder}/{address}"
+            yield name if tab else _name_below(address, folder), address
 
 
 class _Local:
     """A path of this machine."""
 
-    def __init__(self, word: str) -> None:
-        self.address = word
+    def __init__(self, path: str) -> None:
+        self._path = path
 
     def is_folder(self) -> bool:
-        return os.path.isdir(self.address)
+        return os.path.isdir(self._path)
 
     def is_file(self) -> bool:
-        return os.path.isfile(self.address)
+        return os.path.isfile(self._path)
 
-    def matches(self) -> Iterator[str]:
-        return iter(sorted(p for p in glob.glob(self.address, recursive=True) if _is_file(p)))
+    def matches(self) -> list[str]:
+        return sorted(p for p in glob.glob(self._path, recursive=True) if os.path.isfile(p))
 
     def videos_below(self) -> Iterator[str]:
-        for folder, folders, files in os.walk(os.path.abspath(self.address), onerror=_raise):
+        for folder, folders, files in os.walk(os.path.abspath(self._path), onerror=_raise):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             for name in sorted(files):
-                if _is_wanted(name):
+                if _is_video(name):
                     yield os.path.join(folder, name)
 
 
 class _Url:
     """A URL."""
 
-    def __init__(self, word: str, stall: float) -> None:
-        self.address = word
-        self._stall = stall
-        self._system, self._path = filesystem(word)
+    def __init__(self, url: str, stall: float) -> None:
+        self._url, self._stall = url, stall
+        self._system, self._path = filesystem(url)
 
     def is_folder(self) -> bool:
-        # Of a web server, an address that looks like a file is none.
-        if _suffix_of(self.address) or _SPECIAL & set(self.address):
+        # On a web server, an address that looks like a file is not a folder.
+        if _suffix_of(self._url) or _SPECIAL & set(self._url):
             return False
-        return unless_stalled(lambda _: bool(self._system.isdir(self._path)), *self._about)
+        return bool(self._ask(self._system.isdir))
 
     def is_file(self) -> bool:
-        if _SPECIAL & set(self.address):
-            return False
-        return unless_stalled(lambda _: bool(self._system.isfile(self._path)), *self._about)
+        return not _SPECIAL & set(self._url) and bool(self._ask(self._system.isfile))
 
-    def matches(self) -> Iterator[str]:
-        found = unless_stalled(lambda _: sorted(self._system.glob(self._path)), *self._about)
-        return map(self._url, found)
+    def matches(self) -> list[str]:
+        return [self._system.unstrip_protocol(path) for path in self._paths(self._system.glob)]
 
     def videos_below(self) -> Iterator[str]:
-        found = unless_stalled(lambda _: sorted(self._system.find(self._path)), *self._about)
-        return (self._url(path) for path in found if _is_wanted(path.rpartition("/")[2]))
+        for path in self._paths(self._system.find):
+            if _is_video(path.rpartition("/")[2]):
+                yield str(self._system.unstrip_protocol(path))
 
-    @property
-    def _about(self) -> tuple[str, float]:
-        return self.address, self._stall
+    def _paths(self, list_paths: Callable[[str], Iterable[str]]) -> list[str]:
+        return unless_stalled(lambda _: sorted(list_paths(self._path)), self._url, self._stall)
 
-    def _url(self, path: Any) -> str:
-        return str(self._system.unstrip_protocol(path))
-
-
-def _is_wanted(name: str) -> bool:
-    suffix = _suffix_of(name)
-    return not name.startswith(".") and (suffix == _TAR or suffix in VIDEO_SUFFIXES)
+    def _ask(self, question: Callable[[str], object]) -> object:
+        return unless_stalled(lambda _: question(self._path), self._url, self._stall)
 
 
-def _is_file(path: str) -> bool:
-    return Path(path).is_file()
+def _is_video(name: str) -> bool:
+    return not name.startswith(".") and _suffix_of(name) in VIDEO_SUFFIXES
 
 
 def _raise(error: OSError) -> None:

@@ -3,44 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
-import re
+import queue
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from colmap_av1.batch.cluster import RayEngine
-from colmap_av1.batch.files import absolute
-from colmap_av1.batch.index import Index
-from colmap_av1.batch.inputs import list_videos
-from colmap_av1.batch.jobs import Ended, Engine, Job, Needs, Outcome, Row, TooSmall, Work
-from colmap_av1.batch.local import LocalEngine
-from colmap_av1.batch.needs import least_needs
-from colmap_av1.batch.outputs import (
-    ROWS,
-    Output,
-    output_at,
-    scratch_for,
-    scratch_of_process,
-)
-from colmap_av1.batch.rows import write_csv, write_json
-from colmap_av1.batch.tasks import matching_of, task_of
+from colmap_av1.batch.engines import Engine, LocalEngine, RayEngine
+from colmap_av1.batch.inputs import Video, list_videos
+from colmap_av1.batch.output import ROWS, Output, output_at, remove_unused_scratch, scratch_for
+from colmap_av1.batch.rows import Row, csv_of, json_of
+from colmap_av1.batch.video import Outcome, Work, failed_row
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.options import BatchOptions, DensifyOptions
+from colmap_av1.options import BatchOptions, DensifyOptions, MatchOptions
+from colmap_av1.options.batch import TASK_OPTIONS
 from colmap_av1.options.fields import Options
 from colmap_av1.util.digests import package_version
+from colmap_av1.util.remote import absolute, without_secrets
 
-# Rows are written at most so often, and for at most this share of the time: those of a million
-# videos take half a minute.
+# Rows are written at most so often, and for at most this share of the time.
 _WRITE_EVERY = 5.0
 _WRITE_SHARE = 0.05
 _WAIT = 1.0
-_GB = 10**9
-_TASK = re.compile(rb'^ "task": "([a-z]+)"', re.MULTILINE)
 
 
 @dataclass
@@ -72,7 +62,7 @@ class BatchReport:
     """What became of a batch.
 
     Attributes:
-        output: the output, as an absolute path or URL.
+        output: the output, as an absolute path or URL, without secrets.
         num_videos: videos of this shard.
         num_done: those that are done.
         num_kept: those of them that an earlier run had finished.
@@ -111,11 +101,10 @@ def run_batch(
 ) -> BatchReport:
     """Do one task on many videos.
 
-    Each video gets a folder in the output, with `report.json` as its mark of completion; it is
-    there whole or not at all. `batch.csv` and `batch.json` there have a row for each
-    video, in the order of the inputs, and are written as it goes. Videos whose folder comes of the
-    same file, options and version are kept from an earlier run; others are made again, and so is
-    what failed.
+    Each video gets a folder in the output, which is complete once it holds `report.json`.
+    `batch.csv` and `batch.json` there have a row for each video, in the order of the inputs, and
+    are written as it goes. Videos whose folder comes of the same file, options and version are
+    kept from an earlier run; others are made again, and so is what failed.
 
     Args:
         inputs: lists, patterns, folders and files, see `list_videos`; paths or URLs.
@@ -135,126 +124,138 @@ def run_batch(
     words = [inputs] if isinstance(inputs, (str, os.PathLike)) else inputs
     place = absolute(os.fspath(output))
     work = _work_of(task, place, None if models is None else os.fspath(models), options)
-    shard = "" if options.shard is None else "-{}-of-{}".format(*options.part)
+    number, count = options.part
+    shard = "" if options.shard is None else f"-{number}-of-{count}"
     start = time.perf_counter()
     with ExitStack() as opened:
         into = output_at(place)
         opened.enter_context(into.opened(shard))
         _refuse_another_task(into, place, work.task)
-        try:
-            scratch = opened.enter_context(scratch_of_process(work.scratch))
-        except OSError as error:
-            raise OptionError(cannot_write(Path(work.scratch), error)) from error
-        index = Index(scratch / "index.db")
-        opened.callback(index.close)
-        index.add(list_videos([os.fspath(word) for word in words], place, options.stall))
-        counts = Counts(_size_of(options.part, index.num_videos))
-        rows = _RowFiles(index, into, work, shard, scratch)
-        engine: Engine = LocalEngine(work) if options.engine == "local" else _ray(work, options)
+        _check_scratch(work.scratch)
+        everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
+        videos = everything[number - 1 :: count]
+        engine: Engine = (
+            LocalEngine(work, options, len(videos))
+            if options.engine == "local"
+            else RayEngine(work, options)
+        )
         opened.callback(engine.close)
         if hear is not None:
             hear(engine.about)
-        jobs = index.jobs(options.part, least_needs(work))
-        totals = [0.0, 0.0]
         watch = watch if watch is not None else _watch_nothing
+        table = _Table(into, shard, work, len(everything))
+        counts = Counts(len(videos))
         watch(counts, None)
+        cpu_seconds = video_seconds = 0.0
         try:
-            for job, ended in _drive(jobs, engine, options.retries, counts):
-                index.record(job.position, ended.row)
-                if not ended.kept and ended.row.state == "done":
-                    totals[0] += ended.row.cpu_seconds or 0.0
-                    totals[1] += ended.row.video_seconds or 0.0
-                watch(counts, ended.row)
-                rows.write_in_time()
+            for position, outcome in _outcomes(engine, videos):
+                row = outcome.row
+                table.rows[position] = row
+                counts.retried += outcome.retried
+                counts.kept += outcome.kept
+                if row.state == "failed":
+                    counts.failed[row.reason] += 1
+                else:
+                    counts.done += 1
+                if row.state == "done" and not outcome.kept:
+                    cpu_seconds += row.cpu_seconds or 0.0
+                    video_seconds += row.video_seconds or 0.0
+                watch(counts, row)
+                table.write_in_time()
         except BaseException:
             with suppress(OptionError):
-                rows.write()
+                table.write()
             raise
-        rows.write()
+        table.write()
+    repeated = f"{num_repeated} of the inputs are there twice and count once"
     return BatchReport(
-        output=place,
+        output=without_secrets(place),
         num_videos=counts.total,
         num_done=counts.done,
         num_kept=counts.kept,
         failed=dict(sorted(counts.failed.items())),
         num_retried=counts.retried,
         seconds=time.perf_counter() - start,
-        cpu_seconds=totals[0],
-        video_seconds=totals[1],
-        warnings=_warnings(index),
+        cpu_seconds=cpu_seconds,
+        video_seconds=video_seconds,
+        warnings=(repeated,) if num_repeated else (),
     )
 
 
+def batch_files(output: Output) -> list[str]:
+    """Names of the JSON files of rows in an output."""
+    names = [name for name in output.names() if name.endswith(".json")]
+    return [name for name in names if name == f"{ROWS}.json" or name.startswith(f"{ROWS}-")]
+
+
 def _refuse_another_task(output: Output, place: str, task: str) -> None:
-    """Refuse an output whose tables are those of another task.
+    """Refuse an output whose rows are those of another task.
 
     Raises:
         OptionError: they are.
     """
-    with suppress(OSError):  # there is nothing yet
-        for name in output.files(".json"):
-            if name == f"{ROWS}.json" or name.startswith(f"{ROWS}-"):
-                found = _TASK.search(output.read(name) or b"")
-                if found is not None and found[1].decode() != task:
-                    raise OptionError(
-                        f"{place}: holds a batch of the task {found[1].decode()}: give another "
-                        "output"
-                    )
+    for name in batch_files(output):
+        found: object = None
+        with suppress(ValueError, RecursionError):  # a damaged one is written again
+            found = json.loads(output.read(name) or b"")
+        earlier = found.get("task") if isinstance(found, dict) else None
+        if earlier in TASK_OPTIONS and earlier != task:
+            raise OptionError(
+                f"{without_secrets(place)}: holds a batch of the task {earlier}: give another "
+                "output"
+            )
 
 
-def _drive(
-    jobs: Iterator[Job], engine: Engine, retries: int, counts: Counts
-) -> Iterator[tuple[Job, Ended]]:
-    """Attempt every video until it is done, or another attempt cannot help."""
-    again: deque[Job] = deque()
-    num_running = 0
-    upcoming = next(jobs, None)
-    while again or num_running or upcoming is not None:
-        while (job := again[0] if again else upcoming) is not None and engine.has_room(job):
-            engine.submit(job)
-            num_running += 1
-            if again:
-                again.popleft()
-            else:
-                upcoming = next(jobs, None)
-        for job, outcome in engine.wait(_WAIT):
-            num_running -= 1
-            further = _further_attempt(job, outcome, retries)
-            if further is not None:
-                counts.retried += further.attempt > job.attempt
-                again.append(further)
-                continue
-            ended = cast(Ended, outcome)
-            counts.done += ended.row.state == "done"
-            counts.kept += ended.kept
-            if ended.row.state == "failed":
-                counts.failed[ended.row.reason] += 1
-            yield job, ended
+def _check_scratch(scratch: str) -> None:
+    """Make the folder for unfinished work, and remove what killed processes left there.
+
+    Raises:
+        OptionError: it cannot be made.
+    """
+    try:
+        os.makedirs(scratch, exist_ok=True)
+    except OSError as error:
+        raise OptionError(cannot_write(Path(scratch), error)) from error
+    remove_unused_scratch(scratch)
 
 
-def _further_attempt(job: Job, outcome: Outcome, retries: int) -> Job | None:
-    """The video as it is to be attempted again; None where it has ended."""
-    if isinstance(outcome, TooSmall):
-        return replace(job, needs=outcome.needs)
-    if not outcome.passing or job.attempt > retries:
-        return None
-    memory = job.needs.memory * (2 if outcome.starved else 1)
-    return replace(job, needs=Needs(job.needs.cores, memory), attempt=job.attempt + 1)
+def _outcomes(engine: Engine, videos: Sequence[Video]) -> Iterator[tuple[int, Outcome]]:
+    """The outcomes of all videos as they come, with their positions."""
+    ended: queue.SimpleQueue[Future[Outcome]] = queue.SimpleQueue()
+    positions: dict[Future[Outcome], int] = {}
+    for position, video in enumerate(videos):
+        future = engine.submit(video)
+        positions[future] = position
+        future.add_done_callback(ended.put)
+    for _ in videos:
+        future = _next(ended)
+        position = positions[future]
+        error = future.exception()
+        if error is None:
+            yield position, future.result()
+        else:
+            yield position, Outcome(failed_row(videos[position], engine.failure(error)))
 
 
-class _RowFiles:
+def _next(ended: queue.SimpleQueue[Future[Outcome]]) -> Future[Outcome]:
+    while True:
+        with suppress(queue.Empty):
+            return ended.get(timeout=_WAIT)  # without a time, Windows takes no interrupt
+
+
+class _Table:
     """The files of rows in the output, written again as rows come."""
 
-    def __init__(self, index: Index, output: Output, work: Work, shard: str, scratch: Path) -> None:
-        self._index, self._output, self._scratch = index, output, scratch
-        self._names = [f"{ROWS}{shard}{suffix}" for suffix in (".csv", ".json")]
+    def __init__(self, output: Output, shard: str, work: Work, num_videos: int) -> None:
+        self._output, self._shard = output, shard
         self._facts = {
             "task": work.task,
             "options": dataclasses.asdict(cast(Any, work.options)),
             "version": work.version,
-            "videos": index.num_videos,
+            "videos": num_videos,
         }
         self._next = 0.0
+        self.rows: dict[int, Row] = {}
 
     def write_in_time(self) -> None:
         """Write the rows so far, unless that was done a short while ago, if that is possible."""
@@ -269,28 +270,30 @@ class _RowFiles:
             OptionError: they cannot be written.
         """
         start = time.monotonic()
-        self._next = start + _WRITE_EVERY
-        files = [self._scratch / name for name in self._names]
+        rows = [row for _, row in sorted(self.rows.items())]
+        name = f"{ROWS}{self._shard}"
         try:
-            write_csv(self._index.rows(), files[0])
-            write_json(self._index.rows(), files[1], self._facts)
-            for file in files:
-                self._output.put(file, file.name)
+            self._output.write(f"{name}.csv", csv_of(rows))
+            self._output.write(f"{name}.json", json_of(rows, self._facts))
         except OSError as error:
-            path = Path(os.fsdecode(error.filename or self._names[0]))
+            path = Path(os.fsdecode(error.filename or f"{name}.csv"))
             raise OptionError(cannot_write(path, error)) from error
-        end = time.monotonic()
-        self._next = end + max(_WRITE_EVERY, (end - start) / _WRITE_SHARE)
+        finally:
+            end = time.monotonic()
+            self._next = end + max(_WRITE_EVERY, (end - start) / _WRITE_SHARE)
 
 
 def _work_of(task: Options, output: str, models: str | None, options: BatchOptions) -> Work:
     """What is done with each video, after a look at what cannot work."""
-    name = task_of(task)
+    name = next((name for name, kind in TASK_OPTIONS.items() if type(task) is kind), None)
+    if name is None:
+        kinds = ", ".join(kind.__name__ for kind in TASK_OPTIONS.values())
+        raise OptionError(f"{type(task).__name__} are no options of a batch: give one of {kinds}")
     if (models is not None) != isinstance(task, DensifyOptions):
         what = "is for" if models is not None else "is missing for"
         raise OptionError(f"models {what} the task densify: give a folder of models with it alone")
-    matching = matching_of(task)
-    if matching is not None and matching.keep_stream is not None:
+    matching = task if isinstance(task, MatchOptions) else getattr(task, "match", None)
+    if isinstance(matching, MatchOptions) and matching.keep_stream is not None:
         raise OptionError("keep_stream is one file, and a batch has many videos: leave it out")
     return Work(
         task=name,
@@ -299,27 +302,11 @@ def _work_of(task: Options, output: str, models: str | None, options: BatchOptio
         models=None if models is None else absolute(models),
         scratch=scratch_for(output, options.scratch),
         timeout=options.timeout,
+        retries=options.retries,
         stall=options.stall,
         write_images=options.write_images,
-        cores=options.cores,
-        memory=None if options.memory is None else int(options.memory * _GB),
         version=package_version(),
     )
-
-
-def _ray(work: Work, options: BatchOptions) -> Engine:
-    return RayEngine(work, options.address)
-
-
-def _size_of(part: tuple[int, int], total: int) -> int:
-    number, count = part
-    return len(range(number - 1, total, count))
-
-
-def _warnings(index: Index) -> tuple[str, ...]:
-    if not index.num_duplicates:
-        return ()
-    return (f"{index.num_duplicates} of the inputs are there twice and count once",)
 
 
 def _watch_nothing(counts: Counts, row: Row | None) -> None:

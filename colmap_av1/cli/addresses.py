@@ -9,11 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
-from colmap_av1.batch.files import absolute, fetch, is_url, without_secrets
-from colmap_av1.batch.jobs import Source
 from colmap_av1.cli.terminal import print_note
 from colmap_av1.errors import OptionError
 from colmap_av1.options import BatchOptions
+from colmap_av1.util.remote import absolute, fetch, is_url, without_secrets
 
 
 @contextmanager
@@ -56,7 +55,7 @@ def _fetched(url: str, folder: Path, quiet: bool) -> str:
     if not quiet:
         print_note(f"fetching {without_secrets(url)}")
     try:
-        copy = fetch(Source(address), folder, BatchOptions().stall)
+        copy = fetch(address, folder, BatchOptions().stall)
     except OptionError as error:
         raise OptionError(f"{error}; or fetch it first, and give its path") from error
     name = PurePosixPath(unquote(urlsplit(url).path)).name

@@ -26,7 +26,7 @@ def add_arguments(command: Parser) -> None:
         nargs="+",
         metavar="PATH",
         help="lists (a path or URL on each line, and if wanted a tab and a name), quoted patterns, "
-        "folders, tar files and videos; paths or URLs",
+        "folders and videos; paths or URLs",
     )
     command.add_argument(
         "--output",

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from colmap_av1.batch.jobs import Row
+from colmap_av1.batch.rows import Row
 from colmap_av1.batch.run import Counts, Watch
 from colmap_av1.cli.terminal import PROGRAM, print_warning
 

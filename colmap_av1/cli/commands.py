@@ -16,6 +16,7 @@ import colmap_av1
 from colmap_av1.cli import batch, reports
 from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.parser import Parser
+from colmap_av1.cli.report_file import write_report_json
 from colmap_av1.cli.terminal import (
     print_next,
     print_result,
@@ -123,6 +124,9 @@ _OVERWRITE_MODELS = _flag("overwrite", "replace an output that exists and holds 
 _GAUSSIANS = _optional_path(
     "gaussians", "also write initial Gaussians to this .ply, for trainers that start from them"
 )
+_REPORT_JSON = _optional_path(
+    "report_json", "also write the report to this file as JSON; after a failure its reason"
+)
 
 
 def _match(namespace: argparse.Namespace) -> None:
@@ -135,6 +139,7 @@ def _match(namespace: argparse.Namespace) -> None:
             options=given(namespace, MatchOptions),
             progress=report,
         )
+    write_report_json(namespace, result)
     print_result(namespace, reports.match_rows(result), result.warnings)
     if not namespace.quiet:
         print_next(result)
@@ -165,6 +170,7 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
             options=given(namespace, ReconstructOptions),
             progress=report,
         )
+    write_report_json(namespace, result)
     print_result(namespace, reports.reconstruct_rows(result), result.warnings)
 
 
@@ -181,6 +187,7 @@ def _densify(namespace: argparse.Namespace) -> None:
             progress=report,
             overwrite=namespace.overwrite,
         )
+    write_report_json(namespace, result)
     print_result(namespace, reports.densify_rows(result), result.warnings)
 
 
@@ -232,6 +239,7 @@ def _info(namespace: argparse.Namespace) -> None:
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
             read_out = estimate_video_read_out(namespace.video, options, report)
+    write_report_json(namespace, result)
     print_summary([*reports.info_rows(result), *reports.read_out_rows(read_out)])
 
 
@@ -364,6 +372,7 @@ COMMANDS = {
                 "image_path",
                 "folder to write the images to; existing ones of the right size are kept",
             ),
+            _REPORT_JSON,
         ),
         (MatchOptions,),
         full_help=True,
@@ -392,6 +401,7 @@ COMMANDS = {
             _path("output", "folder for images/ and sparse/0/; that of an earlier run is resumed"),
             _GAUSSIANS,
             _flag("overwrite", "replace a file of --gaussians that exists"),
+            _REPORT_JSON,
         ),
         (ReconstructOptions,),
         full_help=True,
@@ -409,6 +419,7 @@ COMMANDS = {
                 "image_path", "folder of its images, where their names do not determine the frames"
             ),
             _GAUSSIANS,
+            _REPORT_JSON,
         ),
         (DensifyOptions,),
         full_help=True,
@@ -470,6 +481,7 @@ COMMANDS = {
                     "picture, from the tracks, which takes as long as to match them",
                 },
             ),
+            _REPORT_JSON,
         ),
         (ReadOptions,),
         pycolmap=False,

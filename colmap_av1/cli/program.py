@@ -12,6 +12,7 @@ from colmap_av1.cli.addresses import videos_at_hand
 from colmap_av1.cli.commands import COMMANDS
 from colmap_av1.cli.options import underscored
 from colmap_av1.cli.parser import BAD_INPUT, Parser
+from colmap_av1.cli.report_file import failure_as_json
 from colmap_av1.cli.terminal import (
     PROGRAM,
     StreamError,
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             namespace = _parse([underscored(word) for word in words])
             command = COMMANDS[namespace.command]
             _import_libraries(with_pycolmap=command.pycolmap)
-            with videos_at_hand(namespace):
+            with failure_as_json(namespace), videos_at_hand(namespace):
                 status = command.run(namespace)
     except ColmapAv1Error as error:
         print_error(error)

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from colmap_av1.cli.reports import Rows
+from colmap_av1.util.remote import without_secrets
 
 if TYPE_CHECKING:
     from colmap_av1.match import MatchReport
@@ -132,7 +133,7 @@ def print_error(message: object) -> None:
 def _print_line(text: str) -> None:
     try:
         # Names of files may hold ends of lines.
-        print(text.replace("\n", "\\n"), file=sys.stderr, flush=True)
+        print(without_secrets(text).replace("\n", "\\n"), file=sys.stderr, flush=True)
     except OSError:  # there is nowhere left to say so
         _silence(sys.stderr)
 

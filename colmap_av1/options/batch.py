@@ -51,14 +51,11 @@ class BatchOptions(Options):
         common=True,
     )
     cores: int | None = option(
-        None, "CPU cores of a video; None: estimated from its size and length", least=1
-    )
-    memory: float | None = option(
         None,
-        "memory of a video in GB, at which it is stopped; None: estimated, and stopped at twice "
-        "as much",
-        above=0,
-        unit="GB",
+        "CPU cores for each video, by which as many run at a time as there are cores for; None: "
+        "one, on this machine more where it has less than 4 GB of memory for each",
+        least=1,
+        common=True,
     )
     stall: float = option(
         60.0,

@@ -1,4 +1,4 @@
-"""Memory that this process may use, and that processes use."""
+"""Memory that this process may use."""
 
 from __future__ import annotations
 
@@ -47,15 +47,3 @@ def give_back_free_memory() -> None:
     # Other C libraries have no such function.
     with suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def resident_memory(process: int) -> int:
-    """Bytes of memory that a process and those it has started hold; 0 where that is not known."""
-    total = 0
-    with suppress(OSError, ValueError, IndexError):
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-        total = pages * os.sysconf("SC_PAGE_SIZE")
-        for task in Path(f"/proc/{process}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                total += resident_memory(int(child))
-    return total

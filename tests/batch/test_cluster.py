@@ -60,18 +60,18 @@ def test_a_cluster_that_loses_processes_and_a_node(
     rng = random.Random(0)
 
     def harm(counts: Counts, _: object) -> None:
-        if counts.ended in {5, 12, 30}:
+        if counts.ended in {1, 3}:
             for process in ray_workers()[:1]:
                 os.kill(process, signal.SIGKILL)
-        if counts.ended in {8, 25}:
+        if counts.ended in {2, 5}:
             processes = workers_of(*ray_workers())
             if processes:
                 os.kill(rng.choice(processes), signal.SIGKILL)
-        if counts.ended == 18 and len(cluster.worker_nodes) == 1:
+        if counts.ended == 4 and len(cluster.worker_nodes) == 1:
             cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
 
     report = run_batch(clips, out, ReadOptions(), options=options, watch=harm)
-    assert (report.num_done, report.failed) == (36, {"damaged": 2, "unreadable": 2})
+    assert (report.num_done, report.failed) == (6, {"damaged": 1, "unreadable": 1})
     assert rows_of(out) == rows_of(local)
     assert files_of(out) == files_of(local)
     assert len(cluster.worker_nodes) == 0

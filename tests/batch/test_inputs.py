@@ -1,12 +1,9 @@
-"""Lists, patterns, folders and tar files of videos, and their names."""
+"""Lists, patterns and folders of videos, and their names."""
 
 from __future__ import annotations
 
 import http.server
 import os
-import resource
-import sys
-import tarfile
 import threading
 import time
 from collections.abc import Iterator
@@ -15,16 +12,13 @@ from pathlib import Path
 import pytest
 
 from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
-from colmap_av1.batch.index import Index
-from colmap_av1.batch.inputs import list_videos
-from colmap_av1.batch.jobs import Needs, Row, Source
-from colmap_av1.batch.rows import read_json, write_csv, write_json
+from colmap_av1.batch.inputs import Video, list_videos
 
 OUT = "/nowhere/out"
 
 
 def names(*inputs: str | Path) -> list[str]:
-    return [name for name, _ in list_videos([str(word) for word in inputs], OUT, 5)]
+    return [video.name for video in list_videos([str(word) for word in inputs], OUT, 5)[0]]
 
 
 @pytest.fixture
@@ -48,23 +42,10 @@ def test_lists(folder: Path) -> None:
     lines = ["videos/sub/c.v1.MP4", f"{folder}/b.mp4\tscene/first", "", "../x/e.mp4\r"]
     videos.write_text("\n".join([*lines, "https://host/f.mp4?key=1", "s3://bucket/dir/g.mkv"]))
     assert names(videos) == ["videos/sub/c.v1", "scene/first", "e", "f", "g"]
-    first = next(iter(list_videos([str(videos)], OUT, 5)))[1]
-    assert os.path.samefile(str(first), folder / "sub" / "c.v1.MP4")
-
-
-def test_tar_files(folder: Path) -> None:
-    with tarfile.open(folder / "shard-0.tar", "w") as tar:
-        for name in ("b.mp4", "a.webm"):
-            tar.add(folder / name, f"./{name}")
-        tar.add(folder / "sub" / "notes.txt", "b.json")
-    found = dict(list_videos([str(folder / "shard-0.tar")], OUT, 5))
-    assert list(found) == ["shard-0/b", "shard-0/a"]
-    content = (folder / "shard-0.tar").read_bytes()
-    source = found["shard-0/a"]
-    assert content[source.start : source.start + (source.length or 0)] == b"a.webm"
-    (folder / "shard-0.tar").write_bytes(b"x" * 2000)
-    with pytest.raises(OptionError, match="no tar file"):
-        names(folder)
+    found, num_repeated = list_videos([str(videos), str(videos)], OUT, 5)
+    assert (len(found), num_repeated) == (5, 5)
+    assert os.path.samefile(found[0].address, folder / "sub" / "c.v1.MP4")
+    assert found[4] == Video("g", "s3://bucket/dir/g.mkv")
 
 
 @pytest.mark.parametrize(
@@ -110,41 +91,10 @@ def test_names_that_clash(lines: str, message: str, tmp_path: Path) -> None:
         run_batch(videos, tmp_path / "out", ReadOptions())
 
 
-def test_shards_have_every_video_once(tmp_path: Path) -> None:
-    index = Index(tmp_path / "index")
-    index.add((f"v{i}", Source(f"/v{i}.mp4")) for i in [*range(600), 3, 4])
-    assert (index.num_videos, index.num_duplicates) == (600, 2)
-    shards = [[j.name for j in index.jobs((i, 7), Needs(1, 1))] for i in range(1, 8)]
-    assert sorted(n for shard in shards for n in shard) == sorted(f"v{i}" for i in range(600))
-    assert max(map(len, shards)) - min(map(len, shards)) <= 1
-
-
 @pytest.mark.parametrize("shard", ["0/2", "3/2", "1", "1/0", "a/b", "-1/2"])
 def test_bad_shards(shard: str) -> None:
     with pytest.raises(OptionError, match="give I/N"):
         BatchOptions(shard=shard)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="names are text there")
-def test_long_lists_take_no_memory(tmp_path: Path) -> None:
-    """Names that are no UTF-8 keep their bytes."""
-    videos = tmp_path / "list"
-    with videos.open("wb") as file:
-        for i in range(50_000):
-            file.write(b"/videos/of a long name that takes its place \xe9/%d.mp4\n" % i)
-    index = Index(tmp_path / "index")
-    index.add(list_videos([str(videos)], OUT, 5))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for job in index.jobs((1, 10), Needs(1, 1)):
-        index.record(job.position, Row(job.name, str(job.source), "done"))
-    write_csv(index.rows(), tmp_path / "rows.csv")
-    write_json(index.rows(), tmp_path / "rows.json", {})
-    with (tmp_path / "rows.json").open() as text:
-        inputs = [row.input for row in read_json(text)]
-    assert len(inputs) == 5_000
-    assert inputs[-1] == "/videos/of a long name that takes its place \udce9/49990.mp4"
-    assert b"name that takes its place \xe9/49990.mp4" in (tmp_path / "rows.csv").read_bytes()
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 8_000  # KB
 
 
 class _Hangs(http.server.BaseHTTPRequestHandler):
@@ -181,7 +131,7 @@ def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
     videos.write_text(f"{server}/hangs.mp4\n{server}/none.mp4\n")
-    options = BatchOptions(stall=2, retries=0, cores=99)
+    options = BatchOptions(stall=2, retries=0)
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from colmap_av1 import OptionError, write_page
-from colmap_av1.batch.jobs import Row
-from colmap_av1.batch.rows import row_facts, write_json
+from colmap_av1.batch.rows import Row, json_of
 from colmap_av1.cli import main
 
 JPEG = b"\xff\xd8\xff\xe0 a small picture"
@@ -52,13 +51,15 @@ class Cells(html.parser.HTMLParser):
 
 def write_rows(out: Path, rows: list[Row], name: str = "batch.json") -> None:
     out.mkdir(exist_ok=True)
-    write_json(rows, out / name, {"task": "reconstruct"})
+    (out / name).write_bytes(json_of(rows, {"task": "reconstruct"}))
 
 
 def test_a_page(tmp_path: Path) -> None:
     done = [
         Row(
-            *(f"v{i}", f"/in/v{i}.mp4", "done"),
+            f"v{i}",
+            f"/in/v{i}.mp4",
+            "done",
             seconds=i + 0.5,
             cpu_seconds=2.0 * i,
             video_seconds=60.0,
@@ -75,7 +76,7 @@ def test_a_page(tmp_path: Path) -> None:
     (out / "v2").mkdir()
     (out / "v2" / "thumbnail.jpg").write_bytes(JPEG)
     assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
-    text = (out / "report.html").read_text()
+    text = " ".join((out / "report.html").read_text().split())
     page = Cells(text)
     assert "<script>alert" not in text
     assert [link.partition(",")[0] for link in page.links] == ["data:image/jpeg;base64"]
@@ -112,8 +113,8 @@ def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
 
 def row_text(field: str, value: object) -> str:
     """A file of rows, one of whose values is altered."""
-    facts = {**row_facts(Row("x", "/x", "done")), field: value}
-    return f'{{"rows": [\n  {json.dumps(facts)}]\n}}'
+    facts = {**vars(Row("x", "/x", "done")), field: value}
+    return json.dumps({"rows": [facts]})
 
 
 @pytest.mark.parametrize(
@@ -125,7 +126,7 @@ def row_text(field: str, value: object) -> str:
         (row_text("state", "<script>alert(1)</script>"), "damaged"),
         (row_text("seconds", "<script>"), "damaged"),
         (row_text("points", [1]), "damaged"),
-        (row_text("error", {"a": "b"}), "damaged"),
+        ("[]", "damaged"),
         ('{"rows": [\n  {"name": ' + "[" * 100_000, "damaged"),
     ],
 )

@@ -38,7 +38,7 @@ def _timeless(value: Any) -> Any:
 
 
 def workers_of(*drivers: int) -> list[int]:
-    """The processes that attempt videos for some processes."""
+    """The processes that run our commands for some processes."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -46,6 +46,6 @@ def workers_of(*drivers: int) -> list[int]:
             command = (folder / "cmdline").read_bytes()
         except OSError:  # it has ended
             continue
-        if parent in drivers and b"colmap_av1.batch.worker" in command:
+        if parent in drivers and b"\0-m\0colmap_av1\0" in command:
             found.append(int(folder.name))
     return sorted(found)

@@ -1,4 +1,4 @@
-"""Reading of files here and, through fsspec, anywhere else."""
+"""Files at URLs, read through fsspec."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-from colmap_av1.batch.jobs import Source
 from colmap_av1.errors import ColmapAv1Error, OptionError, VideoError
 
 _Result = TypeVar("_Result")
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
-_SECRET = re.compile(r"""([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/?@]*@)?([^\s?'"]*)(?:\?[^\s'"]*)?""")
+_SECRET = re.compile(
+    r"""([A-Za-z][A-Za-z0-9+.-]+:/{1,2})(?:[^\s/?@]*@)?([^\s?'"]*)(?:\?[^\s'"]*)?"""
+)
 _BLOCK = 1 << 22
-# What stores call the sign of a changed object: S3 and Azure, HTTP, Google.
+# What stores call the tag of a version of an object: S3 and Azure, HTTP, Google.
 _TAGS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "updated")
 EXTRA = "colmap-av1[remote]"
 
@@ -30,12 +31,12 @@ def without_secrets(text: str) -> str:
 
 
 def is_url(address: str) -> bool:
-    """Whether an address is no path of this machine."""
+    """Whether an address is a URL, not a path of this machine."""
     return _URL.match(address) is not None
 
 
 def absolute(address: str) -> str:
-    """The address for processes with another working folder."""
+    """The URL or absolute path of an address."""
     if address.startswith("file://"):
         address = address.removeprefix("file://")
     return address if is_url(address) else os.path.abspath(address)
@@ -45,7 +46,7 @@ def filesystem(url: str) -> tuple[Any, str]:
     """The file system that fsspec has for a URL, and the path in it.
 
     Raises:
-        OptionError: a package is missing, or there is no such kind of URL.
+        OptionError: a package is missing, or fsspec does not know this kind of URL.
     """
     shown = without_secrets(url)
     try:
@@ -63,68 +64,58 @@ def filesystem(url: str) -> tuple[Any, str]:
     return system, str(path)
 
 
-def state_of(source: Source, stall: float) -> dict[str, Any]:
-    """What changes with the content of a video, as JSON holds it.
+def version_of(address: str, stall: float) -> dict[str, object]:
+    """What changes with the content of a file: its size and time, or the tag of its store.
 
     Raises:
         VideoError: there is no such file.
-        OSError: nothing can be learned of it.
+        OSError: the file system does not answer.
     """
-    part = {"start": source.start, "length": source.length} if source.member else {}
-    if not is_url(source.address):
+    if not is_url(address):
         try:
-            status = os.stat(source.address)
+            status = os.stat(address)
         except FileNotFoundError as error:
-            raise _missing(source.address) from error
-        return {"bytes": status.st_size, "mtime_ns": status.st_mtime_ns, **part}
+            raise _missing(address) from error
+        return {"bytes": status.st_size, "mtime_ns": status.st_mtime_ns}
 
-    system, path = filesystem(source.address)
+    system, path = filesystem(address)
 
-    def ask(_: Callable[[], None]) -> dict[str, Any]:
+    def ask(_: Callable[[], None]) -> dict[str, object]:
         info = system.info(path)
         tags = {tag: str(info[tag]) for tag in _TAGS if info.get(tag) is not None}
-        return {"bytes": info.get("size"), **tags, **part}
+        return {"bytes": info.get("size"), **tags}
 
-    return unless_stalled(ask, source.address, stall)
+    return unless_stalled(ask, address, stall)
 
 
-def fetch(source: Source, folder: Path, stall: float) -> Path:
-    """A file that holds a video: its own, where it has one here, or a copy.
+def fetch(address: str, folder: Path, stall: float) -> Path:
+    """The path of a file; a file at a URL is copied.
 
     Args:
-        source: the video.
+        address: path or URL.
         folder: gets the copy.
-        stall: seconds without data after which a URL is given up.
+        stall: seconds without data after which reading a URL is given up.
 
     Raises:
         VideoError: there is no such file.
-        OSError: it cannot be read, or not be written here.
+        OSError: it cannot be read, or the copy not be written.
     """
-    if not is_url(source.address) and not source.member:
-        return Path(source.address)
-    suffix = PurePosixPath(source.member or source.address.partition("?")[0]).suffix
-    target = folder / f"video{suffix}"
+    if not is_url(address):
+        return Path(address)
+    target = folder / f"video{PurePosixPath(address.partition('?')[0]).suffix}"
 
-    def copy(beat: Callable[[], None]) -> Path:
-        with open_to_read(source.address) as file, target.open("wb") as copied:
-            file.seek(source.start)
-            left = source.length
-            while left is None or left > 0:
-                block = file.read(_BLOCK if left is None else min(_BLOCK, left))
-                if not block:
-                    break
+    def copy(beat: Callable[[], None]) -> None:
+        with open_to_read(address) as file, target.open("wb") as copied:
+            while block := file.read(_BLOCK):
                 copied.write(block)
-                left = left if left is None else left - len(block)
                 beat()
-        if left:
-            raise VideoError(f"{source}: cut off: {left} bytes are missing: write the file again")
-        return target
 
-    return unless_stalled(copy, str(source), stall)
+    unless_stalled(copy, address, stall)
+    return target
 
 
 def open_to_read(address: str) -> Any:
-    """An open file, of bytes, that can be read from any position.
+    """An open binary file.
 
     Raises:
         OptionError: as `filesystem`.
@@ -139,19 +130,18 @@ def open_to_read(address: str) -> Any:
 def unless_stalled(
     step: Callable[[Callable[[], None]], _Result], address: str, seconds: float
 ) -> _Result:
-    """Run a step that reads a URL; give it up where it does not come further.
+    """Run a step that reads a URL; give it up if it makes no progress.
 
     Args:
-        step: is given a function to be called whenever it has come further.
+        step: gets a function to call after each piece of progress.
         address: what it reads, for messages.
-        seconds: for how long it may stand still.
+        seconds: without progress after which it is given up.
 
     Raises:
         VideoError: there is no such file.
-        OSError: it failed, or stood still; it may then run on as long as the process does.
+        OSError: it failed or stalled; a stalled step may run on in its thread.
         ColmapAv1Error: what the step raised.
     """
-    shown = without_secrets(address)
     result: list[_Result] = []
     failure: list[BaseException] = []
     last = [time.monotonic()]
@@ -163,7 +153,7 @@ def unless_stalled(
     def run() -> None:
         try:
             result.append(step(beat))
-        except BaseException as error:  # handed on below
+        except BaseException as error:  # raised again below
             failure.append(error)
         finally:
             done.set()
@@ -171,6 +161,7 @@ def unless_stalled(
     threading.Thread(target=run, daemon=True).start()
     while not done.wait(max(0.01, last[0] + seconds - time.monotonic())):
         if time.monotonic() - last[0] >= seconds:
+            shown = without_secrets(address)
             raise OSError(errno.ETIMEDOUT, f"nothing comes for {seconds:g} seconds", shown)
     if failure:
         raise _as_os_error(failure[0], address) from failure[0]
@@ -178,7 +169,7 @@ def unless_stalled(
 
 
 def _as_os_error(error: BaseException, address: str) -> BaseException:
-    """What clients of stores raise, which is of many kinds, as one of the system."""
+    """An error of a store's client, which may be of any type, as an OSError."""
     if isinstance(error, ColmapAv1Error) or not isinstance(error, Exception):
         return error
     if isinstance(error, FileNotFoundError):

@@ -1,0 +1,405 @@
+"""One video of a batch: our command in a process of its own, and what it made, published."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+
+from colmap_av1.batch.inputs import Video
+from colmap_av1.batch.output import earlier_report, output_at, own_scratch, publish
+from colmap_av1.batch.rows import Row, row_of
+from colmap_av1.errors import ModelError, OptionError, VideoError
+from colmap_av1.options import MatchOptions
+from colmap_av1.options.fields import Options
+from colmap_av1.options.words import words_of
+from colmap_av1.util.digests import digest_if_there, digest_of
+from colmap_av1.util.failures import Failure, failure_of
+from colmap_av1.util.processes import bound
+from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
+
+THUMBNAIL = "thumbnail.jpg"
+_THUMBNAIL_WIDTH = 160
+_THUMBNAIL_TIME = 60.0  # seconds
+_IMAGES = "images"
+# What only a further run of the same command would use.
+_STAGES = ".stages"
+# Where a model may lie in the folder that is given for a video.
+_MODEL_FOLDERS = ("", "sparse/0", "0")
+_MODEL_FILES = ("cameras", "images", "points3D")
+# Columns of the row, and the fields of reports that they show.
+_FIGURES = {
+    "info": {"frames": "num_shown"},
+    "match": {"frames": "num_frames", "images": "num_images", "tracks": "num_tracks"},
+    "reconstruct": {
+        "frames": "num_frames",
+        "images": "num_images",
+        "registered": "num_registered",
+        "tracks": "num_tracks",
+        "points": "num_points",
+        "coverage": "coverage",
+    },
+    "densify": {
+        "images": "num_images",
+        "registered": "num_images",
+        "tracks": "num_tracks",
+        "points": "num_points",
+        "coverage": "coverage",
+    },
+}
+_WARNING = re.compile(r"^colmap-av1: warning: (.*)$", re.MULTILINE)
+_ERROR = re.compile(r"^colmap-av1: error: (.*)$", re.MULTILINE)
+_MOST_SAID = 1 << 16  # bytes of what a process printed last
+# Statuses of a process that the system or an operator has ended: by a signal, or in order after it.
+_SENT = (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGKILL", signal.SIGTERM))
+_ENDED = {*(-number for number in _SENT), *(128 + number for number in _SENT)}
+_END = 5.0  # seconds
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is done with each video of a batch.
+
+    Attributes:
+        task: name of the command.
+        options: its options.
+        output: absolute path, or URL, of the folder that gets a folder for each video.
+        models: the same of the folder with a model for each video, for `densify`.
+        scratch: absolute path of the folder for unfinished work, on whatever machine.
+        timeout: seconds after which an attempt is stopped; None: never.
+        retries: further attempts after a failure that may be gone.
+        stall: seconds without data after which reading a URL is given up.
+        write_images: write images beside the database of `match`.
+        version: version of this package, which results depend on.
+    """
+
+    task: str
+    options: Options
+    output: str
+    models: str | None
+    scratch: str
+    timeout: float | None
+    retries: int
+    stall: float
+    write_images: bool
+    version: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a video.
+
+    Attributes:
+        row: its row.
+        kept: an earlier run had finished it.
+        retried: attempts beyond the first.
+    """
+
+    row: Row
+    kept: bool = False
+    retried: int = 0
+
+
+class Processes:
+    """Runs processes, one for each thread that asks for one, and can stop them all."""
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = threading.Lock()
+        self.stopped = False
+
+    def run(self, words: list[str], folder: Path, log: Path, timeout: float | None) -> int | None:
+        """The exit status of our command, negative for a signal; None where it took too long."""
+        # Not the working folder, in which another version of the package may lie.
+        path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, sys.path)])
+        with log.open("wb") as said, self._lock:
+            if self.stopped:
+                return -signal.SIGTERM
+            process = subprocess.Popen(
+                bound([sys.executable, "-m", "colmap_av1", *words]),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                cwd=folder,
+                env={**os.environ, "PYTHONPATH": path},
+                # The interrupt of a terminal is for the driver, which ends the others in order.
+                start_new_session=True,
+            )
+            self._running.add(process)
+        try:
+            return process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            with self._lock:
+                self._running.discard(process)
+            _signal(process, "SIGKILL")
+            process.wait()
+
+    def stop(self) -> None:
+        """End all processes, in order if they heed that in time, and let no further one start."""
+        with self._lock:
+            self.stopped = True
+            running = list(self._running)
+        for process in running:
+            _signal(process, "SIGTERM")
+        end = time.monotonic() + _END
+        for process in running:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, end - time.monotonic()))
+            _signal(process, "SIGKILL")
+
+
+def _signal(process: subprocess.Popen[bytes], name: str) -> None:
+    """Send a signal to a process that runs, and to those that it has started."""
+    if process.poll() is not None:
+        return
+    with suppress(ProcessLookupError, PermissionError):
+        if os.name == "posix":
+            os.killpg(process.pid, signal.Signals[name])
+        else:
+            process.kill()
+
+
+class _FailedError(Exception):
+    """Our command has failed."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(failure.message)
+        self.failure = failure
+
+
+def process_video(work: Work, video: Video, threads: int, processes: Processes) -> Outcome:
+    """Do the task on a video, unless its folder in the output is of the same video and options.
+
+    Args:
+        work: the task.
+        video: the video.
+        threads: threads of the command where its options do not say.
+        processes: runs it.
+
+    Returns:
+        What became of it; whatever goes wrong is a row.
+    """
+    retried = 0
+    while True:
+        start = time.perf_counter()
+        try:
+            outcome = _attempt(work, video, threads, processes)
+            return dataclasses.replace(outcome, retried=retried)
+        except Exception as error:  # of one video: the others go on
+            failure = error.failure if isinstance(error, _FailedError) else failure_of(error)
+        if not failure.transient or retried >= work.retries or processes.stopped:
+            return Outcome(failed_row(video, failure, time.perf_counter() - start), False, retried)
+        retried += 1
+
+
+def failed_row(video: Video, failure: Failure, seconds: float = 0.0) -> Row:
+    """The row of a video that failed."""
+    message = without_secrets(failure.message)
+    address = without_secrets(video.address)
+    return Row(video.name, address, "failed", failure.reason, round(seconds, 3), error=message)
+
+
+def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Outcome:
+    start = time.perf_counter()
+    output = output_at(work.output)
+    source = version_of(video.address, work.stall)
+    models = _model_versions(work, video)
+    key = digest_of([source, [v for _, v in models], work.version, *_depends_on(work)])
+    earlier = earlier_report(output, video.name)
+    if earlier is not None and earlier.get("task") != work.task:
+        raise OptionError(f"{video.name}: is of another task: give another output")
+    if earlier is not None and earlier["key"] == key:
+        with suppress(ValueError):  # a damaged one is made again
+            row = dataclasses.replace(
+                row_of(earlier["row"]), name=video.name, input=without_secrets(video.address)
+            )
+            return Outcome(row, kept=True)
+    with own_scratch(work.scratch) as scratch:
+        folder, copies = scratch / "output", scratch / "input"
+        for new in (folder, copies):
+            new.mkdir()
+        path = fetch(video.address, copies, work.stall)
+        model = _fetch_model(models, copies, work.stall)
+        names = {str(path): video.address, str(copies): video.address, str(folder): video.name}
+        facts, warnings = _run(
+            work,
+            _words(work, path, model, folder, threads),
+            scratch,
+            processes,
+            names,
+        )
+        _write_thumbnail(path, folder)
+        shutil.rmtree(folder / _STAGES, ignore_errors=True)
+        report = facts["report"]
+        figures = {column: report[field] for column, field in _FIGURES[work.task].items()}
+        row = Row(
+            video.name,
+            without_secrets(video.address),
+            "done",
+            seconds=round(time.perf_counter() - start, 3),
+            cpu_seconds=round(facts["cpu_seconds"], 3),
+            video_seconds=facts["video_seconds"],
+            warnings=tuple(dict.fromkeys([*warnings, *report.get("reasons", ())])),
+            **figures,
+        )
+        record = {
+            "key": key,
+            "version": work.version,
+            "input": {"path": row.input, **source},
+            "task": work.task,
+            "options": dataclasses.asdict(work.options),  # type: ignore[call-overload]
+            "row": vars(row),
+            "report": report,
+        }
+        publish(output, folder, video.name, record)
+        return Outcome(row)
+
+
+def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: int) -> list[str]:
+    """The words of our command that does the task on a video, in a folder."""
+    words = [work.task, f"--video={video}", *words_of(work.options), "--quiet"]
+    if not any(word.startswith("--num_threads=") for word in words):
+        words.append(f"--num_threads={threads}")
+    if work.task == "match":
+        words.append(f"--database={folder / 'database.db'}")
+        if work.write_images:
+            words.append(f"--image_path={folder / _IMAGES}")
+    elif work.task == "reconstruct":
+        words.append(f"--output={folder}")
+    elif work.task == "densify":
+        words += [f"--model={model}", f"--output={folder / 'sparse' / '0'}"]
+    return words
+
+
+def _run(
+    work: Work,
+    words: list[str],
+    scratch: Path,
+    processes: Processes,
+    names: dict[str, str],
+) -> tuple[dict[str, Any], list[str]]:
+    """Run our command and read its report.
+
+    Args:
+        work: the task.
+        words: the command and its options.
+        scratch: the folder it is started in.
+        processes: runs it.
+        names: paths of unfinished work, and what they are called afterwards.
+
+    Returns:
+        What --report_json wrote, and the warnings.
+
+    Raises:
+        _FailedError: it failed.
+    """
+    log, written = scratch / "log", scratch / "report.json"
+    status = processes.run([*words, f"--report_json={written}"], scratch, log, work.timeout)
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - _MOST_SAID))
+        said = _renamed(file.read().decode("utf-8", "backslashreplace"), names)
+    facts: dict[str, Any] = {}
+    with suppress(OSError, ValueError):
+        facts = _renamed(json.loads(written.read_bytes()), names)
+    if status == 0 and "report" in facts:
+        return facts, _WARNING.findall(said)
+    if status is None:
+        text = f"stopped after {work.timeout:g} seconds: give a longer --timeout"
+        raise _FailedError(Failure("timeout", text, transient=True))
+    if status in _ENDED:
+        number = -status if status < 0 else status - 128
+        text = f"its process was ended by {signal.Signals(number).name}"
+        raise _FailedError(Failure("killed", text, transient=True))
+    if "failure" in facts:
+        raise _FailedError(Failure(**facts["failure"]))
+    if status < 0:
+        text = f"its process ended by signal {-status}: please report the video"
+        raise _FailedError(Failure("crashed", text))
+    errors = _ERROR.findall(said)
+    if errors:  # the report of it could not be written
+        raise _FailedError(Failure("reading or writing", errors[-1], transient=True))
+    last = said.strip().rpartition("\n")[2]
+    raise _FailedError(Failure("defect", last or f"its process ended with status {status}"))
+
+
+def _renamed(value: Any, names: dict[str, str]) -> Any:
+    """Texts with the names of things in place of paths of unfinished work."""
+    if isinstance(value, dict):
+        return {key: _renamed(item, names) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_renamed(item, names) for item in value]
+    if isinstance(value, str):
+        for path, name in names.items():
+            value = value.replace(path, name)
+        return without_secrets(value)
+    return value
+
+
+def _depends_on(work: Work) -> list[object]:
+    """What the result depends on beside the video and the version."""
+    options = work.options
+    matching = options if isinstance(options, MatchOptions) else getattr(options, "match", None)
+    if not isinstance(matching, MatchOptions):
+        return [work.task, options, None, work.write_images]
+    files = [digest_if_there(path) for path in matching.files]
+    return [work.task, options, files, work.write_images]
+
+
+def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, object]]]:
+    """The files of the video's model and their versions; none where the task needs no model."""
+    if work.models is None:
+        return []
+    top = f"{work.models.rstrip('/')}/{video.name}"
+    for folder in _MODEL_FOLDERS:
+        for suffix in (".bin", ".txt"):
+            parts = (filter(None, (top, folder, f"{file}{suffix}")) for file in _MODEL_FILES)
+            files = ["/".join(part) for part in parts]
+            with suppress(VideoError):  # it has not this one
+                return [(file, version_of(file, work.stall)) for file in files]
+    raise ModelError(
+        f"{work.models}: has no model of '{video.name}': give a folder with cameras, images and "
+        f"points3D in {video.name}, {video.name}/sparse/0 or {video.name}/0"
+    )
+
+
+def _fetch_model(
+    models: list[tuple[str, dict[str, object]]], copies: Path, stall: float
+) -> Path | None:
+    if not models:
+        return None
+    if not is_url(models[0][0]):
+        return Path(models[0][0]).parent
+    model = copies / "model"
+    model.mkdir()
+    for address, _ in models:
+        fetch(address, model, stall).rename(model / address.rpartition("/")[2])
+    return model
+
+
+def _write_thumbnail(video: Path, folder: Path) -> None:
+    """Write a small picture, of the middle image or the start of the video, if there is any."""
+    images = sorted((folder / _IMAGES).glob("*"))
+    if images:  # its name may hold what stands for a number elsewhere
+        source = ["-f", "image2", "-pattern_type", "none", "-i", str(images[len(images) // 2])]
+    else:
+        source = ["-i", f"file:{video}"]
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", "-nostdin", "-threads", "1"]
+    shape = ["-frames:v", "1", "-vf", f"scale={_THUMBNAIL_WIDTH}:-2"]
+    with suppress(OSError, subprocess.TimeoutExpired):
+        command = [*ffmpeg, *source, *shape, str(folder / THUMBNAIL)]
+        subprocess.run(bound(command), check=False, timeout=_THUMBNAIL_TIME)
