@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
-from html import escape
+from html import unescape
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,10 +78,14 @@ def compared(video, truth, tmp_path_factory):
 
 def test_no_model_at_all_is_an_error(video, tmp_path, capsys):
     words = ["--frontends", "broken=no.h5:none.h5", "--every", "6", "--quiet"]
-    output = tmp_path / "report"
-    assert main(["compare", "--video", str(video), "--output", str(output), *words]) == 2
+    output, hostile = tmp_path / "report", tmp_path / "<script>.mp4"
+    shutil.copy(video, hostile)
+    assert main(["compare", "--video", str(hostile), "--output", str(output), *words]) == 2
     assert "no front-end gave a model" in capsys.readouterr().err.splitlines()[-1]
-    assert "no.h5: no such file" in (output / "report.html").read_text()
+    html = (output / "report.html").read_text()
+    assert "no.h5: no such file" in html
+    assert "&lt;script&gt;.mp4" in html
+    assert "<script>" not in html
 
 
 def run_again(video, output, truth, *frontends):
@@ -316,10 +320,8 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
         (column,) = compare(video, output, reference=truth, options=options).columns
         assert told in column.training_error
         assert column.model.num_registered == 8
-        assert (
-            escape(f"nothing rendered of av1: {column.training_error}")
-            in (output / "report.html").read_text()
-        )
+        page = unescape((output / "report.html").read_text())
+        assert f"nothing rendered of av1: {column.training_error}" in page
 
 
 def test_renderings_are_found_by_name_or_order(tmp_path):

@@ -6,7 +6,7 @@ import logging
 import os
 import socket
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 from colmap_av1.batch.inputs import Video
 from colmap_av1.batch.video import Outcome, Processes, Work, process_video
@@ -20,28 +20,6 @@ from colmap_av1.util.signals import handlers_kept
 EXTRA = "colmap-av1[cluster]"
 _MEMORY_OF_VIDEO = 4 << 30
 _ANSWERS = 10.0  # seconds in which something must answer at an address
-
-
-class Engine(Protocol):
-    """Runs videos, several at a time.
-
-    Attributes:
-        about: what it runs on, a line for the user.
-    """
-
-    about: str
-
-    def submit(self, video: Video) -> Future[Outcome]:
-        """Process a video as soon as there is room."""
-        ...
-
-    def failure(self, error: BaseException) -> Failure:
-        """Why a future has no outcome."""
-        ...
-
-    def close(self) -> None:
-        """Stop everything at once."""
-        ...
 
 
 class LocalEngine:
@@ -113,7 +91,7 @@ class RayEngine:
         dashboard = f", dashboard http://{context.dashboard_url}" if context.dashboard_url else ""
         self.about = f"Ray of {sum(nodes):.0f} cores{dashboard}"
         # Ray itself tries again where a node or its process is lost.
-        self._task = ray.remote(max_retries=work.retries)(_process_on_node)
+        self._task = ray.remote(max_retries=options.retries)(_process_on_node)
         self._work = ray.put(work)
         self._running: set[Any] = set()
 

@@ -8,9 +8,9 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from colmap_av1.batch.rows import json_text
 from colmap_av1.errors import OptionError, cannot_write
@@ -29,45 +29,123 @@ _SCRATCH = ".colmap-av1-"
 _LOCK = "lock"
 
 
-class Output(Protocol):
-    """Where a batch writes; paths are relative, with '/' between parts."""
+class Output:
+    """A folder of this machine, or one that it has mounted; paths in it have '/' between parts."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
 
     def read(self, path: str) -> bytes | None:
         """The content of a file; None if there is none."""
-        ...
+        try:
+            return (self._root / path).read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
 
     def write(self, path: str, content: bytes) -> None:
         """Write a file, whole or not at all."""
-        ...
+        target = self._root / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(target) as partial:
+            partial.write_bytes(content)
 
     def take(self, file: Path, path: str) -> None:
         """Move or copy a file of this machine here."""
-        ...
+        target = self._root / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            file.replace(target)
+        except OSError as error:
+            if error.errno != errno.EXDEV:  # the scratch is on another disk
+                raise
+            with whole_file(target) as partial:
+                shutil.copyfile(file, partial)
 
     def remove(self, path: str) -> None:
         """Remove a file."""
-        ...
+        (self._root / path).unlink(missing_ok=True)
 
     def files(self, folder: str) -> set[str]:
         """Paths of the files below a folder, relative to it."""
-        ...
+        top = self._root / folder
+        if top.exists() and not top.is_dir():
+            return {""}
+        return {path.relative_to(top).as_posix() for path in top.rglob("*") if not path.is_dir()}
 
     def names(self) -> list[str]:
         """Names at the top, sorted; none if there is no output yet."""
-        ...
+        return sorted(os.listdir(self._root)) if self._root.exists() else []
 
-    def opened(self, shard: str) -> AbstractContextManager[None]:
-        """Make the output if it is missing, and be alone with a shard.
+    @contextmanager
+    def opened(self, shard: str) -> Iterator[None]:
+        """Make the output if it is missing, and be alone with a shard of the videos.
 
         Raises:
             OptionError: it cannot be made, or another batch is at work on the shard.
         """
-        ...
+        lock = self._root / HIDDEN / f"{ROWS}{shard}.lock"
+        try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            lock.touch()
+        except OSError as error:
+            raise OptionError(cannot_write(self._root, error)) from error
+        with only_run(lock) as alone:
+            if not alone:
+                raise OptionError(
+                    f"{self._root}: another batch is at work in it: wait for its end, or give "
+                    "another output"
+                )
+            yield
+
+
+class StoreOutput(Output):
+    """A folder of an object store, whose files appear one by one, each of them whole."""
+
+    def __init__(self, address: str) -> None:
+        self._system, self._top = filesystem(address.rstrip("/"))
+
+    def read(self, path: str) -> bytes | None:
+        """The content of a file; None if there is none."""
+        with suppress(FileNotFoundError):
+            return bytes(self._system.cat_file(f"{self._top}/{path}"))
+        return None
+
+    def write(self, path: str, content: bytes) -> None:
+        """Write a file."""
+        self._system.pipe_file(f"{self._top}/{path}", content)
+
+    def take(self, file: Path, path: str) -> None:
+        """Copy a file of this machine here."""
+        self._system.put_file(str(file), f"{self._top}/{path}")
+
+    def remove(self, path: str) -> None:
+        """Remove a file."""
+        self._system.rm_file(f"{self._top}/{path}")
+
+    def files(self, folder: str) -> set[str]:
+        """Paths of the files below a folder, relative to it."""
+        top = f"{self._top}/{folder}"
+        with suppress(FileNotFoundError):
+            return {str(path).removeprefix(f"{top}/") for path in self._system.find(top)}
+        return set()
+
+    def names(self) -> list[str]:
+        """Names at the top, sorted; none if there is no output yet."""
+        with suppress(FileNotFoundError):
+            paths = self._system.ls(self._top, detail=False)
+            return sorted(str(path).rpartition("/")[2] for path in paths)
+        return []
+
+    @contextmanager
+    def opened(self, shard: str) -> Iterator[None]:
+        """Nothing: stores have no locks, and of two that write a file the later one wins."""
+        del shard
+        yield
 
 
 def output_at(address: str) -> Output:
     """The output at a path or URL."""
-    return _Store(address) if is_url(address) else _Folder(Path(address))
+    return StoreOutput(address) if is_url(address) else Output(Path(address))
 
 
 def publish(output: Output, folder: Path, name: str, report: dict[str, object]) -> None:
@@ -80,7 +158,8 @@ def publish(output: Output, folder: Path, name: str, report: dict[str, object]) 
         OptionError: no batch has made what is there, or a file of others is in the way.
         OSError: it cannot be written.
     """
-    sources = {p.relative_to(folder).as_posix(): p for p in files_below(folder)}
+    sources = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+    sources.pop(REPORT, None)  # the command's own, which `report` holds
     new = {*sources, REPORT}
     there = output.files(name)
     ours = _files_of_ours(output, name, there, new)
@@ -101,11 +180,6 @@ def earlier_report(output: Output, name: str) -> dict[str, Any] | None:
         return None
     is_ours = isinstance(report, dict) and "key" in report and "row" in report
     return report if is_ours else None
-
-
-def files_below(folder: Path) -> list[Path]:
-    """All files below a folder, sorted."""
-    return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
 def scratch_for(output: str, scratch: str | os.PathLike[str] | None) -> str:
@@ -144,105 +218,6 @@ def remove_unused_scratch(scratch: str | os.PathLike[str]) -> None:
             with suppress(OSError), only_run(folder / _LOCK) as unused:
                 if unused:
                     shutil.rmtree(folder, ignore_errors=True)
-
-
-class _Folder:
-    """A folder of this machine, or one that it has mounted."""
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-
-    def read(self, path: str) -> bytes | None:
-        try:
-            return (self._root / path).read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-
-    def write(self, path: str, content: bytes) -> None:
-        target = self._root / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(target) as partial:
-            partial.write_bytes(content)
-
-    def take(self, file: Path, path: str) -> None:
-        target = self._root / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            file.replace(target)
-        except OSError as error:
-            if error.errno != errno.EXDEV:  # the scratch is on another disk
-                raise
-            with whole_file(target) as partial:
-                shutil.copyfile(file, partial)
-
-    def remove(self, path: str) -> None:
-        (self._root / path).unlink(missing_ok=True)
-
-    def files(self, folder: str) -> set[str]:
-        top = self._root / folder
-        if top.exists() and not top.is_dir():
-            return {""}
-        return {path.relative_to(top).as_posix() for path in top.rglob("*") if not path.is_dir()}
-
-    def names(self) -> list[str]:
-        return sorted(os.listdir(self._root)) if self._root.exists() else []
-
-    @contextmanager
-    def opened(self, shard: str) -> Iterator[None]:
-        hidden = self._root / HIDDEN
-        try:
-            hidden.mkdir(parents=True, exist_ok=True)
-            lock = hidden / f"{ROWS}{shard}.lock"
-            lock.touch()
-        except OSError as error:
-            raise OptionError(cannot_write(self._root, error)) from error
-        with only_run(lock) as alone:
-            if not alone:
-                raise OptionError(
-                    f"{self._root}: another batch is at work in it: wait for its end, or give "
-                    "another output"
-                )
-            yield
-
-
-class _Store:
-    """A folder of an object store, whose files appear one by one, each of them whole."""
-
-    def __init__(self, address: str) -> None:
-        self._system, self._root = filesystem(address.rstrip("/"))
-
-    def read(self, path: str) -> bytes | None:
-        try:
-            content: bytes = self._system.cat_file(f"{self._root}/{path}")
-            return content
-        except FileNotFoundError:
-            return None
-
-    def write(self, path: str, content: bytes) -> None:
-        self._system.pipe_file(f"{self._root}/{path}", content)
-
-    def take(self, file: Path, path: str) -> None:
-        self._system.put_file(str(file), f"{self._root}/{path}")
-
-    def remove(self, path: str) -> None:
-        self._system.rm_file(f"{self._root}/{path}")
-
-    def files(self, folder: str) -> set[str]:
-        top = f"{self._root}/{folder}"
-        with suppress(FileNotFoundError):
-            return {str(path).removeprefix(f"{top}/") for path in self._system.find(top)}
-        return set()
-
-    def names(self) -> list[str]:
-        with suppress(FileNotFoundError):
-            paths = self._system.ls(self._root, detail=False)
-            return sorted(str(path).rpartition("/")[2] for path in paths)
-        return []
-
-    @contextmanager
-    def opened(self, shard: str) -> Iterator[None]:
-        del shard  # object stores have no locks; of two that write a file, the later one wins
-        yield
 
 
 def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) -> set[str]:

@@ -8,14 +8,14 @@ import os
 import queue
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from colmap_av1.batch.engines import Engine, LocalEngine, RayEngine
+from colmap_av1.batch.engines import LocalEngine, RayEngine
 from colmap_av1.batch.inputs import Video, list_videos
 from colmap_av1.batch.output import ROWS, Output, output_at, remove_unused_scratch, scratch_for
 from colmap_av1.batch.rows import Row, csv_of, json_of
@@ -134,7 +134,7 @@ def run_batch(
         _check_scratch(work.scratch)
         everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
         videos = everything[number - 1 :: count]
-        engine: Engine = (
+        engine = (
             LocalEngine(work, options, len(videos))
             if options.engine == "local"
             else RayEngine(work, options)
@@ -143,14 +143,21 @@ def run_batch(
         if hear is not None:
             hear(engine.about)
         watch = watch if watch is not None else _watch_nothing
-        table = _Table(into, shard, work, len(everything))
+        facts = {
+            "task": work.task,
+            "options": dataclasses.asdict(cast(Any, work.options)),
+            "version": work.version,
+            "videos": len(everything),
+        }
+        rows: dict[int, Row] = {}
+        next_time = 0.0
         counts = Counts(len(videos))
         watch(counts, None)
         cpu_seconds = video_seconds = 0.0
         try:
             for position, outcome in _outcomes(engine, videos):
                 row = outcome.row
-                table.rows[position] = row
+                rows[position] = row
                 counts.retried += outcome.retried
                 counts.kept += outcome.kept
                 if row.state == "failed":
@@ -161,12 +168,17 @@ def run_batch(
                     cpu_seconds += row.cpu_seconds or 0.0
                     video_seconds += row.video_seconds or 0.0
                 watch(counts, row)
-                table.write_in_time()
+                before = time.monotonic()
+                if before >= next_time:
+                    with suppress(OptionError):
+                        _write_rows(into, shard, rows, facts)
+                    after = time.monotonic()
+                    next_time = after + max(_WRITE_EVERY, (after - before) / _WRITE_SHARE)
         except BaseException:
             with suppress(OptionError):
-                table.write()
+                _write_rows(into, shard, rows, facts)
             raise
-        table.write()
+        _write_rows(into, shard, rows, facts)
     repeated = f"{num_repeated} of the inputs are there twice and count once"
     return BatchReport(
         output=without_secrets(place),
@@ -219,7 +231,9 @@ def _check_scratch(scratch: str) -> None:
     remove_unused_scratch(scratch)
 
 
-def _outcomes(engine: Engine, videos: Sequence[Video]) -> Iterator[tuple[int, Outcome]]:
+def _outcomes(
+    engine: LocalEngine | RayEngine, videos: Sequence[Video]
+) -> Iterator[tuple[int, Outcome]]:
     """The outcomes of all videos as they come, with their positions."""
     ended: queue.SimpleQueue[Future[Outcome]] = queue.SimpleQueue()
     positions: dict[Future[Outcome], int] = {}
@@ -243,44 +257,22 @@ def _next(ended: queue.SimpleQueue[Future[Outcome]]) -> Future[Outcome]:
             return ended.get(timeout=_WAIT)  # without a time, Windows takes no interrupt
 
 
-class _Table:
-    """The files of rows in the output, written again as rows come."""
+def _write_rows(
+    output: Output, shard: str, rows: Mapping[int, Row], facts: Mapping[str, object]
+) -> None:
+    """Write the rows so far, in the order of the videos.
 
-    def __init__(self, output: Output, shard: str, work: Work, num_videos: int) -> None:
-        self._output, self._shard = output, shard
-        self._facts = {
-            "task": work.task,
-            "options": dataclasses.asdict(cast(Any, work.options)),
-            "version": work.version,
-            "videos": num_videos,
-        }
-        self._next = 0.0
-        self.rows: dict[int, Row] = {}
-
-    def write_in_time(self) -> None:
-        """Write the rows so far, unless that was done a short while ago, if that is possible."""
-        if time.monotonic() >= self._next:
-            with suppress(OptionError):
-                self.write()
-
-    def write(self) -> None:
-        """Write the rows so far.
-
-        Raises:
-            OptionError: they cannot be written.
-        """
-        start = time.monotonic()
-        rows = [row for _, row in sorted(self.rows.items())]
-        name = f"{ROWS}{self._shard}"
-        try:
-            self._output.write(f"{name}.csv", csv_of(rows))
-            self._output.write(f"{name}.json", json_of(rows, self._facts))
-        except OSError as error:
-            path = Path(os.fsdecode(error.filename or f"{name}.csv"))
-            raise OptionError(cannot_write(path, error)) from error
-        finally:
-            end = time.monotonic()
-            self._next = end + max(_WRITE_EVERY, (end - start) / _WRITE_SHARE)
+    Raises:
+        OptionError: they cannot be written.
+    """
+    ordered = [row for _, row in sorted(rows.items())]
+    name = f"{ROWS}{shard}"
+    try:
+        output.write(f"{name}.csv", csv_of(ordered))
+        output.write(f"{name}.json", json_of(ordered, facts))
+    except OSError as error:
+        path = Path(os.fsdecode(error.filename or f"{name}.csv"))
+        raise OptionError(cannot_write(path, error)) from error
 
 
 def _work_of(task: Options, output: str, models: str | None, options: BatchOptions) -> Work:
@@ -301,10 +293,7 @@ def _work_of(task: Options, output: str, models: str | None, options: BatchOptio
         output=output,
         models=None if models is None else absolute(models),
         scratch=scratch_for(output, options.scratch),
-        timeout=options.timeout,
-        retries=options.retries,
-        stall=options.stall,
-        write_images=options.write_images,
+        batch=options,
         version=package_version(),
     )
 

@@ -23,11 +23,12 @@ from colmap_av1.batch.inputs import Video
 from colmap_av1.batch.output import earlier_report, output_at, own_scratch, publish
 from colmap_av1.batch.rows import Row, row_of
 from colmap_av1.errors import ModelError, OptionError, VideoError
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import BatchOptions, MatchOptions
 from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.util.digests import digest_if_there, digest_of
 from colmap_av1.util.failures import Failure, failure_of
+from colmap_av1.util.plain import plain
 from colmap_av1.util.processes import bound
 from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
 
@@ -42,23 +43,12 @@ _MODEL_FOLDERS = ("", "sparse/0", "0")
 _MODEL_FILES = ("cameras", "images", "points3D")
 # Columns of the row, and the fields of reports that they show.
 _FIGURES = {
-    "info": {"frames": "num_shown"},
-    "match": {"frames": "num_frames", "images": "num_images", "tracks": "num_tracks"},
-    "reconstruct": {
-        "frames": "num_frames",
-        "images": "num_images",
-        "registered": "num_registered",
-        "tracks": "num_tracks",
-        "points": "num_points",
-        "coverage": "coverage",
-    },
-    "densify": {
-        "images": "num_images",
-        "registered": "num_images",
-        "tracks": "num_tracks",
-        "points": "num_points",
-        "coverage": "coverage",
-    },
+    "frames": "num_frames",
+    "images": "num_images",
+    "registered": "num_registered",
+    "tracks": "num_tracks",
+    "points": "num_points",
+    "coverage": "coverage",
 }
 _WARNING = re.compile(r"^colmap-av1: warning: (.*)$", re.MULTILINE)
 _ERROR = re.compile(r"^colmap-av1: error: (.*)$", re.MULTILINE)
@@ -79,10 +69,7 @@ class Work:
         output: absolute path, or URL, of the folder that gets a folder for each video.
         models: the same of the folder with a model for each video, for `densify`.
         scratch: absolute path of the folder for unfinished work, on whatever machine.
-        timeout: seconds after which an attempt is stopped; None: never.
-        retries: further attempts after a failure that may be gone.
-        stall: seconds without data after which reading a URL is given up.
-        write_images: write images beside the database of `match`.
+        batch: how it is done.
         version: version of this package, which results depend on.
     """
 
@@ -91,10 +78,7 @@ class Work:
     output: str
     models: str | None
     scratch: str
-    timeout: float | None
-    retries: int
-    stall: float
-    write_images: bool
+    batch: BatchOptions
     version: str
 
 
@@ -202,7 +186,7 @@ def process_video(work: Work, video: Video, threads: int, processes: Processes) 
             return dataclasses.replace(outcome, retried=retried)
         except Exception as error:  # of one video: the others go on
             failure = error.failure if isinstance(error, _FailedError) else failure_of(error)
-        if not failure.transient or retried >= work.retries or processes.stopped:
+        if not failure.transient or retried >= work.batch.retries or processes.stopped:
             return Outcome(failed_row(video, failure, time.perf_counter() - start), False, retried)
         retried += 1
 
@@ -217,7 +201,7 @@ def failed_row(video: Video, failure: Failure, seconds: float = 0.0) -> Row:
 def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Outcome:
     start = time.perf_counter()
     output = output_at(work.output)
-    source = version_of(video.address, work.stall)
+    source = version_of(video.address, work.batch.stall)
     models = _model_versions(work, video)
     key = digest_of([source, [v for _, v in models], work.version, *_depends_on(work)])
     earlier = earlier_report(output, video.name)
@@ -233,8 +217,8 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
         folder, copies = scratch / "output", scratch / "input"
         for new in (folder, copies):
             new.mkdir()
-        path = fetch(video.address, copies, work.stall)
-        model = _fetch_model(models, copies, work.stall)
+        path = fetch(video.address, copies, work.batch.stall)
+        model = _fetch_model(models, copies, work.batch.stall)
         names = {str(path): video.address, str(copies): video.address, str(folder): video.name}
         facts, warnings = _run(
             work,
@@ -246,7 +230,9 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
         _write_thumbnail(path, folder)
         shutil.rmtree(folder / _STAGES, ignore_errors=True)
         report = facts["report"]
-        figures = {column: report[field] for column, field in _FIGURES[work.task].items()}
+        figures = {column: report.get(field) for column, field in _FIGURES.items()}
+        if work.task == "info":
+            figures["frames"] = report["num_shown"]
         row = Row(
             video.name,
             without_secrets(video.address),
@@ -277,7 +263,7 @@ def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: i
         words.append(f"--num_threads={threads}")
     if work.task == "match":
         words.append(f"--database={folder / 'database.db'}")
-        if work.write_images:
+        if work.batch.write_images:
             words.append(f"--image_path={folder / _IMAGES}")
     elif work.task == "reconstruct":
         words.append(f"--output={folder}")
@@ -308,18 +294,24 @@ def _run(
     Raises:
         _FailedError: it failed.
     """
+
+    def renamed(text: str) -> str:
+        for path, name in names.items():
+            text = text.replace(path, name)
+        return without_secrets(text)
+
     log, written = scratch / "log", scratch / "report.json"
-    status = processes.run([*words, f"--report_json={written}"], scratch, log, work.timeout)
+    status = processes.run([*words, f"--report_json={written}"], scratch, log, work.batch.timeout)
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _MOST_SAID))
-        said = _renamed(file.read().decode("utf-8", "backslashreplace"), names)
-    facts: dict[str, Any] = {}
+        said = renamed(file.read().decode("utf-8", "backslashreplace"))
+    facts: Any = {}
     with suppress(OSError, ValueError):
-        facts = _renamed(json.loads(written.read_bytes()), names)
+        facts = plain(json.loads(written.read_bytes()), renamed)
     if status == 0 and "report" in facts:
         return facts, _WARNING.findall(said)
     if status is None:
-        text = f"stopped after {work.timeout:g} seconds: give a longer --timeout"
+        text = f"stopped after {work.batch.timeout:g} seconds: give a longer --timeout"
         raise _FailedError(Failure("timeout", text, transient=True))
     if status in _ENDED:
         number = -status if status < 0 else status - 128
@@ -337,27 +329,14 @@ def _run(
     raise _FailedError(Failure("defect", last or f"its process ended with status {status}"))
 
 
-def _renamed(value: Any, names: dict[str, str]) -> Any:
-    """Texts with the names of things in place of paths of unfinished work."""
-    if isinstance(value, dict):
-        return {key: _renamed(item, names) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_renamed(item, names) for item in value]
-    if isinstance(value, str):
-        for path, name in names.items():
-            value = value.replace(path, name)
-        return without_secrets(value)
-    return value
-
-
 def _depends_on(work: Work) -> list[object]:
     """What the result depends on beside the video and the version."""
     options = work.options
     matching = options if isinstance(options, MatchOptions) else getattr(options, "match", None)
     if not isinstance(matching, MatchOptions):
-        return [work.task, options, None, work.write_images]
+        return [work.task, options, None, work.batch.write_images]
     files = [digest_if_there(path) for path in matching.files]
-    return [work.task, options, files, work.write_images]
+    return [work.task, options, files, work.batch.write_images]
 
 
 def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, object]]]:
@@ -370,7 +349,7 @@ def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, objec
             parts = (filter(None, (top, folder, f"{file}{suffix}")) for file in _MODEL_FILES)
             files = ["/".join(part) for part in parts]
             with suppress(VideoError):  # it has not this one
-                return [(file, version_of(file, work.stall)) for file in files]
+                return [(file, version_of(file, work.batch.stall)) for file in files]
     raise ModelError(
         f"{work.models}: has no model of '{video.name}': give a folder with cameras, images and "
         f"points3D in {video.name}, {video.name}/sparse/0 or {video.name}/0"

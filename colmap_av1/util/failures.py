@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -18,26 +17,13 @@ from colmap_av1.errors import (
     VideoError,
 )
 
-# Failures of the system that may be gone at the next attempt.
-_TRANSIENT = frozenset(
-    {
-        errno.EAGAIN,
-        errno.ECONNABORTED,
-        errno.ECONNREFUSED,
-        errno.ECONNRESET,
-        errno.EDQUOT,
-        errno.EHOSTUNREACH,
-        errno.EIO,
-        errno.EMFILE,
-        errno.ENETUNREACH,
-        errno.ENFILE,
-        errno.ENOMEM,
-        errno.ENOSPC,
-        errno.ENOTCONN,
-        errno.EPIPE,
-        errno.ESTALE,
-        errno.ETIMEDOUT,
-    }
+# Failures of the system that will be there at the next attempt, too.
+_PERMANENT = (
+    FileExistsError,
+    FileNotFoundError,
+    IsADirectoryError,
+    NotADirectoryError,
+    PermissionError,
 )
 # Failures that the video or the options cause; the first that fits.
 _REASONS: tuple[tuple[type[Exception], str], ...] = (
@@ -82,7 +68,7 @@ def failure_of(error: BaseException) -> Failure:
 def _is_transient(error: BaseException) -> bool:
     if isinstance(error, sqlite3.OperationalError):
         return "full" in str(error) or "I/O" in str(error)
-    return isinstance(error, OSError) and error.errno in _TRANSIENT
+    return isinstance(error, OSError) and not isinstance(error, _PERMANENT)
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

@@ -82,7 +82,7 @@ def test_a_page(tmp_path: Path) -> None:
     assert [link.partition(",")[0] for link in page.links] == ["data:image/jpeg;base64"]
     assert not re.search(r"https?:|url\(|@import", text)
     assert "5 done, 2 failed" in text
-    assert "at 1.7 CPU hours for 1,000 of them" in text  # 30 s for 5 minutes
+    assert "1.7 CPU hours per 1,000 minutes" in text  # 30 s for 5 minutes
     assert page.tables["failures"][1:] == [
         ["damaged", "1", "<script>alert(1)</script>"],
         ["killed", "1", "its process was ended by SIGKILL"],

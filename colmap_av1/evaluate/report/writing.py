@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import html
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -39,29 +36,8 @@ from colmap_av1.evaluate.report.tables import (
 )
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import whole_file
-
-_CSS = """
-body { font: 15px/1.5 system-ui, "Helvetica Neue", Arial, sans-serif; color: #1f2937;
-  max-width: 1120px; margin: 2.5em auto; padding: 0 1.5em; }
-h1 { font-size: 1.6em; margin: 0 0 .2em; }
-h2 { font-size: 1.15em; margin: 2.2em 0 .5em; border-bottom: 1px solid #e5e7eb; }
-p.about { color: #4b5563; margin: .3em 0 1em; }
-table { border-collapse: collapse; font-size: 13px; margin: .6em 0; }
-th { text-align: right; font-weight: 600; border-bottom: 2px solid #9ca3af; padding: .3em .7em;
-  vertical-align: bottom; }
-td { text-align: right; border-bottom: 1px solid #e5e7eb; padding: .3em .7em;
-  font-variant-numeric: tabular-nums; white-space: nowrap; }
-table.cost td:last-child, table.cost th:last-child { text-align: left; white-space: normal; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-.clouds { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 14px; }
-.clouds.upright { grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); }
-figure { margin: 0; }
-figcaption { font-size: 13px; margin: .25em 0 .6em; }
-figure img, .chart { width: 100%; display: block; }
-figure img { border-radius: 3px; }
-ul.notes { padding-left: 1.2em; }
-footer { color: #6b7280; font-size: 12px; margin-top: 3em; }
-"""
+from colmap_av1.util.pages import render_page
+from colmap_av1.util.plain import plain
 
 
 @dataclass(frozen=True)
@@ -108,7 +84,7 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     on_the_way = milestones_table(report.columns)
     if on_the_way is not None:
         tables["milestones"] = on_the_way
-    _write(report.output / "report.html", _html(report, tables, figures).encode())
+    _write(report.output / "report.html", _html(report, tables, figures).encode("utf-8", "replace"))
     _write(report.output / "results.json", _json(report).encode())
 
 
@@ -118,24 +94,12 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _json(report: CompareReport) -> str:
-    def plain(value: Any) -> Any:
-        """Values as JSON holds them, which has neither paths nor NaN."""
-        if isinstance(value, dict):
-            return {str(k): plain(v) for k, v in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(v) for v in value]
-        if isinstance(value, np.ndarray):
-            return plain(value.tolist())
-        if isinstance(value, float) and not math.isfinite(value):
-            return None
-        return str(value) if isinstance(value, Path) else value
-
-    facts = plain(dataclasses.asdict(report))
+    facts = dataclasses.asdict(report)
     for column, result in zip(report.columns, facts["columns"], strict=True):
         if column.cloud is not None:
             result["cloud"]["chamfer"] = column.cloud.chamfer
     facts["versions"] = _versions()
-    return json.dumps(facts, indent=1) + "\n"
+    return json.dumps(plain(facts), indent=1) + "\n"
 
 
 def _versions() -> dict[str, str]:
@@ -241,57 +205,18 @@ def _notes(report: CompareReport) -> list[str]:
 def _html(
     report: CompareReport, tables: Mapping[str, Table], figures: Mapping[str, list[_Figure]]
 ) -> str:
-    def table(kind: str) -> str:
-        one = tables[kind]
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in one.header)
-        rows = "".join(
-            f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>"
-            for row in one.rows
-        )
-        about = f'<p class="about">{html.escape(one.about)}</p>' if one.about else ""
-        return (
-            f"<h2>{html.escape(one.title)}</h2><table class='{kind}'><thead><tr>{head}</tr></thead>"
-            f"<tbody>{rows}</tbody></table>{about}"
-        )
-
-    def chart(figure: _Figure) -> str:
-        return f'<img class="chart" alt="{html.escape(figure.caption)}" src="{figure.uri}">'
-
-    def grid(kind: str) -> str:
-        each = "".join(
-            f'<figure><img alt="{html.escape(f.caption)}" src="{f.uri}">'
-            f"<figcaption>{html.escape(f.caption)}</figcaption></figure>"
-            for f in (*figures["clouds"], *figures["crops"])
-            if f.name.endswith(f"_{kind}.png")
-        )
-        upright = " upright" if kind == "view" and report.size[1] > report.size[0] else ""
-        return f'<div class="clouds{upright}">{each}</div>'
-
-    renderings = ""
-    if "renderings" in tables:
-        renderings = table("renderings")
-        renderings += table("milestones") if "milestones" in tables else ""
-        renderings += "".join(map(chart, figures.get("training", []))) + grid("crop")
-    title = html.escape(f"Front-ends compared on {report.video.name}")
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in _notes(report))
-    versions = ", ".join(f"{name} {number}" for name, number in _versions().items())
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{_CSS}</style></head><body>"
-        f'<h1>{title}</h1><p class="about">{html.escape(_facts(report))}</p>'
-        + (f'<ul class="notes">{notes}</ul>' if notes else "")
-        + table("models")
-        + chart(figures["bars"][0])
-        + "<h2>Clouds from one viewpoint</h2>"
-        + '<p class="about">Behind and above the middle camera; below, from above. Red: the '
-        + "camera's path.</p>"
-        + grid("view")
-        + grid("plan")
-        + renderings
-        + table("lengths")
-        + chart(figures["lengths"][0])
-        + table("cost")
-        + chart(figures["cost"][0])
-        + f"<footer>{html.escape(versions)}</footer></body></html>\n"
+    pictures = [*figures["clouds"], *figures["crops"]]
+    return render_page(
+        "compare.html",
+        video=report.video.name,
+        facts=_facts(report),
+        notes=_notes(report),
+        tables=tables,
+        charts=figures,
+        grids={
+            kind: [figure for figure in pictures if figure.name.endswith(f"_{kind}.png")]
+            for kind in ("view", "plan", "crop")
+        },
+        is_upright=report.size[1] > report.size[0],
+        versions=_versions(),
     )
