@@ -8,8 +8,9 @@ import socket
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from colmap_av1.batch.command import Processes
 from colmap_av1.batch.inputs import Video
-from colmap_av1.batch.video import Outcome, Processes, Work, process_video
+from colmap_av1.batch.video import Outcome, Work, process_video
 from colmap_av1.errors import OptionError
 from colmap_av1.options import BatchOptions
 from colmap_av1.util.cpus import threads_or_cpus

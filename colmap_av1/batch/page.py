@@ -7,7 +7,6 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,21 +50,6 @@ _COLUMNS = {
 _NUM_BARS = 24
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A cell of a table.
-
-    Attributes:
-        text: what it shows.
-        key: what it is sorted by; empty where nothing is known.
-        is_text: it holds words, not a number.
-    """
-
-    text: str
-    key: str
-    is_text: bool
-
-
 def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) -> str:
     """Write `report.html` into the output of a batch: it needs no other file and no network.
 
@@ -105,7 +89,8 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
         failures=[(reason, count, first[reason]) for reason, count in reasons.most_common()],
         quantiles=list(_QUANTILES.values()),
         spreads=_spreads(done),
-        heads=[(_COLUMNS[name], name not in _NUMBERS) for name in columns],
+        titles=[_COLUMNS[name] for name in columns],
+        are_texts=[name not in _NUMBERS for name in columns],
         rows=[
             (row, _thumbnail(row, into), [_cell(row, name) for name in columns]) for row in shown
         ],
@@ -155,12 +140,13 @@ def _spreads(rows: Sequence[Row]) -> list[Mapping[str, object]]:
     return spreads
 
 
-def _cell(row: Row, name: str) -> Cell:
+def _cell(row: Row, name: str) -> tuple[str, object]:
+    """What a cell shows, and what it is sorted by."""
     value: object = getattr(row, name)
     if isinstance(value, (int, float)):
-        return Cell(_number(name, value), str(value), is_text=False)
+        return _number(name, value), value
     text = "; ".join(value) if isinstance(value, tuple) else str(value or "")
-    return Cell(text, text, is_text=name not in _NUMBERS)
+    return text, text
 
 
 def _is_known(row: Row, name: str) -> bool:

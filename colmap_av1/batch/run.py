@@ -211,7 +211,7 @@ def _refuse_another_task(output: Output, place: str, task: str) -> None:
         with suppress(ValueError, RecursionError):  # a damaged one is written again
             found = json.loads(output.read(name) or b"")
         earlier = found.get("task") if isinstance(found, dict) else None
-        if earlier in TASK_OPTIONS and earlier != task:
+        if isinstance(earlier, str) and earlier in TASK_OPTIONS and earlier != task:
             raise OptionError(
                 f"{without_secrets(place)}: holds a batch of the task {earlier}: give another "
                 "output"

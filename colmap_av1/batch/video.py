@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-import re
 import shutil
-import signal
 import subprocess
-import sys
-import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import imageio_ffmpeg
 
+from colmap_av1.batch.command import CommandFailedError, Processes, run_command
 from colmap_av1.batch.inputs import Video
 from colmap_av1.batch.output import earlier_report, output_at, own_scratch, publish
 from colmap_av1.batch.rows import Row, row_of
@@ -28,7 +22,6 @@ from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.util.digests import digest_if_there, digest_of
 from colmap_av1.util.failures import Failure, failure_of
-from colmap_av1.util.plain import plain
 from colmap_av1.util.processes import bound
 from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
 
@@ -50,13 +43,6 @@ _FIGURES = {
     "points": "num_points",
     "coverage": "coverage",
 }
-_WARNING = re.compile(r"^colmap-av1: warning: (.*)$", re.MULTILINE)
-_ERROR = re.compile(r"^colmap-av1: error: (.*)$", re.MULTILINE)
-_MOST_SAID = 1 << 16  # bytes of what a process printed last
-# Statuses of a process that the system or an operator has ended: by a signal, or in order after it.
-_SENT = (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGKILL", signal.SIGTERM))
-_ENDED = {*(-number for number in _SENT), *(128 + number for number in _SENT)}
-_END = 5.0  # seconds
 
 
 @dataclass(frozen=True)
@@ -97,75 +83,6 @@ class Outcome:
     retried: int = 0
 
 
-class Processes:
-    """Runs processes, one for each thread that asks for one, and can stop them all."""
-
-    def __init__(self) -> None:
-        self._running: set[subprocess.Popen[bytes]] = set()
-        self._lock = threading.Lock()
-        self.stopped = False
-
-    def run(self, words: list[str], folder: Path, log: Path, timeout: float | None) -> int | None:
-        """The exit status of our command, negative for a signal; None where it took too long."""
-        # Not the working folder, in which another version of the package may lie.
-        path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, sys.path)])
-        with log.open("wb") as said, self._lock:
-            if self.stopped:
-                return -signal.SIGTERM
-            process = subprocess.Popen(
-                bound([sys.executable, "-m", "colmap_av1", *words]),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=said,
-                cwd=folder,
-                env={**os.environ, "PYTHONPATH": path},
-                # The interrupt of a terminal is for the driver, which ends the others in order.
-                start_new_session=True,
-            )
-            self._running.add(process)
-        try:
-            return process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            return None
-        finally:
-            with self._lock:
-                self._running.discard(process)
-            _signal(process, "SIGKILL")
-            process.wait()
-
-    def stop(self) -> None:
-        """End all processes, in order if they heed that in time, and let no further one start."""
-        with self._lock:
-            self.stopped = True
-            running = list(self._running)
-        for process in running:
-            _signal(process, "SIGTERM")
-        end = time.monotonic() + _END
-        for process in running:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(max(0.0, end - time.monotonic()))
-            _signal(process, "SIGKILL")
-
-
-def _signal(process: subprocess.Popen[bytes], name: str) -> None:
-    """Send a signal to a process that runs, and to those that it has started."""
-    if process.poll() is not None:
-        return
-    with suppress(ProcessLookupError, PermissionError):
-        if os.name == "posix":
-            os.killpg(process.pid, signal.Signals[name])
-        else:
-            process.kill()
-
-
-class _FailedError(Exception):
-    """Our command has failed."""
-
-    def __init__(self, failure: Failure) -> None:
-        super().__init__(failure.message)
-        self.failure = failure
-
-
 def process_video(work: Work, video: Video, threads: int, processes: Processes) -> Outcome:
     """Do the task on a video, unless its folder in the output is of the same video and options.
 
@@ -185,7 +102,7 @@ def process_video(work: Work, video: Video, threads: int, processes: Processes) 
             outcome = _attempt(work, video, threads, processes)
             return dataclasses.replace(outcome, retried=retried)
         except Exception as error:  # of one video: the others go on
-            failure = error.failure if isinstance(error, _FailedError) else failure_of(error)
+            failure = error.failure if isinstance(error, CommandFailedError) else failure_of(error)
         if not failure.transient or retried >= work.batch.retries or processes.stopped:
             return Outcome(failed_row(video, failure, time.perf_counter() - start), False, retried)
         retried += 1
@@ -220,13 +137,8 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
         path = fetch(video.address, copies, work.batch.stall)
         model = _fetch_model(models, copies, work.batch.stall)
         names = {str(path): video.address, str(copies): video.address, str(folder): video.name}
-        facts, warnings = _run(
-            work,
-            _words(work, path, model, folder, threads),
-            scratch,
-            processes,
-            names,
-        )
+        words = _words(work, path, model, folder, threads)
+        facts, warnings = run_command(words, scratch, names, work.batch.timeout, processes)
         _write_thumbnail(path, folder)
         shutil.rmtree(folder / _STAGES, ignore_errors=True)
         report = facts["report"]
@@ -270,63 +182,6 @@ def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: i
     elif work.task == "densify":
         words += [f"--model={model}", f"--output={folder / 'sparse' / '0'}"]
     return words
-
-
-def _run(
-    work: Work,
-    words: list[str],
-    scratch: Path,
-    processes: Processes,
-    names: dict[str, str],
-) -> tuple[dict[str, Any], list[str]]:
-    """Run our command and read its report.
-
-    Args:
-        work: the task.
-        words: the command and its options.
-        scratch: the folder it is started in.
-        processes: runs it.
-        names: paths of unfinished work, and what they are called afterwards.
-
-    Returns:
-        What --report_json wrote, and the warnings.
-
-    Raises:
-        _FailedError: it failed.
-    """
-
-    def renamed(text: str) -> str:
-        for path, name in names.items():
-            text = text.replace(path, name)
-        return without_secrets(text)
-
-    log, written = scratch / "log", scratch / "report.json"
-    status = processes.run([*words, f"--report_json={written}"], scratch, log, work.batch.timeout)
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - _MOST_SAID))
-        said = renamed(file.read().decode("utf-8", "backslashreplace"))
-    facts: Any = {}
-    with suppress(OSError, ValueError):
-        facts = plain(json.loads(written.read_bytes()), renamed)
-    if status == 0 and "report" in facts:
-        return facts, _WARNING.findall(said)
-    if status is None:
-        text = f"stopped after {work.batch.timeout:g} seconds: give a longer --timeout"
-        raise _FailedError(Failure("timeout", text, transient=True))
-    if status in _ENDED:
-        number = -status if status < 0 else status - 128
-        text = f"its process was ended by {signal.Signals(number).name}"
-        raise _FailedError(Failure("killed", text, transient=True))
-    if "failure" in facts:
-        raise _FailedError(Failure(**facts["failure"]))
-    if status < 0:
-        text = f"its process ended by signal {-status}: please report the video"
-        raise _FailedError(Failure("crashed", text))
-    errors = _ERROR.findall(said)
-    if errors:  # the report of it could not be written
-        raise _FailedError(Failure("reading or writing", errors[-1], transient=True))
-    last = said.strip().rpartition("\n")[2]
-    raise _FailedError(Failure("defect", last or f"its process ended with status {status}"))
 
 
 def _depends_on(work: Work) -> list[object]:
