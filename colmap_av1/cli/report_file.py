@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.util.cpus import cpu_seconds
-from colmap_av1.util.failures import failure_of
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.plain import plain
-from colmap_av1.video.container import read_file
 
 
 def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
     """Write the report of a command on videos, if it is wanted."""
     if namespace.report_json is None:
         return
+    from colmap_av1.video.container import read_file  # noqa: PLC0415 - few commands need it
+
     given = namespace.video
     durations = [read_file(video).duration for video in (given if type(given) is list else [given])]
     known = [duration for duration in durations if duration is not None]
@@ -40,6 +40,8 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
     except Exception as error:
         path = getattr(namespace, "report_json", None)
         if path is not None:
+            from colmap_av1.util.failures import failure_of  # noqa: PLC0415
+
             failure = dataclasses.asdict(failure_of(error))
             with suppress(OSError):  # the error itself is reported in any case
                 _write(path, {"failure": failure, "cpu_seconds": cpu_seconds()})

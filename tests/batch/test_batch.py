@@ -6,14 +6,15 @@ import json
 import os
 import shutil
 import sqlite3
+import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from batch_output import files_of, rows_of
 from conftest import PROJECT
 
+import colmap_av1
 from colmap_av1 import (
     BatchOptions,
     DensifyOptions,
@@ -31,6 +32,8 @@ from colmap_av1.batch.output import own_scratch, remove_unused_scratch
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
 
+# The folder that the package under test is installed in.
+PACKAGES = Path(colmap_av1.__file__).parents[1]
 ONCE = BatchOptions(retries=0)
 SMALL = MatchOptions(images=ImageOptions(image_name="%03d.jpg"))
 DONE = ["a/clip0", "a/clip2", "a/clip4", "b/clip1", "b/clip3", "b/clip5"]
@@ -87,10 +90,22 @@ def test_a_second_run_does_what_has_changed(clips: Path, tmp_path: Path) -> None
 
 
 def test_shards_share_an_output(clips: Path, tmp_path: Path) -> None:
+    """Two at once, as in an array of jobs."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run_batch(clips / "a", whole, ReadOptions(), options=ONCE)
-    for i in (1, 2):
-        run_batch(clips / "a", parts, ReadOptions(), options=replace(ONCE, shard=f"{i}/2"))
+    command = [sys.executable, "-m", "colmap_av1", "batch", "--task", "info", "--quiet"]
+    command += ["--inputs", str(clips / "a"), "--output", str(parts)]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGES), *sys.path])}
+    shards = [
+        subprocess.Popen(
+            [*command, "--shard", f"{i}/2"],
+            stderr=subprocess.DEVNULL,
+            env=env,
+            cwd=tmp_path,
+        )
+        for i in (1, 2)
+    ]
+    assert sorted(shard.wait() for shard in shards) == [0, 1]  # one has the damaged video
     assert files_of(parts) == files_of(whole)
     rows = [rows_of(parts, f"batch-{i}-of-2.csv") for i in (1, 2)]
     assert [rows[i % 2][i // 2] for i in range(4)] == rows_of(whole)
