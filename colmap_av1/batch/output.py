@@ -24,9 +24,6 @@ HIDDEN = ".batch"
 ROWS, PAGE = "batch", "report.html"
 # Lists our files in the folder of a video while they are written.
 _UNFINISHED = ".unfinished"
-# Starts the names of folders for unfinished work.
-_SCRATCH = ".colmap-av1-"
-_LOCK = "lock"
 
 
 class Output:
@@ -187,37 +184,6 @@ def scratch_for(output: str, scratch: str | os.PathLike[str] | None) -> str:
     if scratch is not None:
         return os.path.abspath(scratch)
     return tempfile.gettempdir() if is_url(output) else os.path.join(output, HIDDEN)
-
-
-@contextmanager
-def own_scratch(scratch: str | os.PathLike[str]) -> Iterator[Path]:
-    """A new folder for unfinished work; what killed processes left is removed.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    remove_unused_scratch(scratch)
-    os.makedirs(scratch, exist_ok=True)
-    # Containers may share host name and process numbers: only a random name is unique.
-    folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=scratch)).resolve()
-    try:
-        new = folder / "new"
-        with only_run(new):
-            new.rename(folder / _LOCK)  # held before others can find it
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def remove_unused_scratch(scratch: str | os.PathLike[str]) -> None:
-    """Remove the folders of `own_scratch` that ended processes left."""
-    if os.name != "posix":  # no locks elsewhere
-        return
-    for folder in Path(scratch).glob(f"{_SCRATCH}*"):
-        if (folder / _LOCK).is_file():
-            with suppress(OSError), only_run(folder / _LOCK) as unused:
-                if unused:
-                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) -> set[str]:

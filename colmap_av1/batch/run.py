@@ -17,14 +17,15 @@ from typing import Any, cast
 
 from colmap_av1.batch.engines import LocalEngine, RayEngine
 from colmap_av1.batch.inputs import Video, list_videos
-from colmap_av1.batch.output import ROWS, Output, output_at, remove_unused_scratch, scratch_for
+from colmap_av1.batch.output import ROWS, Output, output_at, scratch_for
 from colmap_av1.batch.rows import Row, csv_of, json_of
-from colmap_av1.batch.video import Outcome, Work, failed_row
+from colmap_av1.batch.video import SCRATCH, Outcome, Work, failed_row
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.options import BatchOptions, DensifyOptions, MatchOptions
 from colmap_av1.options.batch import TASK_OPTIONS
 from colmap_av1.options.fields import Options
 from colmap_av1.util.digests import package_version
+from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.remote import absolute, without_secrets
 
 # Rows are written at most so often, and for at most this share of the time.
@@ -228,7 +229,7 @@ def _check_scratch(scratch: str) -> None:
         os.makedirs(scratch, exist_ok=True)
     except OSError as error:
         raise OptionError(cannot_write(Path(scratch), error)) from error
-    remove_unused_scratch(scratch)
+    remove_leftovers(Path(scratch), SCRATCH)
 
 
 def _outcomes(

@@ -14,7 +14,7 @@ import imageio_ffmpeg
 
 from colmap_av1.batch.command import CommandFailedError, Processes, run_command
 from colmap_av1.batch.inputs import Video
-from colmap_av1.batch.output import earlier_report, output_at, own_scratch, publish
+from colmap_av1.batch.output import earlier_report, output_at, publish
 from colmap_av1.batch.rows import Row, row_of
 from colmap_av1.errors import ModelError, OptionError, VideoError
 from colmap_av1.options import BatchOptions, MatchOptions
@@ -22,10 +22,13 @@ from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.util.digests import digest_if_there, digest_of
 from colmap_av1.util.failures import Failure, failure_of
+from colmap_av1.util.files import scratch_folder
 from colmap_av1.util.processes import bound
 from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
 
 THUMBNAIL = "thumbnail.jpg"
+# Names of folders for unfinished work hold it.
+SCRATCH = "video"
 _THUMBNAIL_WIDTH = 160
 _THUMBNAIL_TIME = 60.0  # seconds
 _IMAGES = "images"
@@ -130,7 +133,7 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
                 row_of(earlier["row"]), name=video.name, input=without_secrets(video.address)
             )
             return Outcome(row, kept=True)
-    with own_scratch(work.scratch) as scratch:
+    with scratch_folder(Path(work.scratch) / SCRATCH) as scratch:
         folder, copies = scratch / "output", scratch / "input"
         for new in (folder, copies):
             new.mkdir()

@@ -53,10 +53,12 @@ class Argument:
     Attributes:
         names: its spellings.
         how: further arguments of `add_argument`.
+        rare: where there is --help-all, --help leaves it out.
     """
 
     names: tuple[str, ...]
     how: dict[str, Any]
+    rare: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,9 @@ class Command:
         if self.add_more is not None:
             self.add_more(parser)
         for argument in self.arguments:
-            parser.add_argument(*argument.names, **argument.how)
+            action = parser.add_argument(*argument.names, **argument.how)
+            if argument.rare:
+                parser.rare.append(action)
         add_options(parser, *self.options)
         parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
 
@@ -124,8 +128,13 @@ _OVERWRITE_MODELS = _flag("overwrite", "replace an output that exists and holds 
 _GAUSSIANS = _optional_path(
     "gaussians", "also write initial Gaussians to this .ply, for trainers that start from them"
 )
-_REPORT_JSON = _optional_path(
-    "report_json", "also write the report to this file as JSON; after a failure its reason"
+_REPORT_JSON = Argument(
+    ("--report_json",),
+    {
+        "metavar": "PATH",
+        "help": "also write the report to this file as JSON; after a failure its reason",
+    },
+    rare=True,
 )
 
 

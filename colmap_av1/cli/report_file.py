@@ -19,7 +19,7 @@ def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
     """Write the report of a command on videos, if it is wanted."""
     if namespace.report_json is None:
         return
-    from colmap_av1.video.container import read_file  # noqa: PLC0415 - few commands need it
+    from colmap_av1.video.container import read_file
 
     given = namespace.video
     durations = [read_file(video).duration for video in (given if type(given) is list else [given])]
@@ -40,7 +40,7 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
     except Exception as error:
         path = getattr(namespace, "report_json", None)
         if path is not None:
-            from colmap_av1.util.failures import failure_of  # noqa: PLC0415
+            from colmap_av1.util.failures import failure_of
 
             failure = dataclasses.asdict(failure_of(error))
             with suppress(OSError):  # the error itself is reported in any case

@@ -28,7 +28,6 @@ from colmap_av1 import (
     run_batch,
     write_page,
 )
-from colmap_av1.batch.output import own_scratch, remove_unused_scratch
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
 
@@ -256,16 +255,6 @@ def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
     with (scenes / "scene" / "sparse" / "0" / "points3D.bin").open("ab") as file:
         file.write(bytes(1))
     assert run_batch(video, dense, DensifyOptions(), models=scenes, options=ONCE).num_kept == 0
-
-
-def test_a_folder_in_use_is_nobody_elses_scratch(tmp_path: Path) -> None:
-    """Containers may share host name and process numbers."""
-    with own_scratch(tmp_path) as one, own_scratch(tmp_path) as other:
-        (one / "a").touch()
-        assert one != other
-        remove_unused_scratch(tmp_path)
-        assert (one / "a").exists()
-    assert not list(tmp_path.iterdir())
 
 
 def test_secrets_of_signed_urls_are_not_kept(
