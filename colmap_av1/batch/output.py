@@ -14,7 +14,7 @@ from typing import Any
 
 from colmap_av1.batch.rows import json_text
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.util.files import only_run, whole_file
+from colmap_av1.util.files import only_run, remove_leftovers, whole_file
 from colmap_av1.util.remote import filesystem, is_url
 
 # Marks the folder of a video as complete.
@@ -67,6 +67,7 @@ class Output:
         top = self._root / folder
         if top.exists() and not top.is_dir():
             return {""}
+        remove_leftovers(top)
         return {path.relative_to(top).as_posix() for path in top.rglob("*") if not path.is_dir()}
 
     def names(self) -> list[str]:
