@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.takes import Takes
 from colmap_av1.video.facts import Video, picture_times
-from colmap_av1.video.metadata.positions import Positions, are_places, interpolate, read_positions
+from colmap_av1.video.metadata.places import are_places
+from colmap_av1.video.metadata.positions import Positions, interpolate, read_positions
 
 
 @dataclass(frozen=True)

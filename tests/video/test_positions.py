@@ -112,10 +112,16 @@ def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) 
     assert told is not None
     assert "2 of its positions can be none on Earth" in told
     stamp = "1\n00:00:00,000 --> 00:00:01,000\n"
-    count, told = of_drone(f"{stamp}[latitude: abc] [longitude: ] GPS(--,nan,1e999)\n\n")
-    assert count == 0
-    assert told is not None
-    assert "1 of its positions can be none on Earth" in told
+    for text in ("[latitude: abc] [longitude: ] GPS(--,nan,1e999)", "Lat 59.3293 Lon 18.0686"):
+        count, told = of_drone(f"{stamp}{text}\n\n")
+        assert count == 0
+        assert told is not None
+        assert told.endswith("holds no positions that are understood")
+    # As cameras leave it that were switched off, and what is no .srt file.
+    for text in ("", "no subtitles"):
+        beside.write_text(text)
+        count, told = of_drone(text)
+        assert told == f"{beside} holds no positions that are understood"
     # Without a fix, and subtitles of another kind.
     assert of_drone(dji_text(no_fix, 25)) == (0, None)
     assert of_drone(f"{stamp}Hello there\n\n") == (0, None)
@@ -140,17 +146,102 @@ def test_subtitles_beside_a_video_and_in_it(clip: Path, ffmpeg: Ffmpeg, tmp_path
 @pytest.mark.parametrize(
     ("text", "place"),
     [
+        # Longitude first, then the number of satellites: Mavic Pro, its old firmware, Mini,
+        # Phantom 4 RTK.
         ("HOME(149.02,-20.25) GPS(149.0251,-20.2533,16) BAROMETER:1.9", (-20.2533, 149.0251, 1.9)),
-        ("GPS(149.0251,-20.2533,16)", (-20.2533, 149.0251, 16.0)),
-        ("F/2.8, SS 206, GPS (149.0251, -20.2533, 16), D 24.26m, H 6.00m", (-20.2533, 149.0251, 6)),
-        ("[latitude : 1.5] [longtitude : 2.5] [altitude: 12.3]", (1.5, 2.5, 12.3)),
+        ("GPS(-1.2218,42.4668,11) Hb:2.5 Hs:1.9", (42.4668, -1.2218, 2.5)),
+        ("F/2.8, SS 206, GPS (8.2090, 47.4692, 18), D 24.26m, H 6.00m", (47.4692, 8.2090, 6)),
+        (
+            "GPS (-58.851745, -34.237922, 15), HOME (-58.847509, -34.232707, -57.98m), H 85.80m",
+            (-34.237922, -58.851745, 85.8),
+        ),
+        ("RTK (-58.851745, -34.237922, 15), H 85.80m", (-34.237922, -58.851745, 85.8)),
+        ("GPS(8.2090,47.4692,18)", (47.4692, 8.2090, 0)),
+        # Latitude first, then the accuracy: Matrice 300, also east and south.
+        ("GPS(40.0001,-3.0001,0.0M) BAROMETER:1.5M", (40.0001, -3.0001, 1.5)),
+        ("GPS(-41.3899,174.0177,0.0M) BAROMETER:97.7M", (-41.3899, 174.0177, 97.7)),
+        # Named: Mavic 2, Mavic 3, Air 2S; Autel.
+        ("[latitude : -20.2533] [longtitude : 149.0251] [ev: 0]", (-20.2533, 149.0251, 0)),
+        (
+            "[latitude: 59.3023] [longitude: 18.2030] [rel_alt: 1.300 abs_alt: 132.860]",
+            (59.3023, 18.2030, 132.86),
+        ),
+        ("[latitude: 41.4247] [longitude: 2.2341] [altitude: 117.0]", (41.4247, 2.2341, 117)),
+        ("GPS(W: 8.6499, N: 53.1665, 12.5m)", (53.1665, -8.6499, 12.5)),
+        ("GPS(E:8.6499,S:53.1665,-2m)", (-53.1665, 8.6499, -2)),
+        # No known spelling: only one order is on Earth.
+        ("GPS(149.0251,-20.2533,16.5)", (-20.2533, 149.0251, 16.5)),
+        ("GPS(-20.2533,149.0251)", (-20.2533, 149.0251, 0)),
+        # A known spelling against the range.
+        ("GPS(120.5001,57.0002,0.5M) BAROMETER(12.5)", (57.0002, 120.5001, 12.5)),
     ],
 )
 def test_spellings_of_drones(clip: Path, tmp_path: Path, text: str, place: object) -> None:
-    video = tmp_path / "a.mp4"
+    found = positions_of(with_srt(clip, tmp_path, text))
+    np.testing.assert_allclose(found.places, [place])
+    assert found.left_out is None
+
+
+@pytest.mark.parametrize(
+    ("text", "tag", "place"),
+    [
+        ("GPS(40.0001,-3.0001,12.5m)", "+40.0100-003.0100/", (40.0001, -3.0001, 12.5)),
+        ("GPS(40.0001,-3.0001,12.5m)", "-03.0100+040.0100/", (-3.0001, 40.0001, 12.5)),
+        ("GPS(40.0001,-3.0001,12.5m)", "+52.0000+013.0000/", None),
+        ("GPS(40.0001,-3.0001,12.5m)", None, None),
+        # The video's own tag contradicts the order that the spelling has elsewhere.
+        ("GPS(40.0001,-3.0001,0.0M)", "-03.0100+040.0100/", (-3.0001, 40.0001, 0)),
+        ("GPS(40.0001,-3.0001,12)", "+40.0100-003.0100/", (40.0001, -3.0001, 0)),
+        # Radians, as of some Mavic Air 2.
+        (
+            "[latitude : 0.698134] [longtitude : -0.052361]",
+            "+40.0100-003.0100/",
+            (40.000132, -3.000064, 0),
+        ),
+        ("[latitude : 0.698134] [longtitude : -0.052361]", None, None),
+    ],
+)
+def test_the_location_of_the_video_tells_the_order(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, *, text: str, tag: str | None, place: object
+) -> None:
+    words = [] if tag is None else ["-metadata", f"location={tag}"]
+    video = ffmpeg("-i", clip, "-c", "copy", *words, tmp_path / "tagged.mp4")
+    found = positions_of(with_srt(video, tmp_path, text))
+    if place is None:
+        assert len(found.times) == 0
+        assert found.left_out is not None
+        assert "not certain" in found.left_out
+        assert "not used" in found.left_out
+    else:
+        np.testing.assert_allclose(found.places, [place], atol=1e-5)
+        assert found.left_out is None
+
+
+def test_subtitles_that_start_late(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """The first one of a Mavic Pro starts at 1 s."""
+    cues = "".join(
+        f"{k}\n00:00:0{k},000 --> 00:00:0{k + 1},000\nGPS(149.025{k},-20.2533,16)\n\n"
+        for k in range(1, 5)
+    )
+    video = with_srt(clip, tmp_path, "")
+    beside = video.with_suffix(".srt")
+    beside.write_text(cues)
+    inside = ffmpeg(
+        *("-i", clip, "-i", beside, "-map", "0:v", "-map", "1", "-c:v", "copy"),
+        *("-c:s", "mov_text", tmp_path / "inside.mp4"),
+    )
+    for path in (video, inside):
+        found = positions_of(path)
+        np.testing.assert_allclose(found.times, np.arange(1, 5), atol=1e-3)
+        np.testing.assert_allclose(found.places[:, 1], 149.025 + np.arange(1, 5) * 1e-4)
+
+
+def with_srt(clip: Path, folder: Path, text: str) -> Path:
+    """A copy of a video with a subtitle beside it, from its start to 1 s."""
+    video = folder / "DJI_0001.mp4"
     shutil.copyfile(clip, video)
     video.with_suffix(".srt").write_text(f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n\n")
-    np.testing.assert_allclose(positions_of(video).places, [place])
+    return video
 
 
 def test_track_of_a_gopro(clip: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,30 +21,29 @@ from colmap_av1.errors import VideoError
 from colmap_av1.util.texts import shown
 from colmap_av1.video.container import VideoFile, open_container
 from colmap_av1.video.metadata.gpmf import Payload, read_payload
+from colmap_av1.video.metadata.places import are_places
+from colmap_av1.video.metadata.subtitles import holds_position, read_position, to_places
 
 # As Apple and Android spell one position: ISO 6709, annex H, in degrees.
 _TAGS = ("com.apple.quicktime.location.iso6709", "location", "location-eng", "xyz")
 _NUMBER = r"[+-]?\d+(?:\.\d+)?"
 _ISO_6709 = re.compile(rf"({_NUMBER})([+-]\d+(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?(?:CRS\S*)?/?")
-# DJI's spellings of two decades, one with a slip of the pen.
-_LATITUDE = re.compile(rf"\blatitude\s*:\s*({_NUMBER})")
-_LONGITUDE = re.compile(rf"\blong(?:i|ti)tude\s*:\s*({_NUMBER})")
-_LONGITUDE_FIRST = re.compile(rf"\bGPS\s*\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*({_NUMBER})")
-_ALTITUDES = (
-    re.compile(rf"\babs_alt\s*:\s*({_NUMBER})"),
-    re.compile(rf"\baltitude\s*:\s*({_NUMBER})"),
-    re.compile(rf"\brel_alt\s*:\s*({_NUMBER})"),
-    re.compile(rf"\bBAROMETER\s*:\s*({_NUMBER})"),
-    re.compile(rf"\bH\s+({_NUMBER})m"),
-)
-# What a subtitle holds that is to say a place.
-_SAYS_PLACE = re.compile(r"\blatitude\b|\bGPS\s*\(")
 # The key that every packet of GoPro's track begins with: PyAV does not name the codec of data.
 _GPMF = b"DEVC"
+_NOT_UNDERSTOOD = "holds no positions that are understood"
 # FFmpeg's AVDISCARD_DEFAULT and AVDISCARD_ALL.
 _READ, _SKIP = 0, 48
 # Longest time between two positions that those of frames are interpolated over, in seconds.
 _LONGEST_GAP = 3.0
+
+
+@dataclass(frozen=True)
+class _Packet:
+    """Start and duration in seconds, and content."""
+
+    start: float
+    duration: float
+    content: bytes
 
 
 @dataclass(frozen=True)
@@ -105,14 +104,13 @@ def read_positions(video: VideoFile) -> Positions | None:
     if video.has_telemetry:
         with open_container(video.path, apply_edits=True) as container:
             start = _first_picture(video, container)
-            found = _of_data(container, start)
+            packets = _packets(container)
+            found = _of_data(container, packets, start)
             if found is None or found.left_out is not None:
-                found = _of_subtitles(container, start) or found
+                found = _of_subtitles(container, packets, start, place) or found
     beside = _file_beside(video.path)
-    if found is None and beside is not None:
-        with contextlib.suppress(VideoError), open_container(beside) as container:
-            found = _of_subtitles(container, 0.0)
-            found = replace(found, source=str(beside), stream=None) if found else None
+    if beside is not None and (found is None or not (len(found.times) or len(found.gravity))):
+        found = _of_file_beside(beside, place) or found
     if found is not None:
         return replace(found, place=place, first_picture=start)
     nothing = np.empty(0), np.empty((0, 3))
@@ -145,6 +143,17 @@ def interpolate(
 
 def _file_beside(video: Path) -> Path | None:
     return next((p for s in (".srt", ".SRT") if (p := video.with_suffix(s)).is_file()), None)
+
+
+def _of_file_beside(path: Path, place: tuple[float, float, float] | None) -> Positions | None:
+    try:
+        with open_container(path) as container:
+            found = _of_subtitles(container, _packets(container), 0.0, place)
+    except VideoError:
+        nothing = np.empty(0), np.empty((0, 3))
+        left_out = f"{path} {_NOT_UNDERSTOOD}"
+        return Positions(str(path), *nothing, None, *nothing, left_out=left_out)
+    return replace(found, source=str(path), stream=None) if found else None
 
 
 def _first_picture(video: VideoFile, container: Any) -> float:
@@ -186,44 +195,45 @@ def _one_place(metadata: dict[str, str]) -> tuple[float, float, float] | None:
     return None
 
 
-def are_places(places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of some latitudes, longitudes and altitudes [n, 3] can be those of a camera.
-
-    Both angles 0 is what receivers write without a fix.
-    """
-    latitude, longitude, altitude = np.nan_to_num(places, nan=np.inf).T
-    on_earth = (abs(latitude) <= 90) & (abs(longitude) <= 180) & (abs(altitude) < 1e5)
-    return np.asarray(on_earth & ((latitude != 0) | (longitude != 0)))
-
-
-def _packets(container: Any, streams: Sequence[Any]) -> Iterator[tuple[int, float, float, bytes]]:
-    """Stream's index, start, duration and content of some streams' packets, up to damage."""
+def _packets(container: Any) -> dict[int, list[_Packet]]:
+    """The packets of each stream that may hold positions, up to damage."""
+    streams = [*container.streams.data, *container.streams.subtitles]
+    found: dict[int, list[_Packet]] = {stream.index: [] for stream in streams}
     for other in container.streams:
         if hasattr(other, "discard"):  # of later PyAV: what is not wanted is not even read
             other.discard = type(other.discard)(_READ if other in streams else _SKIP)
+    data = {stream.index for stream in container.streams.data}
     with contextlib.suppress(av.error.FFmpegError, OSError):
-        container.seek(0)  # it may have been read before
         for packet in container.demux(streams):
-            if packet.size and packet.pts is not None:
-                base = packet.time_base
-                start, duration = packet.pts * base, (packet.duration or 0) * base
-                yield packet.stream.index, float(start), float(duration), bytes(packet)
+            index, content = packet.stream.index, bytes(packet)
+            if (
+                not content
+                or packet.pts is None
+                or (index in data and not content.startswith(_GPMF))
+            ):
+                continue
+            base = packet.time_base
+            start, duration = packet.pts * base, (packet.duration or 0) * base
+            found[index].append(_Packet(float(start), float(duration), content))
+    return found
 
 
-def _of_data(container: Any, start: float) -> Positions | None:
+def _of_data(container: Any, packets: dict[int, list[_Packet]], start: float) -> Positions | None:
     """The positions of GoPro's data track."""
-    streams = list(container.streams.data)
-    if not streams:
+    tracks = [stream.index for stream in container.streams.data if packets[stream.index]]
+    if not tracks:
         return None
-    found = [own for own in _packets(container, streams) if own[-1].startswith(_GPMF)]
-    payloads = [(time - start, duration, read_payload(data)) for _, time, duration, data in found]
+    found = packets[tracks[0]]
+    payloads = [
+        (packet.start - start, packet.duration, read_payload(packet.content)) for packet in found
+    ]
     times, places = _spread(payloads, lambda payload: payload.positions)
     gravity_times, gravity = _spread(payloads, lambda payload: payload.gravity)
     kept = are_places(places)
     held = np.linalg.norm(gravity, axis=1) > 0.5
     source = f"the GoPro track of {container.name}"
     left_out = _left_out(source, places[~kept])
-    if not kept.any() and left_out is None and any(_has_receiver(data) for *_, data in found):
+    if not kept.any() and left_out is None and any(_has_receiver(p.content) for p in found):
         left_out = f"{source} holds no position: the receiver had no fix, or the track is damaged"
     if not kept.any() and not held.any() and left_out is None:
         return None
@@ -232,7 +242,7 @@ def _of_data(container: Any, start: float) -> Positions | None:
         *_ascending(times[kept], places[kept]),
         None,
         *_ascending(gravity_times[held], gravity[held]),
-        stream=found[0][0],
+        stream=tracks[0],
         left_out=left_out,
     )
 
@@ -265,38 +275,46 @@ def _spread(
     return np.concatenate(times), np.concatenate(values)
 
 
-def _of_subtitles(container: Any, start: float) -> Positions | None:
-    """The positions in DJI's subtitles."""
-    for stream in container.streams.subtitles:
-        texts = [
-            (time - start, data.decode("utf-8", "replace"))
-            for _, time, _, data in _packets(container, [stream])
-        ]
-        found = [(time, place) for time, text in texts if (place := _place_in(text)) is not None]
-        places = np.array([place for _, place in found]).reshape(-1, 3)
-        kept = are_places(places)
-        source = f"the subtitles of {container.name}"
-        unreadable = sum(_SAYS_PLACE.search(text) is not None for _, text in texts) - len(found)
+def _of_subtitles(
+    container: Any,
+    packets: dict[int, list[_Packet]],
+    start: float,
+    place: tuple[float, float, float] | None,
+) -> Positions | None:
+    """The positions in the subtitles of a drone."""
+    found = [
+        own
+        for stream in container.streams.subtitles
+        if (own := _of_texts(container.name, stream.index, packets[stream.index], start, place))
+    ]
+    return next((own for own in found if len(own.times)), found[0] if found else None)
+
+
+def _of_texts(
+    name: str,
+    stream: int,
+    packets: list[_Packet],
+    start: float,
+    place: tuple[float, float, float] | None,
+) -> Positions | None:
+    texts = [(p.start - start, p.content.decode("utf-8", "replace")) for p in packets]
+    found = [(time, own) for time, text in texts if (own := read_position(text)) is not None]
+    unreadable = sum(read_position(text) is None and holds_position(text) for _, text in texts)
+    source = f"the subtitles of {name}"
+    times = np.array([time for time, _ in found])
+    places, doubt = to_places([own for _, own in found], place)
+    kept = are_places(places)
+    if doubt is not None:
+        left_out: str | None = f"{source}: positions that are not certain, {doubt}, are not used"
+    elif found or not unreadable:
         left_out = _left_out(source, places[~kept], unreadable)
-        if kept.any() or left_out is not None:
-            times = np.array([time for time, _ in found])
-            nothing = np.empty(0), np.empty((0, 3))
-            own = _ascending(times[kept], places[kept])
-            return Positions(source, *own, None, *nothing, stream=stream.index, left_out=left_out)
-    return None
-
-
-def _place_in(text: str) -> tuple[float, float, float] | None:
-    """Latitude, longitude and altitude in a subtitle; None where it holds none."""
-    latitude, longitude = _LATITUDE.search(text), _LONGITUDE.search(text)
-    altitude = next((m for pattern in _ALTITUDES if (m := pattern.search(text))), None)
-    if latitude is not None and longitude is not None:
-        return float(latitude[1]), float(longitude[1]), float(altitude[1]) if altitude else 0.0
-    both = _LONGITUDE_FIRST.search(text)
-    if both is None:
+    else:
+        left_out = f"{source} {_NOT_UNDERSTOOD}"
+    if not kept.any() and left_out is None:
         return None
-    # The third number is the altitude with some models, the number of satellites with others.
-    return float(both[2]), float(both[1]), float(altitude[1] if altitude else both[3])
+    nothing = np.empty(0), np.empty((0, 3))
+    path = _ascending(times[kept], places[kept])
+    return Positions(source, *path, None, *nothing, stream=stream, left_out=left_out)
 
 
 def _ascending(
