@@ -20,6 +20,7 @@ import av.logging
 from av.stream import Disposition
 
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+from colmap_av1.video.cut_off import is_fragmented_mp4_cut, is_matroska_cut
 from colmap_av1.video.unchanged import FileState, file_state
 
 # Edit lists drop or hide samples, but a later frame may reference them: read them all.
@@ -232,6 +233,10 @@ class VideoStream:
                 return f"cut off after packet {count}"
             if file.container == "obu" and end != size:
                 return f"cut off after packet {count}"
+            if "matroska" in file.container and is_matroska_cut(file.path, last.pos):
+                return f"cut off after packet {count}"
+        if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
+            return f"cut off after packet {count}"
         if "matroska" in file.container and file.duration and last.pts is not None:
             step = 1 / file.frame_rate if file.frame_rate else 0.0
             length = float((last.duration or 0) * last.time_base)

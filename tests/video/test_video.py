@@ -16,6 +16,8 @@ from conftest import AV1, SHARED, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream, packets
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
@@ -157,6 +159,50 @@ def test_cut_files_give_a_prefix_and_are_reported(
         assert 0 < len(found) < 16
         whole_ones = found if ending != "obu" else found[:-1]  # FFmpeg ends with whole OBUs
         assert whole_ones == expected[: len(whole_ones)]
+
+
+@pytest.mark.parametrize(
+    ("ending", "how"),
+    [
+        ("webm", ["-live", "1"]),
+        ("mkv", ["-live", "1"]),
+        ("mkv", []),
+        ("mp4", ["-movflags", "frag_every_frame+empty_moov"]),
+    ],
+)
+def test_recordings_cut_inside_their_last_packet(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str, how: list[str]
+) -> None:
+    """Such files say neither their length nor the number of their packets."""
+    whole = ffmpeg("-i", clip, "-c", "copy", *how, tmp_path / f"whole.{ending}")
+    expected = [p.data for p in packets(whole)]
+    assert len(expected) == 16
+    with open_stream(whole) as stream:
+        last = next(p for p in stream.packets() if p.index == 15).data
+    data = whole.read_bytes()
+    end = data.rindex(bytes(last)) + len(last)
+    cut = tmp_path / f"cut.{ending}"
+    for missing in (1, len(last) - 1, len(last) + 1):
+        cut.write_bytes(data[: end - missing])
+        found, error = read_until_error(cut)
+        assert isinstance(error, BitstreamError)
+        assert "cut off" in str(error)
+        assert found == expected[:15]
+    with pytest.warns(UserWarning, match="cut off"):
+        assert len(list(read_motion(cut))) >= 15
+    with pytest.raises(BitstreamError, match="cut off"):
+        list(read_motion(cut, ReadOptions(strict=True)))
+
+
+def test_what_follows_the_last_packet_is_not_cut(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    for ending in ("mkv", "mp4"):
+        flags = ["-movflags", "frag_keyframe+empty_moov"] if ending == "mp4" else []
+        path = ffmpeg("-i", clip, "-c", "copy", *flags, tmp_path / f"whole.{ending}")
+        for rest in (b"", bytes(100), b"\xec\x83abc" if ending == "mkv" else b"\0\0\0\x0afreeab"):
+            path.write_bytes(path.read_bytes() + rest)
+            assert len(list(packets(path))) == 16
 
 
 def test_stream_facts(clip: Path) -> None:
