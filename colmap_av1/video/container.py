@@ -31,6 +31,9 @@ _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
 _AV1C_HEADER_SIZE = 4
 # As a path spells it, with one slash.
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]+):/(?P<rest>.*)", re.DOTALL)
+ENCRYPTED = "is encrypted: give a copy that is not"
+# FFmpeg's tag for the key of an encrypted Matroska stream.
+_KEY_TAG = "enc_key_id"
 # Transfer characteristics of high dynamic range (ITU-T H.273, table 3).
 _HIGH_RANGES = {16: "PQ", 18: "HLG"}
 
@@ -186,7 +189,8 @@ class VideoStream:
         Raises:
             BitstreamError: the file is damaged or cut off; every packet before the damage
                 has been given.
-            VideoError: there is no packet at all, or this process was forked meanwhile.
+            VideoError: there is no packet at all, it is encrypted, or this process was forked
+                meanwhile.
         """
         index = 0
         last: Any = None
@@ -205,6 +209,10 @@ class VideoStream:
                 continue
             if packet.is_corrupt:
                 raise BitstreamError(f"{self.file}: cut off inside packet {index + 1}")
+            if is_encrypted(packet):
+                if index == 0:
+                    raise VideoError(f"{self.file}: {ENCRYPTED}")
+                raise BitstreamError(f"{self.file}: is encrypted after packet {index}")
             is_timed = self.file.is_timed and packet.pts is not None
             pts = float(packet.pts * packet.time_base) if is_timed else None
             last = packet
@@ -397,6 +405,13 @@ def find_decodable_stream(container: Any, path: Path) -> Any:
     if stream.codec_context is None:
         raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
     return stream
+
+
+def is_encrypted(packet: Any) -> bool:
+    """Whether a packet is encrypted, as by Common Encryption (ISO/IEC 23001-7)."""
+    # Earlier PyAV does not show what the container says of a packet.
+    has = getattr(packet, "has_sidedata", None)
+    return _KEY_TAG in packet.stream.metadata or (has is not None and has("encryption_info"))
 
 
 def _codec_name(stream: Any) -> str:

@@ -11,8 +11,14 @@ import av
 import av.error
 import av.logging
 
-from colmap_av1.errors import BitstreamError
-from colmap_av1.video.container import find_decodable_stream, open_container, reason_of
+from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.video.container import (
+    ENCRYPTED,
+    find_decodable_stream,
+    is_encrypted,
+    open_container,
+    reason_of,
+)
 
 
 def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
@@ -43,7 +49,11 @@ def decode(
 def decode_stream(
     container: Any, stream: Any, path: Path, operating_point: int, num_threads: int | None
 ) -> Generator[Any, None, None]:
-    """As `decode`, of a file that is open: PyAV's container and a stream of it."""
+    """As `decode`, of a file that is open: PyAV's container and a stream of it.
+
+    Raises:
+        VideoError: the stream is encrypted.
+    """
     context = stream.codec_context
     context.thread_type = "AUTO"
     context.thread_count = num_threads or 0
@@ -51,6 +61,7 @@ def decode_stream(
     # Grain is noise laid over the picture the motion was coded for.
     context.options = {"export_side_data": "film_grain", **options}
     damage: Exception | None = None
+    has_packet = False
     try:
         for packet in container.demux(stream):
             if packet.size == 0:  # PyAV's end-of-stream marker
@@ -58,6 +69,12 @@ def decode_stream(
             if packet.is_corrupt:
                 damage = EOFError("cut off inside a packet")
                 break
+            if is_encrypted(packet):
+                if not has_packet:
+                    raise VideoError(f"{path}: {ENCRYPTED}")
+                damage = EOFError("the rest is encrypted")
+                break
+            has_packet = True
             yield from context.decode(packet)
     except (av.error.FFmpegError, OSError) as error:
         damage = error

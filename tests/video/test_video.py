@@ -194,6 +194,25 @@ def test_recordings_cut_inside_their_last_packet(
         list(read_motion(cut, ReadOptions(strict=True)))
 
 
+@pytest.mark.skipif(not hasattr(av.Packet, "has_sidedata"), reason="PyAV shows no encryption")
+@pytest.mark.parametrize("codec", [AV1, ["-c:v", "libx264"]])
+def test_encrypted_videos_are_named_so(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, codec: list[str]
+) -> None:
+    words = ["-encryption_scheme", "cenc-aes-ctr", "-encryption_key", "76" * 16]
+    words += ["-encryption_kid", "a7" * 16]
+    path = ffmpeg("-i", clip, *codec, *words, tmp_path / "encrypted.mp4")
+    with pytest.raises(VideoError, match="is encrypted"):
+        read_video(path)
+    with pytest.raises(VideoError, match="is encrypted"):
+        list(decode_frames(path))
+    if codec == AV1:
+        with pytest.raises(VideoError, match="is encrypted"):
+            list(read_motion(path))
+    assert main(["encode", "--video", str(path), "--output", str(tmp_path / "out.mp4")]) == 2
+    assert not (tmp_path / "out.mp4").exists()
+
+
 def test_what_follows_the_last_packet_is_not_cut(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
