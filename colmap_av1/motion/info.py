@@ -15,7 +15,7 @@ import numpy as np
 
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
-from colmap_av1.motion.reading import read_motion
+from colmap_av1.motion.reading import count_shown_pictures, read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
@@ -99,8 +99,12 @@ def inspect(
         VideoError: the video cannot be read or holds no frame.
         BitstreamError: the stream is damaged and `options.strict` is set.
     """
+    options = options if options is not None else ReadOptions()
     counts = _count(read_motion(video, options), progress)
     structure = counts.structure
+    if structure.num_shown > 0:
+        # A stream may end in pictures that are shown again, which are no coded frames.
+        structure.num_shown = max(structure.num_shown, count_shown_pictures(video, options))
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frame: give a video with pictures")
     # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.

@@ -108,6 +108,15 @@ def read_motion(
         )
 
 
+def count_shown_pictures(video: str | PathLike[str], options: ReadOptions) -> int:
+    """Number of pictures that the bitstream shows up to the first damage, repeated ones included.
+
+    Raises:
+        LimitError, OptionError, VideoError: as `read_motion`.
+    """
+    return len(_read_index(video, options).shown)
+
+
 def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
     """Read the headers of a video up to the first damage.
 

@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -129,6 +129,10 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
     """
     rate = stream.average_rate or stream.guessed_rate
     is_timed = not (_is_ivf_without_rate(state.path) or _is_mp4_without_scale(container, stream))
+    num_packets, duration = stream.frames or None, _stream_duration(container, stream)
+    if container.format.name == "ivf" and is_timed and rate and stream.time_base != 1 / rate:
+        # Some programs write the number of frames to the header, some the length in units of time.
+        num_packets, duration = _measured(state.path, stream.index, 1 / rate)
     return VideoFile(
         path=state.path,
         state=state,
@@ -137,9 +141,9 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         index=stream.index,
         stored_size=(stream.codec_context.width, stream.codec_context.height),
         frame_rate=float(rate) if rate and is_timed else None,
-        duration=_stream_duration(container, stream) if is_timed else None,
+        duration=duration if is_timed else None,
         is_timed=is_timed,
-        num_packets=stream.frames or None,
+        num_packets=num_packets,
         dynamic_range=_HIGH_RANGES.get(stream.codec_context.color_trc),
         tags=tuple((str(k).lower(), str(v)) for k, v in container.metadata.items()),
         has_telemetry=bool(container.streams.data or container.streams.subtitles),
@@ -442,6 +446,22 @@ def _stream_duration(container: Any, stream: Any) -> float | None:
     if container.duration is not None and len(container.streams) == 1:
         return float(Fraction(container.duration, av.time_base))
     return None
+
+
+def _measured(path: Path, index: int, step: Fraction) -> tuple[int, float]:
+    """Number of packets of a stream up to the first damage, and its length in seconds.
+
+    Args:
+        path: the file.
+        index: number of the stream.
+        step: seconds from a picture to the next.
+    """
+    times: list[Fraction] = []
+    with open_container(path) as container, suppress(av.error.FFmpegError, OSError):
+        for packet in container.demux(container.streams[index]):
+            if packet.size and packet.pts is not None:
+                times.append(packet.pts * packet.time_base)
+    return len(times), float(max(times) - min(times) + step) if times else 0.0
 
 
 def reason_of(error: BaseException) -> str:

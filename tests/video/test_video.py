@@ -5,6 +5,7 @@ import hashlib
 import json
 import shlex
 import shutil
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from conftest import AV1, SHARED, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+from colmap_av1.motion.info import inspect
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream, packets
@@ -379,6 +381,58 @@ def test_ivf_without_a_frame_rate_is_read(
     with pytest.raises((BitstreamError, VideoError)):
         list(packets(path))
     gc.collect()  # a file left open would warn now
+
+
+@pytest.mark.parametrize("is_count", [True, False])
+def test_ivf_in_units_of_time_finer_than_frames(clip: Path, tmp_path: Path, is_count: bool) -> None:
+    """The header holds the number of frames or the length in units of time."""
+    data = bytearray(ivf_of(clip))
+    fine = 12800 // 25
+    struct.pack_into("<II", data, 16, 12800, 1)
+    struct.pack_into("<I", data, 24, 16 if is_count else 16 * fine)
+    for at, pts in frame_headers(data):
+        struct.pack_into("<Q", data, at + 4, pts * fine)
+    path = tmp_path / "fine.ivf"
+    path.write_bytes(data)
+    with open_stream(path) as stream:
+        assert stream.file.frame_rate == pytest.approx(25)
+        assert stream.file.duration == pytest.approx(16 / 25)
+        assert stream.file.num_packets == 16
+        assert [p.pts for p in stream.packets()] == pytest.approx(np.arange(16) / 25)
+
+
+def test_pictures_that_are_shown_again_at_the_end_count(clip: Path, tmp_path: Path) -> None:
+    """Players show 4 coded pictures and then the first one of them 20 times more."""
+    data = ivf_of(clip)
+    starts = frame_headers(data)
+    end = starts[4][0]
+    # A temporal delimiter, and a frame header that shows the frame in slot 0.
+    unit = bytes([0x12, 0x00, 0x1A, 0x01, 0x88])
+    again = b"".join(struct.pack("<IQ", len(unit), 4 + k) + unit for k in range(20))
+    path = tmp_path / "again.ivf"
+    path.write_bytes(data[:end] + again)
+    assert len(list(decode_frames(path))) == 24
+    report = inspect(path)
+    assert (report.num_shown, report.num_coded) == (24, 4)
+
+
+def ivf_of(clip: Path) -> bytes:
+    found = list(packets(clip))
+    body = b"".join(struct.pack("<IQ", len(p.data), p.index) + bytes(p.data) for p in found)
+    with av.open(str(clip)) as container:
+        size = container.streams.video[0].width, container.streams.video[0].height
+    head = struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"AV01", *size, 25, 1, len(found), 0)
+    return head + body
+
+
+def frame_headers(ivf: bytes | bytearray) -> list[tuple[int, int]]:
+    """Position of each frame's header, and its time."""
+    found, at = [], 32
+    while at < len(ivf):
+        size, pts = struct.unpack_from("<IQ", ivf, at)
+        found.append((at, pts))
+        at += 12 + size
+    return found
 
 
 def test_animated_avif_is_its_track(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
