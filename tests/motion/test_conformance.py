@@ -10,6 +10,9 @@ import pytest
 from conformance import differences
 from conftest import PROJECT, SHARED
 
+from colmap_av1.motion.reading import read_motion
+from colmap_av1.options import ReadOptions
+
 _DATA = PROJECT / "tests" / "data" / "conformance"
 _SHARED = SHARED
 _KIT = _SHARED / "conformance"
@@ -74,3 +77,10 @@ def test_suite_is_exact(stream: Path, expected: Path) -> None:
         # The stored flag is 0 for a frame whose header sets it; everything read after it agrees.
         found = [f for f in found if "frame_refs_short_signaling" not in f]
     assert found == []
+
+
+@pytest.mark.shared
+def test_level_of_which_20_bits_leave_nothing(shared: Path) -> None:
+    """It counts as positive in the contexts of its neighbours: otherwise the tile ends too early."""
+    (frame,) = read_motion(shared / "cases" / "325_tennis.ivf", ReadOptions(strict=True))
+    assert frame.mi_size.shape == (2, 4)

@@ -399,13 +399,11 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
   if (dc != 0) {
     const bool sign = symbols.flag(cdf.dc_sign[ptype][dc_sign_ctx]);
     --num_signs;
-    int level = dc;
-    if (level == kMaxLevel) {
-      level = golomb();
-      sum += level - kMaxLevel;
+    dc_category = sign ? 1 : 2;  // even where nothing is left of the level in 20 bits
+    if (dc == kMaxLevel) {
+      sum += golomb() - kMaxLevel;
       --num_large;
     }
-    if (level > 0) dc_category = sign ? 1 : 2;
   }
   while (num_large > 0) {
     const int before = large_[--num_large];  // nonzero coefficients that come later
