@@ -88,6 +88,17 @@ def test_no_model_at_all_is_an_error(video, tmp_path, capsys):
     assert "<script>" not in html
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_video_whose_name_is_not_utf_8(video, tmp_path):
+    named = tmp_path / os.fsdecode(b"loc\xe9.mp4")
+    shutil.copy(video, named)
+    words = ["--frontends", "broken=no.h5:none.h5", "--every", "6", "--quiet"]
+    output = tmp_path / "report"
+    assert main(["compare", "--video", str(named), "--output", str(output), *words]) == 2
+    assert ".mp4" in (output / "report.html").read_text(encoding="utf-8")
+    assert json.loads((output / "results.json").read_text())["video"] == str(named)
+
+
 def run_again(video, output, truth, *frontends):
     names = frontends or ("av1", "sift-exhaustive", "broken=no.h5:none.h5")
     options = CompareOptions(match=OPTIONS, frontends=names)

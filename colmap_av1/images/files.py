@@ -325,12 +325,17 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     if not may_read(path):
         raise ImageError(f"{path}: no permission to read it: change that")
+    image = None
     try:
-        image = cv2.imread(str(path), how) if path.is_file() else None
+        # OpenCV opens no path that is not UTF-8.
+        data = path.read_bytes() if path.is_file() else b""
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how) if data else None
     except cv2.error as error:  # more pixels than OpenCV takes
         raise ImageError(f"{path}: is too large for an image: give the folder of the images") from (
             error
         )
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from error
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
@@ -392,6 +397,8 @@ def image_size(path: Path) -> tuple[int, int]:
         ImageError: it is none that can be read.
     """
     size = (0, 0)
+    if path.exists() and not path.is_file():
+        raise ImageError(f"{path}: is a pipe, device or folder, not an image: remove it")
     try:
         with av.open(os.path.abspath(path)) as container:
             if container.streams.video:

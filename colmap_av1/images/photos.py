@@ -16,6 +16,7 @@ from colmap_av1.images.files import READABLE, image_size
 from colmap_av1.images.names import image_file, natural_key
 from colmap_av1.options.images import IMAGE_EXTENSIONS
 from colmap_av1.util.files import whole_file
+from colmap_av1.util.texts import check_name
 from colmap_av1.video.unchanged import FileState, file_state
 
 # Photos as phones and cameras write them that nothing here reads: worth a word where they are left
@@ -108,6 +109,7 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
     for file in files:
         path = folder / file
         name = str(PurePosixPath(label, _flat(file) if flat else file.as_posix()))
+        check_name(name)
         if name in names:
             raise ImageError(
                 f"{path} and {folder / names[name]} would both be image '{name}': rename one"

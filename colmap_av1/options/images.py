@@ -113,6 +113,10 @@ def check_image_pattern(pattern: str) -> str:
             f"image_name {pattern[:40]!r} gives names that files cannot have: give one such as "
             "frame_%06d.png"
         )
+    if pattern.encode(errors="replace").decode() != pattern:
+        raise OptionError(
+            f"image_name {pattern!r} is not UTF-8, as names in a database are: give another"
+        )
     if Path(pattern).name != pattern or pattern.startswith("."):
         raise OptionError(
             f"image_name '{pattern}' has a folder or a leading dot: give a plain file name"

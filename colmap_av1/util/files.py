@@ -305,6 +305,8 @@ def only_run(lock: Path) -> Iterator[bool]:
 
 def may_read(path: Path) -> bool:
     """Whether the system lets this process read a file; True where it is not there, too."""
+    if path.exists() and not path.is_file():  # opening a pipe waits for another process
+        return True
     try:
         path.open("rb").close()
     except PermissionError:

@@ -51,3 +51,7 @@ def check_name(name: str) -> None:
         )
     if not parts.parts or "\0" in name:
         raise ImageError(f"image {name!r} has a name that no file can have: name it otherwise")
+    if name.encode(errors="replace").decode() != name:  # Python holds other bytes as surrogates
+        raise ImageError(
+            f"image {name!r} has a name that is not UTF-8, which no database can hold: rename it"
+        )

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +14,16 @@ import pytest
 from conftest import Encode, encode_two_sizes
 
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.images.files import check_image_folder, size_of_images, write_images
+from colmap_av1.images.files import (
+    check_image_folder,
+    image_size,
+    read_image,
+    size_of_images,
+    write_image,
+    write_images,
+)
 from colmap_av1.images.names import frames_of_images, image_names
+from colmap_av1.images.photos import photo_files, read_photos
 from colmap_av1.util.files import whole_file
 from colmap_av1.video.decoding import decode_frames
 
@@ -118,6 +129,48 @@ def test_existing_images_are_kept(clip: Path, tmp_path: Path) -> None:
     assert write_images(clip, tmp_path, names, [0, 1]) == 1
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "y.png")), mine)
     assert (tmp_path / "sub/x.png").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
+@pytest.mark.parametrize("name", [b"loc\xe9", "locé".encode()])
+def test_paths_that_are_not_utf_8(tmp_path: Path, name: bytes, locale: str) -> None:
+    """OpenCV's own functions for files crash on some of them."""
+    folder = tmp_path / os.fsdecode(name)
+    folder.mkdir()
+    picture = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    write_image(folder / "a.png", picture)
+    code = """
+import sys
+from pathlib import Path
+from colmap_av1.images.files import image_size, read_image
+path = next(next(Path(sys.argv[1]).iterdir()).iterdir())
+sys.stdout.buffer.write(bytes([*image_size(path)]) + read_image(path).tobytes())
+"""
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    environment = {**os.environ, "LC_ALL": locale, "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    done = subprocess.run(words, env=environment, capture_output=True, check=True)
+    assert done.stdout == bytes([8, 8]) + picture.tobytes()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes of a Unix")
+def test_pipes_are_no_images(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")
+    for read in (image_size, read_image):
+        with pytest.raises(ImageError):
+            read(tmp_path / "a.png")
+
+
+def test_names_that_no_database_can_hold(tmp_path: Path) -> None:
+    name = os.fsdecode(b"\xe9")
+    with pytest.raises(OptionError, match="not UTF-8"):
+        image_names(f"{name}%d.png", [0])
+    write_image(tmp_path / f"{name}.png", np.zeros((8, 8, 3), dtype=np.uint8))
+    files, _ = photo_files(tmp_path)
+    with pytest.raises(ImageError, match="not UTF-8"):
+        read_photos(tmp_path, files, "photos", flat=False)
+    (photo,) = read_photos(tmp_path, files, "photos", flat=True)
+    assert photo.name == "photos/_.png"
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])

@@ -81,6 +81,6 @@ def test_suite_is_exact(stream: Path, expected: Path) -> None:
 
 @pytest.mark.shared
 def test_level_of_which_20_bits_leave_nothing(shared: Path) -> None:
-    """It counts as positive in the contexts of its neighbours: otherwise the tile ends too early."""
+    """Such a level has a sign in the contexts of later blocks; without it the tile ends early."""
     (frame,) = read_motion(shared / "cases" / "325_tennis.ivf", ReadOptions(strict=True))
     assert frame.mi_size.shape == (2, 4)

@@ -67,7 +67,9 @@ def main() -> int:
 
 
 def _extract(extractor: Any, path: str, max_size: int, device: str) -> dict[str, torch.Tensor]:
-    image = cv2.cvtColor(cv2.imread(path), cv2.COLOR_BGR2RGB)
+    # OpenCV opens no path that is not UTF-8.
+    pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
     tensor = torch.from_numpy(image).permute(2, 0, 1).float() / 255
     # Images are never enlarged.
     features: dict[str, torch.Tensor] = extractor.extract(

@@ -19,6 +19,7 @@ def main() -> int:
     try:
         import cv2  # noqa: PLC0415 - after the check that torch is there, in any order
         import lpips  # noqa: PLC0415
+        import numpy as np  # noqa: PLC0415
         import torch  # noqa: PLC0415
     except ImportError as error:
         print(f"LPIPS needs the package {error.name}: pip install lpips", file=sys.stderr)
@@ -35,7 +36,9 @@ def main() -> int:
         distance = lpips.LPIPS(net="alex", verbose=False).eval()
 
     def read(path: str) -> "torch.Tensor":
-        image = cv2.cvtColor(cv2.imread(path), cv2.COLOR_BGR2RGB)
+        # OpenCV opens no path that is not UTF-8.
+        pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
         return torch.from_numpy(image).permute(2, 0, 1)[None].float() / 127.5 - 1
 
     with torch.inference_mode():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import EvaluationError, ImageError
 from colmap_av1.evaluate.programs import run_program
+from colmap_av1.images.files import read_image
 from colmap_av1.util.processes import bound
 
 _Image = NDArray[np.uint8]
@@ -160,10 +161,10 @@ def _luma(image: _Image) -> NDArray[np.float64]:
 
 
 def _read(path: Path) -> _Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if image is None:
-        raise ImageError(f"{path}: is missing or not an image: render it again")
-    return np.asarray(image, dtype=np.uint8)
+    try:
+        return read_image(path)
+    except ImageError as error:
+        raise ImageError(f"{error}; render it again") from error
 
 
 def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:

@@ -34,6 +34,7 @@ from colmap_av1.evaluate.report.tables import (
     models_table,
     renderings_table,
 )
+from colmap_av1.images.files import read_image
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.pages import render_page
@@ -136,7 +137,7 @@ def _crop(name: str, caption: str, picture: NDArray[np.uint8]) -> _Figure:
 
 
 def _picture(path: Path) -> NDArray[np.uint8]:
-    return np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR), dtype=np.uint8)
+    return read_image(path)
 
 
 def _cloud_figures(

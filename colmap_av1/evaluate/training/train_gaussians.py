@@ -171,9 +171,10 @@ def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[Vie
         arrays = {name: scene[name] for name in scene.files}
     views = []
     for i, file in enumerate(arrays["files"].tolist()):
-        image = cv2.imread(file, cv2.IMREAD_COLOR)
+        # OpenCV opens no path that is not UTF-8.
+        image = cv2.imdecode(np.fromfile(file, dtype=np.uint8), cv2.IMREAD_COLOR)
         if image is None:
-            raise FileNotFoundError(f"{file}: is missing or not an image")
+            raise FileNotFoundError(f"{file}: is not an image")
         views.append(
             View(
                 name=Path(file).name,
@@ -211,7 +212,8 @@ def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: 
                     rendered = rasterize(gaussians, view, _SH_DEGREE)[0]
                 pixels = (rendered.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
                 path = (folder / view.name).with_suffix(".png")
-                cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+                picture = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+                cv2.imencode(".png", picture)[1].tofile(path)
         words = {
             "iteration": iteration,
             "seconds": seconds,
