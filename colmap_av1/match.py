@@ -16,10 +16,12 @@ from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import check_pixel_aspect
+from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_chosen
+from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
 from colmap_av1.matching.gaps import matching_warnings
@@ -36,6 +38,7 @@ from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
@@ -192,6 +195,7 @@ def match(
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
 
+    before = files_in(folder) if folder is not None else set[Path]()
     listed = _read_listed_images(database, options)
     inputs = read_inputs(video, photos, options)
     if folder is not None:
@@ -209,7 +213,8 @@ def match(
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
-            with clock.measure("images"):
+            with clock.measure("images"), alone_in(folder):
+                _check_images_of_others(images, folder, before, options)
                 num_written = place_photos(inputs.photos, folder)
                 labelled = zip(inputs.labels, images.videos, strict=True)
                 of_videos, blurred = write_all_chosen(labelled, folder, options, progress)
@@ -245,6 +250,31 @@ def match(
         warnings=(*inputs.warnings, *notes, *blurred),
         **_figures([own.tracks for own in videos], written),
     )
+
+
+def _check_images_of_others(
+    images: _Images, folder: Path, before: set[Path], options: MatchOptions
+) -> None:
+    """Refuse images that another run has written since this one began, if of another video.
+
+    Args:
+        images: the images of this run.
+        folder: where they are to be written.
+        before: files that were there when this run began.
+        options: those of reading are used.
+
+    Raises:
+        ImageError: an image shows something else than the frame it should.
+    """
+    for label, own in zip(images.inputs.labels, images.videos, strict=True):
+        for name, frame in zip(own.chosen.names, own.chosen.frames.tolist(), strict=True):
+            path = folder / label / name
+            if path not in before and path.exists():
+                pictures = decodable_frames(
+                    own.source.pictures, own.tracks.num_frames, options.reading, own.display
+                )
+                check_content([path], [frame], pictures)
+                break
 
 
 @dataclass(frozen=True)

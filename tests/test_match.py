@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +25,7 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.images.files import write_images
+from colmap_av1.images.files import alone_in, write_images
 from colmap_av1.images.names import image_names
 from colmap_av1.match import match
 from colmap_av1.options import (
@@ -328,6 +330,47 @@ def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path
         match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
     assert not (tmp_path / "a.db").exists()
     assert len(list((tmp_path / "frames").iterdir())) == 1
+
+
+def test_another_run_writes_to_the_same_folder_meanwhile(
+    clip: Path, encode: Encode, tmp_path: Path
+) -> None:
+    other = encode(make_frames(16)[:, ::-1, ::-1].copy(), tmp_path / "other.mp4")
+    images = tmp_path / "images"
+
+    def match_beside(video: Path, stage: str) -> Callable[..., None]:
+        """Runs the other one, once, when a stage begins."""
+        waiting = [video]
+
+        def progress(now: str, *_: object) -> None:
+            if now == stage and waiting:
+                match(tmp_path / "beside.db", waiting.pop(), image_path=images)
+
+        return progress
+
+    with pytest.raises(ImageError, match="shows another"):
+        match(tmp_path / "a.db", clip, image_path=images, progress=match_beside(other, "motion"))
+    assert not (tmp_path / "a.db").exists()
+    shutil.rmtree(images)
+    (tmp_path / "beside.db").unlink()
+    # Two runs of one video agree.
+    report = match(
+        tmp_path / "a.db", clip, image_path=images, progress=match_beside(clip, "motion")
+    )
+    assert (report.num_images, report.num_written_images) == (16, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="locks folders")
+def test_runs_write_images_one_after_the_other(tmp_path: Path) -> None:
+    code = """
+import fcntl, os, sys
+fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+"""
+    words = [sys.executable, "-c", code, str(tmp_path / "images")]
+    with alone_in(tmp_path / "images"):
+        held = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert "BlockingIOError" in held.stderr
+    subprocess.run(words, check=True)
 
 
 def test_video_that_changes_its_size(encode: Encode, tmp_path: Path) -> None:

@@ -8,6 +8,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
+
 import av
 import av.error
 import cv2
@@ -181,6 +186,40 @@ def check_image_folder(
                     f"{path}: is {size[0]}x{size[1]}, the video {video_size[0]}x{video_size[1]}: "
                     "give another folder or remove the images"
                 )
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Make a folder of images and hold it as long as the body runs; waits for other processes.
+
+    File systems without locks, and Windows, let others go on.
+
+    Raises:
+        ImageError: it cannot be made.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImageError(cannot_write(folder, error)) from error
+    with contextlib.ExitStack() as ending:
+        if fcntl is not None:
+            held = os.open(folder, os.O_RDONLY)
+            ending.callback(os.close, held)
+            with contextlib.suppress(OSError):
+                fcntl.flock(held, fcntl.LOCK_EX)
+        try:
+            yield
+        except BaseException:
+            if is_new:
+                with contextlib.suppress(OSError):  # it holds images
+                    folder.rmdir()
+            raise
+
+
+def files_in(folder: Path) -> set[Path]:
+    """The files in a folder and those below it; none where there is no such folder."""
+    return {Path(parent, name) for parent, _, names in os.walk(folder) for name in names}
 
 
 def write_images(
