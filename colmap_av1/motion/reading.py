@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import queue
 import threading
@@ -223,8 +224,19 @@ def _read_events(
         finally:
             items.close()
 
+    def end() -> None:
+        stop.set()
+        for thread, waiting in zip(readers, ahead, strict=True):
+            while thread.is_alive():
+                while not waiting.empty():
+                    waiting.get_nowait()
+                thread.join(0.01)
+
     process = os.getpid()
     readers = [threading.Thread(target=work, args=(i,), daemon=True) for i in range(num_readers)]
+    # The interpreter ends threads that still run, of a generator that is left open, where they are,
+    # which C++ takes for an unknown exception.
+    atexit.register(end)
     for thread in readers:
         thread.start()
     try:
@@ -241,12 +253,8 @@ def _read_events(
                     break
                 yield item
     finally:
-        stop.set()
-        for thread, waiting in zip(readers, ahead, strict=True):
-            while thread.is_alive():
-                while not waiting.empty():
-                    waiting.get_nowait()
-                thread.join(0.01)
+        end()
+        atexit.unregister(end)
 
 
 def _read_groups(

@@ -174,3 +174,18 @@ def test_tiles_are_read_where_no_thread_can_be_started(tmp_path: Path) -> None:
         cwd=Path(__file__).parent,
     )
     assert (run.returncode, run.stdout.strip()) == (0, "3"), run.stderr
+
+
+@pytest.mark.parametrize("num_threads", [1, 4])
+def test_a_script_that_ends_while_it_reads(clip: Path, num_threads: int) -> None:
+    code = """
+import sys
+from colmap_av1 import ReadOptions, read_motion
+left_open = read_motion(sys.argv[1], ReadOptions(num_threads=int(sys.argv[2])))
+frame = next(left_open)
+raise SystemExit(3)
+"""
+    words = [sys.executable, "-c", code, str(clip), str(num_threads)]
+    for _ in range(5):  # one in ten was ended by a signal
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (3, "")
