@@ -398,7 +398,10 @@ def find_video_stream(container: Any, path: Path) -> Any:
         kinds = sorted({stream.type for stream in container.streams})
         found = f"only {', '.join(kinds)}" if kinds else "nothing"
         raise VideoError(f"{path}: holds no video stream, {found}: give a video")
-    moving = [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
+    moving = [s for s in streams if not s.disposition & Disposition.attached_pic]
+    if not moving and container.streams.audio:
+        raise VideoError(f"{path}: holds audio and a cover picture, no video: give a video")
+    moving = moving or streams
     coded = [s for s in moving if _codec_name(s) == "av1"] or moving
     return next((s for s in coded if s.frames != 1), coded[0])
 

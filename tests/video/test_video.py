@@ -337,6 +337,20 @@ def test_audio_only(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
         open_stream(tone)
 
 
+@pytest.mark.parametrize("ending", ["m4a", "mp3"])
+def test_audio_with_a_cover_picture(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str
+) -> None:
+    cover = ffmpeg("-i", clip, "-frames:v", "1", tmp_path / "cover.png")
+    tone = ffmpeg(
+        *("-f", "lavfi", "-i", "sine=duration=0.2", "-i", cover, "-map", "0", "-map", "1"),
+        *("-c:v", "copy", "-disposition:v:0", "attached_pic", tmp_path / f"tone.{ending}"),
+    )
+    for read in (open_stream, read_video):
+        with pytest.raises(VideoError, match="cover picture, no video"):
+            read(tone)
+
+
 def test_missing_folder_and_empty_file(tmp_path: Path) -> None:
     with pytest.raises(VideoError, match="no such file"):
         open_stream(tmp_path / "none.mp4")
