@@ -16,6 +16,7 @@ import pycolmap
 import pytest
 from conftest import AV1, PROJECT, Encode, Ffmpeg, encode_two_sizes, make_frames
 
+from colmap_av1.cli import main
 from colmap_av1.database.reading import read_images
 from colmap_av1.errors import (
     BitstreamError,
@@ -226,6 +227,26 @@ def test_images_that_ffmpeg_cut_of_a_rotated_clip(
         tables(tmp_path / "new.db")["keypoints"], tables(database)["keypoints"], strict=True
     ):
         assert ours == listed
+
+
+def test_a_listed_image_without_its_camera(clip: Path, tmp_path: Path) -> None:
+    write_images(clip, tmp_path / "cut", [f"{i:04d}.png" for i in range(16)], range(16))
+    database = listing_database(tmp_path / "cut", tmp_path / "a.db")
+    with sqlite3.connect(database) as connection:
+        connection.execute("UPDATE images SET camera_id = 77 WHERE name = '0003.png'")
+    before = database.read_bytes()
+    with pytest.raises(DatabaseError, match="lacks camera 77"):
+        match(database, clip)
+    assert database.read_bytes() == before
+
+
+def test_more_images_than_frames(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--database", str(tmp_path / "a.db"), "--video", str(clip), "--num_images", "100"]
+    assert main(["match", *words]) == 0
+    assert "has 16 frames, 100 images are wanted: all" in capsys.readouterr().err
+    assert len(read_images(tmp_path / "a.db")) == 16
 
 
 def test_every_other_frame(clip: Path, tmp_path: Path) -> None:

@@ -19,8 +19,15 @@ def listed_of_videos(
     """(width, height) of the images of each video that a database lists, by name in its folder.
 
     Raises:
-        DatabaseError: it lists images, but none of a video or not each photo, or others.
+        DatabaseError: it lists images, but none of a video or not each photo, or others, or an
+            image without its camera.
     """
+    lone = next((image for image in listed if 0 in {image.width, image.height}), None)
+    if lone is not None:
+        raise DatabaseError(
+            f"{database}: lacks camera {lone.camera_id} of image '{lone.name}', or its size: "
+            "import the image anew, or use a new database"
+        )
     sizes = {image.name: (image.width, image.height) for image in listed}
     of_videos: list[dict[str, tuple[int, int]]] = [{} for _ in inputs.labels]
     for photo in inputs.photos if listed else ():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -132,7 +133,6 @@ def choose_frames(
 
     Raises:
         OptionError: `fps` needs times.
-        ImageError: there are fewer frames than images wanted.
     """
     count = tracks.num_frames
     if options.every is not None:
@@ -144,9 +144,12 @@ def choose_frames(
     if options.num_images is None:
         return np.arange(count, dtype=np.int32)
     if options.num_images > count:
-        raise ImageError(
-            f"the video has {count} frames, {options.num_images} images are wanted: give fewer"
+        warnings.warn(
+            f"the video has {count} frames, {options.num_images} images are wanted: all of its "
+            "frames become images",
+            stacklevel=2,
         )
+        return np.arange(count, dtype=np.int32)
     if options.select == "parallax":
         place = np.concatenate([[0.0], np.cumsum(parallax(tracks))])
     else:
