@@ -6,6 +6,7 @@ import mmap
 import os
 import re
 import struct
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -242,7 +243,8 @@ def read_model(model: str | os.PathLike[str]) -> Any:
         model: folder with cameras, images and points3D, all .bin or all .txt.
 
     Returns:
-        The pycolmap.Reconstruction.
+        The pycolmap.Reconstruction, without points that have no finite position; a warning gives
+        their number.
 
     Raises:
         ModelError: the folder holds no model, a damaged one, or one without poses.
@@ -278,6 +280,15 @@ def read_model(model: str | os.PathLike[str]) -> Any:
     if reconstruction.num_reg_images() == 0:
         raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
     _check_values(path, reconstruction)
+    point_ids = list(reconstruction.points3D)
+    xyz = np.array([p.xyz for p in reconstruction.points3D.values()]).reshape(-1, 3)
+    nowhere = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
+    for index in nowhere:
+        reconstruction.delete_point3D(point_ids[index])
+    if len(nowhere):
+        warnings.warn(
+            f"{path}: ignored {len(nowhere)} points without a finite position", stacklevel=2
+        )
     return reconstruction
 
 

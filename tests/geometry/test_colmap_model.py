@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
+from colmap_av1.check.model import check_model
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
 
@@ -26,6 +28,21 @@ def test_models_of_both_formats_are_read(
     assert read.num_reg_images() == 4
     written = sorted(tuple(p.xyz) for p in reconstruction.points3D.values())
     np.testing.assert_allclose(sorted(tuple(p.xyz) for p in read.points3D.values()), written)
+
+
+def test_points_without_a_position_are_left_out(
+    reconstruction: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    some = list(reconstruction.points3D)[:3]
+    for point_id, value in zip(some, (np.nan, np.inf, -np.inf), strict=True):
+        reconstruction.points3D[point_id].xyz = np.array([0.0, value, 1.0])
+    reconstruction.write_binary(tmp_path)
+    with pytest.warns(UserWarning, match="ignored 3 points"):
+        read = read_model(tmp_path)
+    assert set(read.points3D) == set(reconstruction.points3D) - set(some)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_model(read)
 
 
 def test_what_is_no_model_is_refused(
