@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import warnings
 from collections import Counter
@@ -336,7 +337,7 @@ def _find_existing(
         except ImageError:
             if options.first_number is not None or not files:
                 raise
-            return _in_order(by_name, frames_by_content(files, decode()))
+            return _by_content(by_name, files, decode)
         chosen = _in_order(by_name, frames)
     if files:
         # The first and the last: a wrong start or rate shows there.
@@ -344,6 +345,36 @@ def _find_existing(
         paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
         check_content(paths, chosen.frames[ends].tolist(), decode())
     return chosen
+
+
+def _by_content(
+    names: Sequence[str],
+    files: Sequence[Path],
+    decode: Callable[[], Iterable[tuple[int, _Image]]],
+) -> ChosenImages:
+    """Images identified by what they show, without those that repeat the one before.
+
+    ffmpeg's fps filter repeats pictures where the video has fewer.
+    """
+    try:
+        return _in_order(names, frames_by_content(files, decode()))
+    except ImageError:
+        pairs = enumerate(itertools.pairwise(files), start=1)
+        repeated = [k for k, (before, file) in pairs if _are_same_bytes(before, file)]
+        if not repeated or len(files) - len(repeated) < 2:
+            raise
+    once = sorted(set(range(len(files))) - set(repeated))
+    frames = frames_by_content([files[k] for k in once], decode())
+    warnings.warn(
+        f"{files[0].parent}: ignored {len(repeated)} images that repeat the one before, the first "
+        f"is '{names[repeated[0]]}'",
+        stacklevel=2,
+    )
+    return _in_order([names[k] for k in once], frames)
+
+
+def _are_same_bytes(file: Path, other: Path) -> bool:
+    return file.stat().st_size == other.stat().st_size and file.read_bytes() == other.read_bytes()
 
 
 def _in_order(names: Sequence[str], frames: NDArray[np.int32]) -> ChosenImages:

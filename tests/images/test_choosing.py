@@ -285,6 +285,19 @@ def test_folder_of_all_frames_of_another_video(
         match(tmp_path / "a.db", clip, image_path=folder)
 
 
+def test_a_folder_in_which_pictures_repeat(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """ffmpeg's filter for a higher rate repeats pictures, one for a lower rate does not."""
+    folder = tmp_path / "fps"
+    folder.mkdir()
+    ffmpeg("-i", clip, "-vf", "fps=30", folder / "%04d.png")
+    num_files = len(list(folder.iterdir()))
+    assert num_files > 16
+    with pytest.warns(UserWarning, match=f"ignored {num_files - 16} images that repeat"):
+        report = match(tmp_path / "a.db", clip, image_path=folder)
+    assert (report.num_images, report.num_written_images) == (16, 0)
+    assert len(list(folder.iterdir())) == num_files
+
+
 def test_images_of_a_folder_that_may_not_be_written(
     clip: Path, cut: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
