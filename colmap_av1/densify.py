@@ -32,29 +32,25 @@ from colmap_av1.geometry.track_points import (
     triangulate_tracks,
 )
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
 from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
-from colmap_av1.options import DensifyOptions, MatchOptions
+from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
+from colmap_av1.options import DensifyOptions
 from colmap_av1.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
     write_gaussians,
 )
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
-from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.tracks.video_tracks import (
-    VideoSource,
-    decoded_pictures,
-    open_source,
-    times_of_frames,
-    track_video,
-)
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import TrackedVideo, open_source
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
@@ -95,16 +91,6 @@ class DensifyReport:
     mean_error: float
     gaussians: Path | None
     seconds: dict[str, float]
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _TrackedImages:
-    """A video's tracks in pixels of its images, in these alone, and what is to be said of it."""
-
-    tracks: Tracks
-    chosen: ChosenImages
-    conversion: str | None
     warnings: tuple[str, ...]
 
 
@@ -163,8 +149,9 @@ def densify(
         # What can be refused is refused before the long work.
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
         of_videos = images_of_videos(model, sizes, inputs, folder, options)
-        track = partial(_track, output=output, options=options, clock=clock, progress=progress)
-        tracked = [track(own) for own in of_videos]
+        context = RunContext.of(options.match.run, clock, progress)
+        found = [_track(own, output, options, context) for own in of_videos]
+        tracked = [images for images, _ in found]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
         takes = inputs.takes(
             [own.chosen for own in tracked],
@@ -194,7 +181,7 @@ def densify(
     return DensifyReport(
         output=output,
         model=model,
-        conversion=inputs.conversion([own.conversion for own in tracked]),
+        conversion=inputs.conversion([words for _, words in found]),
         num_images=len(images),
         masked=takes.masked,
         num_tracks=points.num_tracks,
@@ -206,33 +193,48 @@ def densify(
         mean_error=mean_error(cloud),
         gaussians=_write_gaussians(gaussians, cloud, views, clock),
         seconds=clock.seconds,
-        warnings=(*inputs.warnings, *inputs.with_names([own.warnings for own in tracked])),
+        warnings=(*inputs.warnings, *inputs.with_names([own.video.warnings for own in tracked])),
     )
 
 
 def _track(
-    images: VideoImages,
-    output: Path,
-    options: DensifyOptions,
-    *,
-    clock: Clock,
-    progress: Progress,
-) -> _TrackedImages:
-    """Track a video, and find the frames of its images."""
+    images: VideoImages, output: Path, options: DensifyOptions, context: RunContext
+) -> tuple[TrackedImages, str | None]:
+    """Track a video in pixels of its images.
+
+    Returns:
+        The tracks in the images alone, and how the video was converted, in words.
+    """
     matching = chaining_for_points(options.match, options.triangulate)
     opening = open_source(
-        images.video, options.match, beside=output, clock=clock, progress=progress
+        images.video,
+        options.match,
+        beside=output,
+        clock=context.clock,
+        progress=context.progress,
     )
+
+    def choose(tracked: TrackedVideo) -> ChosenImages:
+        return choose_from_video(
+            source,
+            tracked.tracks,
+            options.match,
+            existing=images.names,
+            folder=images.folder,
+            context=context,
+        )
+
     with opening as source, unchanged(source.stream.state):
-        found = track_video(source, matching, one_size=True, clock=clock, progress=progress)
-        with clock.measure("choice"):
-            chosen = _choose(found.tracks, source, images.names, images.folder, options.match)
-    tracks = found.tracks.scale_to(images.size)
-    if images.masks is not None:
-        least = least_length(matching.tracks)
-        tracks = images.masks.on_tracks(tracks, chosen, least)
-    tracks = tracks.keep_frames(chosen.frames)
-    return _TrackedImages(tracks, chosen, source.conversion, found.warnings)
+        found = track_images(
+            source,
+            matching,
+            choose,
+            masks=images.masks,
+            refine=False,
+            context=context,
+        )
+    tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.size)
+    return found.with_tracks(tracks), source.conversion
 
 
 def _triangulate(
@@ -290,24 +292,6 @@ def _coloured_cloud(
     show("colours", colours.add)
     with clock.measure("colours"):
         return replace(cloud, rgb=colours.rgb())
-
-
-def _choose(
-    tracks: Tracks,
-    source: VideoSource,
-    names: list[str],
-    folder: Path | None,
-    options: MatchOptions,
-) -> ChosenImages:
-    """The frames of the model's images."""
-    return choose_images(
-        tracks,
-        options.images,
-        existing=names,
-        folder=folder,
-        times=lambda: times_of_frames(source, tracks.num_frames),
-        decode=lambda: decoded_pictures(source, options.reading),
-    )
 
 
 def _write(

@@ -228,7 +228,7 @@ def match(
             places=positions.places,
         )
     videos = images.videos
-    notes = inputs.with_names([own.tracked.warnings for own in videos])
+    notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
     if options.on_existing != "append":  # what a database holds already may join the images, too
         notes += matching_warnings(written, images.takes)
@@ -239,16 +239,16 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        num_frames=sum(own.tracks.num_frames for own in videos),
-        num_coded_frames=sum(own.tracked.num_coded_frames for own in videos),
+        num_frames=sum(own.tracked.tracks.num_frames for own in videos),
+        num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_written_images=num_written,
         masked=images.takes.masked,
         focal_length=found.focal_length,
-        read_outs=tuple(own.tracked.read_out for own in videos),
+        read_outs=tuple(own.tracked.video.read_out for own in videos),
         seconds=clock.seconds,
         links=found.links,
         warnings=(*inputs.warnings, *notes, *blurred),
-        **_figures([own.tracks for own in videos], written),
+        **_figures([own.tracked.tracks for own in videos], written),
     )
 
 
@@ -321,7 +321,9 @@ def _prepare(
             inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True
         )
     ]
-    takes = inputs.takes([own.chosen for own in videos], [own.tracks.num_frames for own in videos])
+    takes = inputs.takes(
+        [own.tracked.chosen for own in videos], [own.tracked.tracks.num_frames for own in videos]
+    )
     return _Images(inputs, videos, takes)
 
 
@@ -346,7 +348,9 @@ def _match_images(
     return match_images(
         takes,
         [
-            SelectedTracks(own.source.pictures.path, own.tracks, own.tracked.inter_share)
+            SelectedTracks(
+                own.source.pictures.path, own.tracked.tracks, own.tracked.video.inter_share
+            )
             for own in videos
         ],
         images.inputs.no_motion,
@@ -369,18 +373,18 @@ def _with_chosen_tracks(
     prepared: PreparedImages, options: MatchOptions, clock: Clock
 ) -> PreparedImages:
     """The images with the tracks that are matched, in place of all tracks of the video."""
+    tracked = prepared.tracked
     tracks, read_out = without_shutter(
-        prepared.tracks,
+        tracked.tracks,
         prepared.display,
         prepared.source.pictures.frame_rate,
         options.camera,
         RunContext.of(options.run, clock),
     )
     with clock.measure("pairs"):
-        tracks = select_tracks(tracks.keep_frames(prepared.chosen.frames), options.density)
-    return replace(
-        prepared, tracks=tracks, tracked=replace(prepared.tracked, tracks=tracks, read_out=read_out)
-    )
+        tracks = select_tracks(tracks.keep_frames(tracked.chosen.frames), options.density)
+    video = replace(tracked.video, tracks=tracks, read_out=read_out)
+    return replace(prepared, tracked=replace(tracked, video=video))
 
 
 def _figures(tracks: Sequence[Tracks], matched: MatchedImages) -> dict[str, Any]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.choosing import ChosenImages, check_frame_list, choose_images
+from colmap_av1.images.choosing import ChosenImages, check_frame_list
 from colmap_av1.images.files import (
     blur_warning,
     check_image_folder,
@@ -25,18 +24,20 @@ from colmap_av1.images.files import (
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.recognising import check_content, is_turned_back
+from colmap_av1.images.track_images import (
+    TrackedImages,
+    choose_from_video,
+    decode_all,
+    track_images,
+)
 from colmap_av1.options import MatchOptions
-from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
-    decodable_frames,
     open_source,
-    refine_in_images,
-    times_of_frames,
-    track_video,
 )
 from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display, shown_size, turned_back
 from colmap_av1.video.facts import Video, count_shown
@@ -52,18 +53,14 @@ class PreparedImages:
     Attributes:
         source: the video; a stream that is not kept is gone by now.
         display: how its pictures are shown in the images.
-        tracked: the video's tracks, in its own pixels.
-        tracks: the same in pixels of the images.
-        chosen: the images.
+        tracked: the tracks, in pixels of the images, and the images.
         size: (width, height) of the images.
         pixel_aspect: width of a pixel of theirs over its height.
     """
 
     source: VideoSource
     display: Display
-    tracked: TrackedVideo
-    tracks: Tracks
-    chosen: ChosenImages
+    tracked: TrackedImages
     size: tuple[int, int]
     pixel_aspect: float
 
@@ -75,14 +72,12 @@ class _Fit:
     Attributes:
         existing: (width, height) of the images that exist, by name.
         display: how the video's pictures are shown in the images.
-        back: what turns shown pictures so; None where images show them as players do.
         video_size: (width, height) of the pictures so shown.
         size: (width, height) of the images.
     """
 
     existing: dict[str, tuple[int, int]]
     display: Display
-    back: Display | None
     video_size: tuple[int, int]
     size: tuple[int, int]
 
@@ -151,53 +146,44 @@ def prepare_images(
         names = existing or names_of_all(options.images, count_shown(video))
         masks.check([size, fit.video_size], names, options.images)
 
+    context = RunContext.of(options.run, clock, progress)
+
+    def choose(tracked: TrackedVideo) -> ChosenImages:
+        return choose_from_video(
+            source,
+            tracked.tracks,
+            options,
+            existing=existing,
+            folder=folder,
+            display=display,
+            context=context,
+        )
+
     with (
         open_source(video, options, beside=beside, clock=clock, progress=progress) as source,
         unchanged(source.stream.state),
     ):
-        tracked = track_video(
-            source, options, one_size=folder is not None, clock=clock, progress=progress
+        found = track_images(
+            source,
+            options,
+            choose,
+            masks=masks,
+            display=display,
+            one_size=folder is not None,
+            context=context,
         )
-        tracks = _tracks_that_count(tracked.tracks, source, fit, masks, options)
-
-        def decode() -> Iterator[tuple[int, _Image]]:
-            pictures = decodable_frames(
-                source.pictures, tracks.num_frames, options.reading, display
-            )
-            for index, picture in pictures:
-                progress("looking", index + 1, tracks.num_frames)
-                yield index, picture
-
-        with clock.measure("choice"):
-            chosen = choose_images(
-                tracks,
-                options.images,
-                existing=existing,
-                folder=folder,
-                times=lambda: times_of_frames(source, tracks.num_frames),
-                decode=decode,
-            )
-        refined = refine_in_images(
-            tracked, source, chosen.frames, options, clock=clock, progress=progress
-        )
-        if refined is not tracked:
-            tracked = refined
-            tracks = _tracks_that_count(tracked.tracks, source, fit, masks, options)
-    if masks is not None:
-        tracks = masks.on_images(tracks, chosen, least_length(options.tracks))
-        tracked = replace(tracked, inter_share=masks.on_motion(tracked.inter_share))
     if folder is not None:
-        check_image_folder(folder, chosen.names, size)
-        kept = zip(chosen.names, chosen.frames.tolist(), strict=True)
+        names, frames = found.chosen.names, found.chosen.frames.tolist()
+        check_image_folder(folder, names, size)
+        kept = zip(names, frames, strict=True)
         first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
         if not existing and first_kept is not None:
-            check_content([folder / first_kept[0]], [first_kept[1]], decode())
+            pictures = decode_all(source, found.tracks.num_frames, options, display, context)
+            check_content([folder / first_kept[0]], [first_kept[1]], pictures)
     return PreparedImages(
         source=source,
         display=display,
-        tracked=tracked,
-        tracks=tracks.scale_to(size),
-        chosen=chosen,
+        tracked=found.with_tracks(found.tracks.scale_to(size)),
         size=size,
         pixel_aspect=fit.pixel_aspect,
     )
@@ -221,32 +207,7 @@ def _fit(
         display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
         video_size = shown_size(video_size, back)
     size = size_of_images(existing, video_size, display.pixel_aspect)
-    return _Fit(existing, display, back, video_size, size)
-
-
-def _tracks_that_count(
-    tracks: Tracks,
-    source: VideoSource,
-    fit: _Fit,
-    masks: VideoMasks | None,
-    options: MatchOptions,
-) -> Tracks:
-    """The tracks as the images show the video, where masks of frames leave them."""
-    shown = _tracks_as_shown(tracks, source, fit)
-    return shown if masks is None else masks.on_frames(shown, least_length(options.tracks))
-
-
-def _tracks_as_shown(tracks: Tracks, source: VideoSource, fit: _Fit) -> Tracks:
-    """The tracks as the images show the video; refuses a stream of other pictures."""
-    if fit.back is not None:
-        tracks = tracks.as_displayed(fit.back)
-    width, height = fit.video_size
-    if (tracks.width, tracks.height) != fit.video_size:
-        raise VideoError(
-            f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
-            f"{source.pictures} {width}x{height}: convert it by another --encoder"
-        )
-    return tracks
+    return _Fit(existing, display, video_size, size)
 
 
 def write_chosen(
@@ -303,11 +264,11 @@ def write_all_chosen(
     num_written, warnings = 0, list[str]()
     for label, own in videos:
         num_written += write_chosen(
-            *(own.source.pictures, folder / label, own.chosen, options),
+            *(own.source.pictures, folder / label, own.tracked.chosen, options),
             display=own.display,
             progress=progress,
         )
-        warning = blur_warning([folder / label / name for name in own.chosen.names])
+        warning = blur_warning([folder / label / name for name in own.tracked.chosen.names])
         warnings += [warning] if warning is not None else []
     return num_written, warnings
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,29 +14,18 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.geometry.track_points import chaining_for_points
-from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
+from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
-from colmap_av1.options import (
-    MatchOptions,
-    ReconstructOptions,
-    RefineOptions,
-)
+from colmap_av1.options import MatchOptions, ReconstructOptions, RefineOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.tracks.video_tracks import (
-    TrackedVideo,
-    VideoSource,
-    count_frames,
-    decoded_pictures,
-    refine_in_images,
-    times_of_frames,
-    track_video,
-)
+from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource, count_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.util.run_context import RunContext
@@ -54,8 +44,6 @@ _PIXELS_OF_UNIT = 16
 # those that poses come from.
 _FEWER = 4
 _SEEDING = 8
-# Of its images, that see a track at least.
-_FEWEST_SEEN = 2
 
 
 @dataclass(frozen=True)
@@ -154,7 +142,8 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     name, shown = stage_of_video(run, video), source.pictures
 
     def make(partial: Path) -> TracksResult:
-        tracked, chosen, is_long = _track_and_choose(run, video, options, partial)
+        found, is_long = _track_and_choose(run, video, options, partial)
+        chosen, tracked = found.chosen, found.video
         tracks, read_out = without_shutter(
             tracked.tracks,
             shown.display,
@@ -188,95 +177,74 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
 
 def _track_and_choose(
     run: Run, video: int, options: MatchOptions, folder: Path
-) -> tuple[TrackedVideo, ChosenImages, bool]:
+) -> tuple[TrackedImages, bool]:
     """Chain the motion of a video into tracks, and choose its images.
 
     Returns:
-        The tracks, the images, and whether the video is long.
+        The tracks and images, and whether the video is long.
     """
-    source, clock, progress = run.sources[video], run.clock, run.progress
-    is_long = not options.images.ways and count_frames(source) > run.options.max_images
-    if is_long:
-        tracked, chosen = _track_long(run, video, options)
-    else:
-        tracked = _track(run, video, options, frames=None, clock=clock)
-        with clock.measure("choice"):
-            chosen = choose_images(
-                pose_tracks(run, tracked.tracks),
-                options.images,
-                existing=(),
-                folder=folder,
-                times=lambda: times_of_frames(source, tracked.tracks.num_frames),
-                decode=lambda: decoded_pictures(source, options.reading),
-            )
-    tracked = refine_in_images(
-        tracked, source, chosen.frames, options, clock=clock, progress=progress
-    )
+    source = run.sources[video]
+    if not options.images.ways and count_frames(source) > run.options.max_images:
+        return _track_long(run, video, options), True
+    context = RunContext.of(options.run, run.clock, run.progress)
+
+    def choose(tracked: TrackedVideo) -> ChosenImages:
+        return choose_from_video(
+            source,
+            pose_tracks(run, tracked.tracks),
+            options,
+            folder=folder,
+            context=context,
+        )
+
     masks = run.inputs.masks_of_videos[video]
-    if masks is not None:
-        all_there = not is_long or _has_shutter(options)
-        least = least_length(options.tracks) if all_there else _FEWEST_SEEN
-        left = masks.on_tracks(tracked.tracks, chosen, least)
-        tracked = replace(tracked, tracks=left)
-    return tracked, chosen, is_long
+    return track_images(source, options, choose, masks=masks, context=context), False
 
 
-def _has_shutter(options: MatchOptions) -> bool:
-    """Whether the shutter is to be corrected, by the motion between all neighbouring frames."""
-    return options.camera.rolling_shutter != "none"
+def _track_long(run: Run, video: int, options: MatchOptions) -> TrackedImages:
+    """The tracks of a video with more frames than `max_images`, in chosen images alone.
 
-
-def _track(
-    run: Run, video: int, options: MatchOptions, *, frames: NDArray[np.int32] | None, clock: Clock
-) -> TrackedVideo:
-    """The tracks of a video where masks of frames leave them, see `track_video`."""
-    tracked = track_video(
-        run.sources[video],
-        options,
-        one_size=True,
-        frames=frames,
-        clock=clock,
-        progress=run.progress,
-    )
-    masks = run.inputs.masks_of_videos[video]
-    if masks is None:
-        return tracked
-    least = least_length(options.tracks) if frames is None else _FEWEST_SEEN
-    left = masks.on_frames(tracked.tracks, least)
-    return replace(tracked, tracks=left, inter_share=masks.on_motion(tracked.inter_share))
-
-
-def _track_long(run: Run, video: int, options: MatchOptions) -> tuple[TrackedVideo, ChosenImages]:
-    """The tracks of a video with more frames than a trainer wants, in so many images alone.
-
-    These are chosen among frames that lie evenly. Where the tracks of all of these are too much to
-    be held, the motion is read once for the choice alone, by few tracks, and then again; so too
-    where the shutter is to be corrected or tracks are refined, which takes other frames.
+    These are chosen among evenly spread frames. The motion is read twice, first for the choice
+    alone and by few tracks, if the tracks in all these frames take too much memory, or if the
+    shutter is corrected or tracks are refined, which takes other frames.
     """
-    source, clock = run.sources[video], run.clock
+    source = run.sources[video]
     count = count_frames(source)
     most = min(count, _CANDIDATES * run.options.max_images)
     candidates = np.array(evenly_spread(count, most), dtype=np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_OF_UNIT
-    is_plain = options.refine.refine == "none" and not _has_shutter(options)
-    if is_plain and held <= _MOST_HELD:
-        tracked = _track(run, video, options, frames=candidates, clock=clock)
-        with clock.measure("choice"):
+    # Motion between all neighbouring frames is needed to correct the shutter.
+    has_shutter = options.camera.rolling_shutter != "none"
+    context = RunContext.of(options.run, run.clock, run.progress)
+    track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
+
+    if options.refine.refine == "none" and not has_shutter and held <= _MOST_HELD:
+
+        def choose(tracked: TrackedVideo) -> ChosenImages:
             few = tracked.tracks.every_nth(_FEWER)
-            chosen = _spread_in(run, video, replace(tracked, tracks=few), candidates)
-            tracks = tracked.tracks.keep_frames(chosen.frames)
-            return replace(tracked, tracks=tracks.keep_long(_FEWEST_SEEN)), chosen
-    with clock.measure("choice"):
-        sketch = replace(
-            run.options.match,
-            tracks=replace(run.options.match.tracks, seeding=_SEEDING),
-            refine=RefineOptions(),
-        )
-        tracked = _track(run, video, sketch, frames=candidates, clock=Clock())
-        chosen = _spread_in(run, video, tracked, candidates)
-    frames = None if _has_shutter(options) else chosen.frames
-    return _track(run, video, options, frames=frames, clock=clock), chosen
+            return _spread_in(run, video, replace(tracked, tracks=few), candidates)
+
+        return track(options, choose, frames=candidates, context=context)
+
+    with run.clock.measure("choice"):
+        chosen = track(
+            replace(
+                run.options.match,
+                tracks=replace(run.options.match.tracks, seeding=_SEEDING),
+                refine=RefineOptions(),
+            ),
+            lambda tracked: _spread_in(run, video, tracked, candidates),
+            frames=candidates,
+            refine=False,
+            context=replace(context, clock=Clock()),
+        ).chosen
+    return track(
+        options,
+        lambda _: chosen,
+        frames=None if has_shutter else chosen.frames,
+        context=context,
+    )
 
 
 def _spread_in(

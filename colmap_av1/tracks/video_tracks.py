@@ -311,21 +311,13 @@ def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64]
     return None if times is None or len(times) < num_frames else times[:num_frames]
 
 
-def decoded_pictures(source: VideoSource, options: ReadOptions) -> Iterator[tuple[int, _Image]]:
-    """Index and picture (BGR) of every shown frame."""
-    return decode_frames(
-        source.pictures,
-        operating_point=options.operating_point,
-        num_threads=options.num_threads,
-    )
-
-
 def refine_in_images(
     tracked: TrackedVideo,
     source: VideoSource,
     frames: NDArray[np.int32],
     options: MatchOptions,
     *,
+    display: Display | None = None,
     clock: Clock,
     progress: Progress,
 ) -> TrackedVideo:
@@ -339,6 +331,7 @@ def refine_in_images(
         source: the video.
         frames: int32 [n] frames that become images, ascending.
         options: those of reading are used.
+        display: how images show the pictures; None: as players do.
         clock: gets the stage "refinement".
         progress: called for the stage "refinement".
 
@@ -352,7 +345,12 @@ def refine_in_images(
         wanted = frozenset(frames.tolist())
         num_frames = int(frames[-1]) + 1
         pictures = decodable_frames(
-            source.pictures, num_frames, options.reading, wanted=wanted, kept=source.kept
+            source.pictures,
+            num_frames,
+            options.reading,
+            display,
+            wanted=wanted,
+            kept=source.kept,
         )
         tracks = refine_spread_tracks(
             tracked.tracks,

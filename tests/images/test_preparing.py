@@ -57,10 +57,9 @@ def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
     )
     assert told == {"motion"}
     assert list(clock.seconds) == ["motion", "tracks", "choice"]
-    assert found.chosen.names == image_names("frame_%06d.png", found.chosen.frames)
+    assert found.tracked.chosen.names == image_names("frame_%06d.png", found.tracked.chosen.frames)
     assert found.size == (192, 128)
     assert found.pixel_aspect == 1.0
-    assert found.tracks is found.tracked.tracks
 
 
 def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> None:
@@ -70,10 +69,11 @@ def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> No
         small = cv2.resize(picture, (96, 63), interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(tmp_path / "images" / f"{index + 1}.png"), small)
     found = prepared(clip, tmp_path / "images")
-    assert found.size == (found.tracks.width, found.tracks.height) == (96, 63)
-    assert found.chosen.names == [f"{i + 1}.png" for i in range(16)]
+    assert found.size == (found.tracked.tracks.width, found.tracked.tracks.height) == (96, 63)
+    assert found.tracked.chosen.names == [f"{i + 1}.png" for i in range(16)]
     factor = np.array([96 / 192, 63 / 128])
-    np.testing.assert_allclose(found.tracks.xy, found.tracked.tracks.xy * factor, rtol=1e-6)
+    in_video = prepared(clip).tracked.tracks
+    np.testing.assert_allclose(found.tracked.tracks.xy, in_video.xy * factor, rtol=1e-6)
     # A pixel of the images is 2 of the video wide and 128 / 63 high.
     assert found.pixel_aspect == pytest.approx(2 / (128 / 63))
     listed = {f"{i}.png": (96, 63) for i in range(16)}
@@ -86,8 +86,8 @@ def test_layers_of_a_scalable_stream_have_their_own_size(
 ) -> None:
     options = replace(OPTIONS, read=ReadOptions(operating_point=operating_point))
     first = prepared(LAYERS, tmp_path, options)
-    assert first.size == (first.tracks.width, first.tracks.height) == size
-    names, frames = first.chosen.names, first.chosen.frames
+    assert first.size == (first.tracked.tracks.width, first.tracked.tracks.height) == size
+    names, frames = first.tracked.chosen.names, first.tracked.chosen.frames
     write_images(LAYERS, tmp_path, names, frames.tolist(), operating_point=operating_point)
     # They are what another run finds.
     assert prepared(LAYERS, tmp_path, options).size == size
@@ -119,4 +119,4 @@ def test_images_of_an_earlier_run_must_be_of_this_video(
     with pytest.raises(ImageError, match=r"frame_000000\.png: should show frame 0 of the video"):
         prepared(clip, tmp_path / "images")
     write_images(clip, tmp_path / "own", names[:3], range(3))
-    assert prepared(clip, tmp_path / "own").chosen.names == names
+    assert prepared(clip, tmp_path / "own").tracked.chosen.names == names

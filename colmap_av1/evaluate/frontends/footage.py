@@ -132,18 +132,18 @@ def choose_footage(
                 clock=clock,
                 progress=progress,
             )
-            chosen = prepared.chosen
+            chosen = prepared.tracked.chosen
             check_video()
             pictures, display = prepared.source.pictures, prepared.display
             write_chosen(pictures, images, chosen, options, display=display, progress=progress)
         return {
             "names": chosen.names,
             "frames": chosen.frames.tolist(),
-            "num_frames": prepared.tracks.num_frames,
+            "num_frames": prepared.tracked.tracks.num_frames,
             "size": prepared.size,
             "pixel_aspect": prepared.pixel_aspect,
             "forward_motion": _is_forward_motion(prepared, video.path, options),
-            "warnings": prepared.tracked.warnings,
+            "warnings": prepared.tracked.video.warnings,
             "existed": existed,
         }
 
@@ -179,7 +179,7 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     """Whether the camera moves along its axis; decided only with known intrinsics."""
     if options.camera.camera_params is None:
         return False
-    tracks, chosen = prepared.tracks, prepared.chosen
+    tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
     seen = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
     context = RunContext.of(options.run)

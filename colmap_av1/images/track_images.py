@@ -1,0 +1,195 @@
+"""The step from a video to the tracks of its images: chain, mask, choose, refine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import VideoError
+from colmap_av1.images.choosing import ChosenImages, choose_images
+from colmap_av1.images.masks import VideoMasks
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.tracks.video_tracks import (
+    TrackedVideo,
+    VideoSource,
+    decodable_frames,
+    refine_in_images,
+    times_of_frames,
+    track_video,
+)
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.video.display import Display, shown_size, turned_back
+
+_Image = NDArray[np.uint8]
+
+# Images that observe a track, at least, where other frames are not kept.
+_MIN_IMAGES = 2
+
+
+@dataclass(frozen=True)
+class TrackedImages:
+    """The tracks of a video and the frames that are images.
+
+    Attributes:
+        video: the tracks without masked pixels, in pixels of the shown pictures.
+        chosen: the images.
+    """
+
+    video: TrackedVideo
+    chosen: ChosenImages
+
+    @property
+    def tracks(self) -> Tracks:
+        """The tracks of the video."""
+        return self.video.tracks
+
+    def with_tracks(self, tracks: Tracks) -> TrackedImages:
+        """The same with other tracks."""
+        return replace(self, video=replace(self.video, tracks=tracks))
+
+
+def track_images(
+    source: VideoSource,
+    options: MatchOptions,
+    choose: Callable[[TrackedVideo], ChosenImages],
+    *,
+    masks: VideoMasks | None,
+    display: Display | None = None,
+    one_size: bool = True,
+    frames: NDArray[np.int32] | None = None,
+    refine: bool = True,
+    context: RunContext,
+) -> TrackedImages:
+    """Chain the motion of a video into tracks, mask them, choose images and refine there.
+
+    Masks of frames apply before images are chosen; all masks apply again at the end, as
+    refinement moves observations and images may have masks of their own.
+
+    Args:
+        source: the video.
+        options: those of reading, chaining and refinement are used.
+        choose: chooses the images by the masked tracks.
+        masks: masks of the video; None: all pixels count.
+        display: how images show the pictures; None: as players do.
+        one_size: refuse frames of several sizes, see `track_video`.
+        frames: int32 [n] frames among which images are chosen; tracks are kept in the images alone.
+            None: tracks are kept in all frames.
+        refine: correct tracks of downscaled motion, see `refine_in_images`.
+        context: its clock gets the stages of `track_video` and "choice".
+
+    Raises:
+        VideoError: the video shows no frame, or frames of another size than its container says.
+        BitstreamError: the stream is damaged, and strict or before its second frame.
+        ImageError: the frames change their size and must not, no images can be chosen, or an image
+            has no mask.
+        OptionError: an option does not fit the video or its images.
+    """
+    clock, progress = context.clock, context.progress
+    min_length = least_length(options.tracks) if frames is None else _MIN_IMAGES
+    video = track_video(
+        source,
+        options,
+        one_size=one_size,
+        frames=frames,
+        clock=clock,
+        progress=progress,
+    )
+    video = replace(video, tracks=_as_displayed(video.tracks, source, display))
+    if masks is not None:
+        video = replace(
+            video,
+            tracks=masks.on_frames(video.tracks, min_length),
+            inter_share=masks.on_motion(video.inter_share),
+        )
+    with clock.measure("choice"):
+        chosen = choose(video)
+        if frames is not None:
+            tracks = video.tracks.keep_frames(chosen.frames).keep_long(min_length)
+            video = replace(video, tracks=tracks)
+    if refine:
+        video = refine_in_images(
+            video,
+            source,
+            chosen.frames,
+            options,
+            display=display,
+            clock=clock,
+            progress=progress,
+        )
+    if masks is not None:
+        video = replace(video, tracks=masks.on_tracks(video.tracks, chosen, min_length))
+    return TrackedImages(video, chosen)
+
+
+def choose_from_video(
+    source: VideoSource,
+    tracks: Tracks,
+    options: MatchOptions,
+    *,
+    existing: Sequence[str] = (),
+    folder: Path | None,
+    display: Display | None = None,
+    context: RunContext,
+) -> ChosenImages:
+    """Choose the images of a video, see `choose_images`.
+
+    Args:
+        source: the video.
+        tracks: tracks through all its frames.
+        options: those of images and reading are used.
+        existing: names of images that exist.
+        folder: folder of the images; None: no picture is decoded.
+        display: how images show the pictures; None: as players do.
+        context: its progress is called in the stage "looking".
+    """
+    return choose_images(
+        tracks,
+        options.images,
+        existing=existing,
+        folder=folder,
+        times=lambda: times_of_frames(source, tracks.num_frames),
+        decode=lambda: decode_all(source, tracks.num_frames, options, display, context),
+    )
+
+
+def decode_all(
+    source: VideoSource,
+    num_frames: int,
+    options: MatchOptions,
+    display: Display | None,
+    context: RunContext,
+) -> Iterator[tuple[int, _Image]]:
+    """Decode all frames that have tracks, with progress in the stage "looking"."""
+    pictures = decodable_frames(
+        source.pictures,
+        num_frames,
+        options.reading,
+        display,
+        use="pictures are looked at",
+    )
+    for index, picture in pictures:
+        context.progress("looking", index + 1, num_frames)
+        yield index, picture
+
+
+def _as_displayed(tracks: Tracks, source: VideoSource, display: Display | None) -> Tracks:
+    """The tracks in pixels of the pictures as images show them.
+
+    Raises:
+        VideoError: frames have another size than the container says.
+    """
+    pictures, size = source.pictures, source.pictures.picture_size
+    if display is not None and display.turn != pictures.display.turn:
+        back = turned_back(pictures.display)
+        tracks, size = tracks.as_displayed(back), shown_size(size, back)
+    if (tracks.width, tracks.height) != size:
+        raise VideoError(
+            f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
+            f"{pictures} {size[0]}x{size[1]}: convert it by another --encoder"
+        )
+    return tracks
