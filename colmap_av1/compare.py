@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.check.model_figures import model_figures
@@ -381,11 +381,11 @@ def _measure(
     return column, cloud
 
 
-def _colours(model: Any) -> NDArray[np.uint8]:
+def _colours(model: pycolmap.Reconstruction) -> NDArray[np.uint8]:
     """Colours of the points, in the order of their ids."""
     colours = [model.points3D[i].color for i in sorted(model.points3D)]
     return np.array(colours, dtype=np.uint8).reshape(-1, 3)
 
 
-def _focal_length(model: Any) -> float:
+def _focal_length(model: pycolmap.Reconstruction) -> float:
     return float(next(iter(model.cameras.values())).mean_focal_length())

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError, cannot_write
@@ -296,7 +296,7 @@ def _coloured_cloud(
 
 def _write(
     output: Path,
-    cameras: Mapping[int, Any],
+    cameras: Mapping[int, pycolmap.Camera],
     images: Sequence[ModelImage],
     points: ModelPoints,
     overwrite: bool,
@@ -362,5 +362,5 @@ def _read_inputs(
     return read_inputs(video, photos, options.match, flat=True) if inputs.photos else inputs
 
 
-def _size(camera: Any) -> tuple[int, int]:
+def _size(camera: pycolmap.Camera) -> tuple[int, int]:
     return int(camera.width), int(camera.height)

@@ -235,10 +235,10 @@ def parallax_of(
         if pycolmap.estimate_two_view_geometry_pose(
             ends[0], images.keypoints[i], ends[1], images.keypoints[j], geometry
         ):
+            pose = geometry.cam2_from_cam1
+            assert pose is not None
             angles.append(np.rad2deg(geometry.tri_angle))
-            forward.append(
-                abs(geometry.cam2_from_cam1.translation[2]) >= INITIAL_MAX_FORWARD_MOTION
-            )
+            forward.append(abs(pose.translation[2]) >= INITIAL_MAX_FORWARD_MOTION)
             known = known and all(camera.has_prior_focal_length for camera in ends)
     widest = candidates[np.argmax(pairs.displacement[candidates])]
     i, j = pairs.index[widest]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.file import open_unaltered
@@ -79,7 +79,7 @@ class Crossings:
         )
 
 
-def model_crossings(reconstruction: Any, database: Path) -> Crossings:
+def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> Crossings:
     """Hold the verified matches of a database against the poses of a model of it.
 
     Args:
@@ -103,7 +103,7 @@ def model_crossings(reconstruction: Any, database: Path) -> Crossings:
 
 
 def _fitting(
-    images: list[ModelImage], cameras: Any, database: Path
+    images: list[ModelImage], cameras: pycolmap.CameraMap, database: Path
 ) -> Iterator[tuple[int, int, NDArray[np.bool_]]]:
     """Each matched pair of images, by their place, i < j, and which of its matches fit the poses.
 

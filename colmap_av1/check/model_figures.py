@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.coverage import coverage_of_model
@@ -35,7 +35,7 @@ class ModelFigures:
     focal_length: float
 
 
-def model_figures(model: Any) -> ModelFigures:
+def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
     """Figures of a pycolmap.Reconstruction, or of the model in a folder.
 
     Raises:

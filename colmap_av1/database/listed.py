@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+
+import pycolmap
 
 from colmap_av1.database.reading import DatabaseImage, read_cameras
 from colmap_av1.errors import DatabaseError, OptionError
@@ -58,7 +59,7 @@ def listed_of_videos(
 
 def listed_cameras(
     database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
-) -> list[Any]:
+) -> list[pycolmap.Camera]:
     """The cameras that the database has of its images, one for each name.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -111,7 +112,8 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
         return "the camera does not move"
     post = _POST / rough
     pycolmap.set_random_seed(seed)
-    found = pycolmap.estimate_sim3d_robust(
+    # A dictionary, although the stub says Sim3d.
+    found: Any = pycolmap.estimate_sim3d_robust(
         np.concatenate([path, path + post * up.direction]),
         np.concatenate([positions, positions + _POST * _UP]),
         pycolmap.RANSACOptions(max_error=_MAX_ERROR, max_num_trials=_NUM_TRIALS),

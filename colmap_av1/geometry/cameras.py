@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pycolmap
 
@@ -67,14 +65,14 @@ def make_camera(
     if has_two_focal_lengths(camera):
         params = camera.params
         params[camera.focal_length_idxs()[0]] = focal_length / pixel_aspect
-        camera.params = params
+        camera.params = params.tolist()
     camera.has_prior_focal_length = is_known
     if options.camera_params is not None:
         camera.params = parse_camera_params(options.camera_params, camera)
     return camera
 
 
-def camera_fault(camera: Any) -> str | None:
+def camera_fault(camera: pycolmap.Camera) -> str | None:
     """What makes a pycolmap.Camera none, in words that follow "has"; None where nothing does."""
     if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
         return f"a size of {camera.width}x{camera.height}"
@@ -85,7 +83,7 @@ def camera_fault(camera: Any) -> str | None:
     return None
 
 
-def is_undistorted(camera: Any) -> bool:
+def is_undistorted(camera: pycolmap.Camera) -> bool:
     """Whether the model of a pycolmap.Camera has no distortion."""
     return camera.model_name in _UNDISTORTED
 
@@ -100,12 +98,12 @@ def is_fisheye(model: str | None) -> bool:
     return model is not None and "FISHEYE" in model
 
 
-def has_two_focal_lengths(camera: Any) -> bool:
+def has_two_focal_lengths(camera: pycolmap.Camera) -> bool:
     """Whether the model of a pycolmap.Camera has separate focal lengths for x and y."""
     return len(camera.focal_length_idxs()) == 2
 
 
-def check_pixel_aspect(camera: Any, pixel_aspect: float, what_to_do: str) -> list[str]:
+def check_pixel_aspect(camera: pycolmap.Camera, pixel_aspect: float, what_to_do: str) -> list[str]:
     """Warn of a camera with one focal length where pixels are not square.
 
     Args:

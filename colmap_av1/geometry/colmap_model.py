@@ -127,7 +127,7 @@ def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
 
 
-def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
+def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImage]:
     """The images of a pycolmap.Reconstruction that have a pose, by name."""
     return {
         image.name: ModelImage(
@@ -141,7 +141,9 @@ def posed_images(reconstruction: Any) -> dict[str, ModelImage]:
     }
 
 
-def model_points(reconstruction: Any, images: Sequence[ModelImage]) -> ModelPoints:
+def model_points(
+    reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
+) -> ModelPoints:
     """All points of a pycolmap.Reconstruction, by their ids, with the observations of some images.
 
     Args:
@@ -169,7 +171,10 @@ def model_points(reconstruction: Any, images: Sequence[ModelImage]) -> ModelPoin
 
 
 def write_model(
-    folder: Path, cameras: Mapping[int, Any], images: Sequence[ModelImage], points: ModelPoints
+    folder: Path,
+    cameras: Mapping[int, pycolmap.Camera],
+    images: Sequence[ModelImage],
+    points: ModelPoints,
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin, as all versions of COLMAP read them.
 
@@ -236,7 +241,7 @@ def _point_records(points: ModelPoints, elements: NDArray[Any], first: int, last
     return records.tobytes()
 
 
-def read_model(model: str | os.PathLike[str]) -> Any:
+def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
     """Read a COLMAP model.
 
     Args:
@@ -292,7 +297,7 @@ def read_model(model: str | os.PathLike[str]) -> Any:
     return reconstruction
 
 
-def _check_values(path: Path, reconstruction: Any) -> None:
+def _check_values(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
     """Refuse what pycolmap reads without a look: names, poses and cameras."""
     map_again = "map again, or give another model"
     for image_id, image in reconstruction.images.items():

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
@@ -39,7 +39,7 @@ class PosedCamera:
         mask: which pixels of the image count; None: all.
     """
 
-    camera: Any
+    camera: pycolmap.Camera
     cam_from_world: _Floats
     mask: Mask | None = None
 
@@ -104,7 +104,9 @@ class PosedCamera:
 
 
 def views_of(
-    images: Sequence[ModelImage], cameras: Mapping[int, Any], masks: Sequence[Mask | None]
+    images: Sequence[ModelImage],
+    cameras: Mapping[int, pycolmap.Camera],
+    masks: Sequence[Mask | None],
 ) -> list[PosedCamera]:
     """The cameras where images were taken, by the cameras' ids, and what of them counts."""
     return [
@@ -135,7 +137,7 @@ def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     return filled / max(total, 1)
 
 
-def coverage_of_model(reconstruction: Any) -> float:
+def coverage_of_model(reconstruction: pycolmap.Reconstruction) -> float:
     """`coverage` of a pycolmap.Reconstruction's points in its images."""
     images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
     cameras = reconstruction.cameras
@@ -185,7 +187,7 @@ def without_gaps(grid: _Floats) -> _Floats:
     return np.where(nearer >= _AROUND - 1, np.inf, grid)
 
 
-def _seen_rays(camera: Any) -> tuple[_Floats, _Floats]:
+def _seen_rays(camera: pycolmap.Camera) -> tuple[_Floats, _Floats]:
     """Least and largest (x / z, y / z) that a picture's edge shows, a little widened."""
     width, height = float(camera.width), float(camera.height)
     along = np.linspace(0.0, 1.0, _EDGE_POINTS)

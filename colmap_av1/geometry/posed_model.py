@@ -11,7 +11,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -36,7 +35,7 @@ class PosedModel:
         points: the points; none where only the poses matter.
     """
 
-    cameras: Mapping[int, Any]
+    cameras: Mapping[int, pycolmap.Camera]
     images: Sequence[ModelImage]
     points: ModelPoints = field(default_factory=no_points)
 
@@ -46,7 +45,9 @@ class PosedModel:
         return {image.name: image for image in self.images}
 
 
-def posed_model(reconstruction: Any, *, with_points: bool = False) -> PosedModel:
+def posed_model(
+    reconstruction: pycolmap.Reconstruction, *, with_points: bool = False
+) -> PosedModel:
     """The cameras and registered images of a pycolmap.Reconstruction, and its points if asked."""
     images = list(posed_images(reconstruction).values())
     used = {image.camera_id for image in images}

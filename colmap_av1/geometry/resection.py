@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres
@@ -49,7 +50,7 @@ def sightings_of(
     seen: Tracks,
     tracks: Tracks,
     frames: NDArray[np.int32],
-    camera: Any,
+    camera: pycolmap.Camera,
 ) -> Sightings:
     """The points of tracks where other frames see the same tracks.
 

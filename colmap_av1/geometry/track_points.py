@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelPoints
@@ -65,9 +65,9 @@ def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[
 def triangulate_tracks(
     tracks: Tracks,
     view: NDArray[np.int64],
-    cameras: Sequence[Any],
+    cameras: Sequence[pycolmap.Camera],
     poses: Sequence[NDArray[np.float64]],
-    pinholes: Sequence[Any] | None,
+    pinholes: Sequence[pycolmap.Camera] | None,
     *,
     options: TriangulateOptions,
     num_threads: int | None,
@@ -92,7 +92,9 @@ def triangulate_tracks(
     )
 
 
-def rays_of(tracks: Tracks, view: NDArray[np.int64], cameras: Sequence[Any]) -> NDArray[np.float64]:
+def rays_of(
+    tracks: Tracks, view: NDArray[np.int64], cameras: Sequence[pycolmap.Camera]
+) -> NDArray[np.float64]:
     """Undistorted positions (x / z, y / z) of observations, float64 [num_observations, 2].
 
     Args:

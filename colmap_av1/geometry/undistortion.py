@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -25,7 +24,7 @@ _BISECTIONS = 40
 _COLUMNS = 512
 
 
-def pinhole_camera(camera: Any) -> Any:
+def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
     """The undistorted camera of the same size, with the widest view without empty pixels.
 
     Args:
@@ -71,13 +70,13 @@ def pinhole_camera(camera: Any) -> Any:
     return pycolmap.Camera(camera_id=camera_id, model="PINHOLE", params=params, **size)
 
 
-def _project(camera: Any, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def _project(camera: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels of undistorted positions (x / z, y / z)."""
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
 
 def on_pinholes(
-    rays: NDArray[np.float64], view: NDArray[np.int64], pinholes: Sequence[Any]
+    rays: NDArray[np.float64], view: NDArray[np.int64], pinholes: Sequence[pycolmap.Camera]
 ) -> NDArray[np.float64]:
     """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
     params = np.array([pinhole.params for pinhole in pinholes])
@@ -91,7 +90,9 @@ def on_pinholes(
 
 
 def undistorted_masks(
-    masks: Sequence[Mask | None], cameras: Sequence[Any], pinholes: Mapping[int, Any]
+    masks: Sequence[Mask | None],
+    cameras: Sequence[pycolmap.Camera],
+    pinholes: Mapping[int, pycolmap.Camera],
 ) -> list[Mask | None]:
     """The masks of images as their undistorted pictures have them, of the size of these.
 
@@ -160,7 +161,7 @@ class Undistortion:
 
 
 def undistortion(
-    camera: Any, pinhole: Any, interpolation: int = cv2.INTER_CUBIC
+    camera: pycolmap.Camera, pinhole: pycolmap.Camera, interpolation: int = cv2.INTER_CUBIC
 ) -> Undistortion | None:
     """What undistorts the pictures of a camera; None without distortion."""
     if is_undistorted(camera):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -234,6 +235,7 @@ def _poses(
         views = (a, inliers.xy[0], b, inliers.xy[1])
         found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
         if pycolmap.estimate_two_view_geometry_pose(*views, found):
+            assert found.cam2_from_cam1 is not None
             pose = np.asarray(found.cam2_from_cam1.matrix())
             yield found.inlier_matches[:, 0], pose, float(np.degrees(found.tri_angle))
     if not all(camera.has_prior_focal_length for camera in inliers.cameras):
@@ -283,8 +285,8 @@ def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> boo
     )
 
 
-def _is_near(found: pycolmap.Camera, given: pycolmap.Camera) -> bool:
-    if given.has_bogus_params(*_SANE):
+def _is_near(found: pycolmap.Camera | None, given: pycolmap.Camera) -> bool:
+    if found is None or given.has_bogus_params(*_SANE):
         return False
     focal = given.focal_length_idxs()
     extra = given.extra_params_idxs()
@@ -300,18 +302,19 @@ def _adjusted(
     model = pycolmap.Reconstruction()
     cameras = list({id(camera): camera for camera in inliers.cameras}.values())
     for number, camera in enumerate(cameras, 1):
-        own = pycolmap.Camera(camera.todict() | {"camera_id": number})
-        model.add_camera(own)
+        numbered = pycolmap.Camera(camera.todict() | {"camera_id": number})
+        model.add_camera(numbered)
         rig = pycolmap.Rig(rig_id=number)
-        rig.add_ref_sensor(own.sensor_id)
+        rig.add_ref_sensor(numbered.sensor_id)
         model.add_rig(rig)
     poses = pycolmap.Rigid3d(), pycolmap.Rigid3d(pose)
-    for k, (camera, xy, own) in enumerate(zip(inliers.cameras, inliers.xy, poses, strict=True), 1):
+    views = zip(inliers.cameras, inliers.xy, poses, strict=True)
+    for k, (camera, xy, rig_from_world) in enumerate(views, 1):
         number = next(n for n, of_pair in enumerate(cameras, 1) if of_pair is camera)
         image = pycolmap.Image(image_id=k, name=str(k), camera_id=number, keypoints=xy)
         frame = pycolmap.Frame(frame_id=k, rig_id=number)
         frame.add_data_id(image.data_id)
-        frame.rig_from_world = own
+        frame.rig_from_world = rig_from_world
         model.add_frame(frame)
         image.frame_id = k
         model.add_image(image)
@@ -327,7 +330,8 @@ def _adjusted(
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    solver = getattr(options, "ceres", options).solver_options  # its own before COLMAP 4
+    holder: Any = getattr(options, "ceres", options)  # the options themselves before COLMAP 4
+    solver = holder.solver_options
     solver.num_threads = 1
     solver.max_num_iterations = _NUM_ITERATIONS
     solver.function_tolerance = solver.parameter_tolerance = 0.0

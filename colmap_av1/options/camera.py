@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, option
+
+if TYPE_CHECKING:
+    import pycolmap
 
 # Models of new cameras where none is given: COLMAP's own choice; where the focal length is
 # estimated, one with two distortion parameters, as distortion beyond one bends focal length and
@@ -86,7 +89,9 @@ def _check_shutter(wanted: str) -> None:
         )
 
 
-def camera_of_model(name: str, focal_length: float = 1.0, width: int = 1, height: int = 1) -> Any:
+def camera_of_model(
+    name: str, focal_length: float = 1.0, width: int = 1, height: int = 1
+) -> pycolmap.Camera:
     """A pycolmap.Camera of one of COLMAP's models, principal point in the centre.
 
     Raises:
@@ -99,7 +104,7 @@ def camera_of_model(name: str, focal_length: float = 1.0, width: int = 1, height
         known = ", ".join(n for n in models if n != "INVALID")
         raise OptionError(f"unknown camera model {name!r}: give one of {known}")
     create = getattr(pycolmap.Camera, "create_from_model_id", None) or pycolmap.Camera.create
-    camera = create(0, models[name], focal_length, width, height)
+    camera: pycolmap.Camera = create(0, models[name], focal_length, width, height)
     if len(camera.focal_length_idxs()) == 0:
         raise OptionError(
             f"camera model {name} has no focal length, so it does not fit a "
@@ -108,7 +113,7 @@ def camera_of_model(name: str, focal_length: float = 1.0, width: int = 1, height
     return camera
 
 
-def parse_camera_params(text: str, camera: Any) -> list[float]:
+def parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:
     """The parameters of a pycolmap.Camera's model from COLMAP's spelling.
 
     Raises:

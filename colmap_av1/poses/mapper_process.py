@@ -64,18 +64,19 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
             how.ba_global_function_tolerance = settings["tolerance"]
         if settings["init_max_forward_motion"] is not None:
             how.mapper.init_max_forward_motion = settings["init_max_forward_motion"]
-        callbacks = {"initial_image_pair_callback": placed, "next_image_callback": placed}
+        # pycolmap takes None for a callback, although the stub does not say so.
+        callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
     else:
-        how = pycolmap.GlobalPipelineOptions(**common)
-        how.mapper.bundle_adjustment.refine_focal_length = refine
-        how.mapper.bundle_adjustment.refine_extra_params = refine
+        global_options = pycolmap.GlobalPipelineOptions(**common)
+        adjustment = global_options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = refine
+        adjustment.refine_extra_params = refine
         if settings["tolerance"] is not None:
-            solver = how.mapper.bundle_adjustment.ceres.solver_options
-            solver.function_tolerance = settings["tolerance"]
+            adjustment.ceres.solver_options.function_tolerance = settings["tolerance"]
         if settings["start_tracks"] is not None:
-            how.mapper.track_required_tracks_per_view = settings["start_tracks"]
-        models = pycolmap.global_mapping(database, each, each, options=how)
+            global_options.mapper.track_required_tracks_per_view = settings["start_tracks"]
+        models = pycolmap.global_mapping(database, each, each, options=global_options)
     shutil.rmtree(each)
     found = sorted(models.values(), key=lambda m: -m.num_reg_images())
     for number, model in enumerate(found):

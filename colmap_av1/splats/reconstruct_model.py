@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
@@ -76,7 +76,7 @@ def _tracked_points(
     return to_model_points(points, view, xy), agreeing
 
 
-def _pinholes(views: Sequence[PosedCamera]) -> dict[int, Any]:
+def _pinholes(views: Sequence[PosedCamera]) -> dict[int, pycolmap.Camera]:
     """The undistorted cameras by their ids."""
     return {int(view.camera.camera_id): view.camera for view in views}
 
@@ -193,7 +193,7 @@ def _coloured(
 def _write_masks(
     folder: Path,
     images: Sequence[ModelImage],
-    cameras: Mapping[int, Any],
+    cameras: Mapping[int, pycolmap.Camera],
     masks: Sequence[Mask | None],
 ) -> None:
     """Write a mask for each image, white where there is none.

@@ -143,6 +143,7 @@ def _read_scene(model: str | os.PathLike[str]) -> _Scene:
     if not colours.any():  # mapped without images
         colours[:] = _NO_COLOUR
     camera = images[0].camera
+    assert camera is not None
     return _Scene(
         points=xyz,
         colours=colours,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
@@ -64,7 +64,9 @@ def cloud_distances(
     )
 
 
-def depth_differences(model: Any, reference: Any, *, pixels: float = 5.0) -> NDArray[np.float64]:
+def depth_differences(
+    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction, *, pixels: float = 5.0
+) -> NDArray[np.float64]:
     """Relative differences of a model's depths to those of another model's points nearby.
 
     A point is looked at in the image in the middle of its track, and so are the three points of the
@@ -108,12 +110,12 @@ def depth_differences(model: Any, reference: Any, *, pixels: float = 5.0) -> NDA
     return difference
 
 
-def _middle_image(track: Any) -> int:
+def _middle_image(track: pycolmap.Track) -> int:
     image_ids = sorted(int(element.image_id) for element in track.elements)
     return image_ids[len(image_ids) // 2]
 
 
-def point_cloud(model: Any) -> NDArray[np.float64]:
+def point_cloud(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)

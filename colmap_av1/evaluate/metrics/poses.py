@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -133,7 +132,7 @@ def pose_errors(
     )
 
 
-def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
+def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> NDArray[np.float64]:
     """Poses of a model's images: float64 [n, 3, 4] cam_from_world, NaN without one.
 
     Args:
@@ -148,7 +147,7 @@ def image_poses(model: Any, names: Sequence[str]) -> NDArray[np.float64]:
     return cam_from_world
 
 
-def model_poses(model: Any, num_frames: int) -> NDArray[np.float64]:
+def model_poses(model: pycolmap.Reconstruction, num_frames: int) -> NDArray[np.float64]:
     """Poses of a model's registered images, by frame.
 
     Args:

@@ -7,7 +7,6 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -42,7 +41,7 @@ class Sequence:
     width: int
     height: int
     fps: float
-    camera: Any | None
+    camera: pycolmap.Camera | None
     cam_from_world: NDArray[np.float64] | None
 
 

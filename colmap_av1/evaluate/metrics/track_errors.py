@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
@@ -46,7 +46,7 @@ def pairs_at_span(tracks: Tracks, span: int, *, max_pairs: int | None = None) ->
 def epipolar_errors(
     tracks: Tracks,
     cam_from_world: NDArray[np.float64],
-    camera: Any,
+    camera: pycolmap.Camera,
     span: int,
     *,
     max_pairs: int | None = 200_000,
@@ -128,7 +128,7 @@ def _essential_matrices(cam_from_world: NDArray[np.float64], span: int) -> NDArr
     return essential
 
 
-def _rays(camera: Any, xy: NDArray[np.float32]) -> NDArray[np.float64]:
+def _rays(camera: pycolmap.Camera, xy: NDArray[np.float32]) -> NDArray[np.float64]:
     """[n, 3] rays of positions [n, 2], one unit long along the camera's axis."""
     if not len(xy):
         return np.empty((0, 3))

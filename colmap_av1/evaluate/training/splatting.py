@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import pycolmap
 import scipy.spatial
 from numpy.typing import NDArray
 
@@ -202,7 +203,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
     return [file for file, image in zip(files, images, strict=True) if image.name in test]
 
 
-def _intrinsics(model: Path, camera: Any) -> NDArray[np.float64]:
+def _intrinsics(model: Path, camera: pycolmap.Camera) -> NDArray[np.float64]:
     if not is_undistorted(camera):
         raise ModelError(
             f"{model}: camera {camera.camera_id} is {camera.model_name}: undistort the images first"

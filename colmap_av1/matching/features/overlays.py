@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.features.sift import Features, alike
@@ -24,7 +24,7 @@ _CELL = 16
 
 
 def without_overlays(
-    features: Mapping[int, Features], cameras: Sequence[Any]
+    features: Mapping[int, Features], cameras: Sequence[pycolmap.Camera]
 ) -> dict[int, Features]:
     """Leave out the features that stay in their place in pictures that else change.
 
