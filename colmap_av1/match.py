@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
 from colmap_av1.matching.gaps import matching_warnings
-from colmap_av1.matching.image_matches import MatchedImages, PairedImages
+from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.matching.match_images import (
@@ -228,6 +228,9 @@ def match(
             places=positions.places,
         )
     videos = images.videos
+    tracks = [own.tracked.tracks for own in videos]
+    kinds = Counter(geometry.config.name for geometry in written.geometries)
+    num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
     if options.on_existing != "append":  # what a database holds already may join the images, too
@@ -239,16 +242,25 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        num_frames=sum(own.tracked.tracks.num_frames for own in videos),
+        num_frames=sum(own.num_frames for own in tracks),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
+        num_images=len(written.keypoints),
         num_written_images=num_written,
         masked=images.takes.masked,
+        num_tracks=sum(own.num_tracks for own in tracks),
+        track_lengths=_length_quantiles(tracks),
+        num_observations=sum(len(keypoints.xy) for keypoints in written.keypoints),
         focal_length=found.focal_length,
         read_outs=tuple(own.tracked.video.read_out for own in videos),
-        seconds=clock.seconds,
+        num_pairs=len(written.geometries),
+        num_verified_pairs=sum(count > 0 for count in num_inliers),
+        num_matches=sum(len(matches) for matches in written.matches),
+        num_inliers=sum(num_inliers),
+        configs=dict(sorted(kinds.items())),
+        forward_motion=written.forward_motion,
         links=found.links,
+        seconds=clock.seconds,
         warnings=(*inputs.warnings, *notes, *blurred),
-        **_figures([own.tracked.tracks for own in videos], written),
     )
 
 
@@ -387,26 +399,13 @@ def _with_chosen_tracks(
     return replace(prepared, tracked=replace(tracked, video=video))
 
 
-def _figures(tracks: Sequence[Tracks], matched: MatchedImages) -> dict[str, Any]:
-    """The counts of tracks and matches in `MatchReport`."""
+def _length_quantiles(tracks: Sequence[Tracks]) -> dict[float, int]:
+    """Quantiles of the lengths of all tracks; empty without a track."""
     lengths = np.concatenate([own.lengths for own in tracks])
-    quantiles = np.quantile(lengths, _LENGTH_QUANTILES, method="lower") if len(lengths) else ()
-    kinds = [geometry.config.name for geometry in matched.geometries]
-    num_inliers = [len(geometry.inlier_matches) for geometry in matched.geometries]
-    return {
-        "num_images": len(matched.keypoints),
-        "num_tracks": len(lengths),
-        "track_lengths": {
-            q: int(length) for q, length in zip(_LENGTH_QUANTILES, quantiles, strict=False)
-        },
-        "num_observations": sum(len(k.xy) for k in matched.keypoints),
-        "num_pairs": len(matched.geometries),
-        "num_verified_pairs": sum(count > 0 for count in num_inliers),
-        "num_matches": sum(len(m) for m in matched.matches),
-        "num_inliers": sum(num_inliers),
-        "configs": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        "forward_motion": matched.forward_motion,
-    }
+    if len(lengths) == 0:
+        return {}
+    found = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
+    return dict(zip(_LENGTH_QUANTILES, map(int, found), strict=True))
 
 
 def _no_option(path: Path) -> str:

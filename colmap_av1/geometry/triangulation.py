@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,9 @@ from colmap_av1.options import TriangulateOptions
 from colmap_av1.util.cpus import threads_or_cpus
 
 _Floats = NDArray[np.float64]
+_Ints = NDArray[np.int64]
+# What the core returns for some of the tracks, see `TriangulatedPoints`.
+_Part = tuple[_Floats, _Floats, _Ints, _Ints, int, int]
 
 # Observations worked on at a time: few enough for progress and for all threads.
 _CHUNK = 65_536
@@ -115,7 +117,7 @@ def triangulate(
     chunk = np.searchsorted(offsets, np.arange(0, offsets[-1] + _CHUNK, _CHUNK), side="left")
     bounds = np.unique(np.minimum(chunk, len(offsets) - 1))
 
-    def work(index: int) -> tuple[Any, ...]:
+    def work(index: int) -> _Part:
         return _core.triangulate(
             cam_from_world=cam_from_world,
             focal=focal,
@@ -134,7 +136,7 @@ def triangulate(
         )
 
     none = np.empty(0, np.int64)
-    parts: list[tuple[Any, ...]] = [(np.empty((0, 3)), np.empty(0), none, none, 0, 0)]
+    parts: list[_Part] = [(np.empty((0, 3)), np.empty(0), none, none, 0, 0)]
     # The core releases the interpreter lock.
     with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
         try:
