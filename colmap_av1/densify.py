@@ -168,7 +168,9 @@ def densify(
         of_tracks = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
         with scratch_folder(output) as scratch:
             cloud = _coloured_cloud(
-                *(of_tracks, views, takes),
+                of_tracks,
+                views,
+                takes,
                 _pictures(takes, inputs, photos_there, scratch, options),
                 options=options,
                 clock=clock,
@@ -245,8 +247,11 @@ def _triangulate(
     progress: Progress,
 ) -> TriangulatedPoints:
     return triangulate_tracks(
-        *(seen, view, [own.camera for own in views]),
-        *([own.cam_from_world for own in views], None),
+        seen,
+        view,
+        [own.camera for own in views],
+        [own.cam_from_world for own in views],
+        None,
         options=options.triangulate,
         num_threads=options.match.run.num_threads,
         progress=progress,
@@ -283,7 +288,10 @@ def _coloured_cloud(
     cloud = tracked
     if options.triangulate.points == "splats":
         cloud = swept_cloud(
-            *(tracked, views, takes.take, partial(show, "sweep")),
+            tracked,
+            views,
+            takes.take,
+            partial(show, "sweep"),
             max_points=options.triangulate.max_points,
             num_threads=options.match.run.num_threads,
             clock=clock,

@@ -210,7 +210,9 @@ def _place(
         return [
             vertical_lines(
                 read_image(image_file(image_path, image.name)),
-                *(model.cameras[image.camera_id], image.cam_from_world, up),
+                model.cameras[image.camera_id],
+                image.cam_from_world,
+                up,
             )
             for image in some_spread(images)
         ]

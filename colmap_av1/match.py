@@ -121,29 +121,35 @@ class MatchReport:
         database = _no_option(self.database)
         output = _no_option(self.database.with_name(f"{self.database.stem}_model"))
         images = _no_option(self.image_path) if self.image_path is not None else "IMAGES"
+        # fmt: off
         mapper = [
-            *("colmap", "mapper", "--database_path", database),
-            *("--image_path", images, "--output_path", output),
+            "colmap", "mapper",
+            "--database_path", database,
+            "--image_path", images,
+            "--output_path", output,
+        ]
+        ours = [
+            "colmap-av1", "map",
+            "--database", database,
+            "--image_path", images,
+            "--output", output,
         ]
         if self.forward_motion:
             mapper += [
-                *("--Mapper.init_max_forward_motion", "1"),
-                *("--Mapper.ba_refine_focal_length", "0"),
-                *("--Mapper.ba_refine_extra_params", "0"),
+                "--Mapper.init_max_forward_motion", "1",
+                "--Mapper.ba_refine_focal_length", "0",
+                "--Mapper.ba_refine_extra_params", "0",
             ]
-        ours = [
-            *("colmap-av1", "map", "--database", database),
-            *("--image_path", images, "--output", output),
-        ]
-        if self.forward_motion:
             ours.append("--forward_motion")
         densify = [
-            *("colmap-av1", "densify", "--model", f"{output}/0"),
+            "colmap-av1", "densify",
+            "--model", f"{output}/0",
             *(word for video in self.videos for word in ("--video", _no_option(video))),
             *(("--photos", _no_option(self.photos)) if self.photos is not None else ()),
             *(("--image_path", images) if self.image_path is not None else ()),
-            *("--output", _no_option(self.database.with_name(f"{self.database.stem}_splats"))),
+            "--output", _no_option(self.database.with_name(f"{self.database.stem}_splats")),
         ]
+        # fmt: on
         with_colmap = f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}"
         return with_colmap, shlex.join(ours), shlex.join(densify)
 
@@ -202,7 +208,10 @@ def match(
         check_places(inputs.photos, folder)
     with unchanged(*inputs.states) as check_videos:
         images = _prepare(
-            *(inputs, listed_of_videos(database, listed, inputs), folder, options),
+            inputs,
+            listed_of_videos(database, listed, inputs),
+            folder,
+            options,
             beside=database,
             clock=clock,
             progress=progress,
@@ -223,7 +232,10 @@ def match(
     with clock.measure("database"):
         positions = image_positions(images.takes, inputs.videos, inputs.photos)
         write_matched_images(
-            *(database, images.takes.images.names, None if listed else found.cameras, written),
+            database,
+            images.takes.images.names,
+            None if listed else found.cameras,
+            written,
             on_existing=options.on_existing,
             places=positions.places,
         )
@@ -319,7 +331,9 @@ def _prepare(
         # All tracks of a video are its largest arrays: they make room for the next.
         _with_chosen_tracks(
             prepare_images(
-                *(video, folder / label if folder is not None else None, options),
+                video,
+                folder / label if folder is not None else None,
+                options,
                 listed=existing,
                 masks=masks,
                 beside=beside,

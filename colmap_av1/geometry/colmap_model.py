@@ -116,8 +116,12 @@ def take_rows(
 def no_points() -> ModelPoints:
     """The points of a model of poses alone: none."""
     return ModelPoints(
-        *(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0)),
-        *(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 2))),
+        np.empty((0, 3)),
+        np.empty((0, 3), np.uint8),
+        np.empty(0),
+        np.zeros(1, np.int64),
+        np.empty(0, np.int64),
+        np.empty((0, 2)),
     )
 
 

@@ -141,7 +141,9 @@ def splat_points(
     seen = _Seen(observations, views, camera_centres(views.cam_from_world))
     points = _Points(found.xyz, found.error, found.offsets, found.observation)
     unsure = distance_uncertainty(
-        *(points.xyz, points.error, points.offsets),
+        points.xyz,
+        points.error,
+        points.offsets,
         centres=seen.centres,
         view=observations.view[points.observation],
         focal=views.focal.mean(axis=1),

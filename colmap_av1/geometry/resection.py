@@ -110,7 +110,7 @@ def resect(
         rays, xyz = sightings.rays[own], sightings.xyz[own]
         own_seed = seed_of(seed, image)
         return _resect_one(
-            *(rays * focal, xyz, guesses[image], camera), loss_scale=loss_scale, seed=own_seed
+            rays * focal, xyz, guesses[image], camera, loss_scale=loss_scale, seed=own_seed
         )
 
     found: list[_Floats | None] = []

@@ -264,7 +264,10 @@ def write_all_chosen(
     num_written, warnings = 0, list[str]()
     for label, own in videos:
         num_written += write_chosen(
-            *(own.source.pictures, folder / label, own.tracked.chosen, options),
+            own.source.pictures,
+            folder / label,
+            own.tracked.chosen,
+            options,
             display=own.display,
             progress=progress,
         )

@@ -29,7 +29,8 @@ class TwoViewConfig(IntEnum):
 # Configurations whose pairs the mappers of COLMAP 4.2 leave out, and those without depth.
 UNUSED_CONFIGS = (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE, TwoViewConfig.WATERMARK)
 FLAT_CONFIGS = (
-    *(TwoViewConfig.PLANAR, TwoViewConfig.PANORAMIC),
+    TwoViewConfig.PLANAR,
+    TwoViewConfig.PANORAMIC,
     TwoViewConfig.PLANAR_OR_PANORAMIC,
 )
 

@@ -117,9 +117,17 @@ class DensifyOptions(Options):
     match: MatchOptions = part(
         MatchOptions(),
         unused=(
-            *("camera", "density", "pairs", "verify", "on_existing", "run.seed"),
-            *("images.image_name", "images.num_images", "images.fps"),
-            *("images.select", "images.skip_blurred"),
+            "camera",
+            "density",
+            "pairs",
+            "verify",
+            "on_existing",
+            "run.seed",
+            "images.image_name",
+            "images.num_images",
+            "images.fps",
+            "images.select",
+            "images.skip_blurred",
         ),
     )
     triangulate: TriangulateOptions = part(TriangulateOptions())

@@ -16,8 +16,14 @@ from colmap_av1.options.model import TriangulateOptions
 # The trainer that is built in; others are commands with these placeholders.
 GSPLAT = "gsplat"
 PLACEHOLDERS = (
-    *("data", "test", "gaussians", "output", "renders"),
-    *("iterations", "milestones", "name"),
+    "data",
+    "test",
+    "gaussians",
+    "output",
+    "renders",
+    "iterations",
+    "milestones",
+    "name",
 )
 # Programs that run the word after -c.
 _SHELL = re.compile(r"(.*/)?((ba|da|k|z)?sh|python[0-9.]*)")

@@ -91,8 +91,12 @@ def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
     """Some of the points, in the order of `rows`."""
     offsets, seen = take_rows(points.offsets, rows)
     return ModelPoints(
-        *(points.xyz[rows], points.rgb[rows], points.error[rows], offsets),
-        *(points.image[seen], points.xy[seen]),
+        points.xyz[rows],
+        points.rgb[rows],
+        points.error[rows],
+        offsets,
+        points.image[seen],
+        points.xy[seen],
     )
 
 
@@ -109,7 +113,9 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
     for key in keys:
         index, xy, depth = key.project(points.xyz)
         best = _core.best_at_spacings(
-            *(xy, depth, rank[index]),
+            xy,
+            depth,
+            rank[index],
             width=key.size[0],
             height=key.size[1],
             spacings=np.array(_SPACINGS),

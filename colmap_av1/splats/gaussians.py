@@ -234,8 +234,12 @@ def write_model_gaussians(path: Path, model: Path) -> None:
 def _records(gaussians: Gaussians, own: slice) -> NDArray[np.float32]:
     opacity = gaussians.opacity[own]
     columns = [
-        *(gaussians.xyz[own], gaussians.normal[own], (gaussians.rgb[own] / 255.0 - 0.5) / _SH0),
-        *(np.zeros((len(opacity), _REST)), np.log(opacity / (1.0 - opacity))[:, None]),
-        *(np.log(gaussians.scale[own]), gaussians.rotation[own]),
+        gaussians.xyz[own],
+        gaussians.normal[own],
+        (gaussians.rgb[own] / 255.0 - 0.5) / _SH0,
+        np.zeros((len(opacity), _REST)),
+        np.log(opacity / (1.0 - opacity))[:, None],
+        np.log(gaussians.scale[own]),
+        gaussians.rotation[own],
     ]
     return np.concatenate(columns, axis=1).astype("<f4")

@@ -148,8 +148,10 @@ def sweep_image(
 
     parts = [look(0), *threads.map(look, range(_CHUNK, len(xy), _CHUNK))]
     return Swept(
-        *(key, np.concatenate([own.xy for own in parts])),
-        *(np.concatenate([own.depth for own in parts]), others),
+        key,
+        np.concatenate([own.xy for own in parts]),
+        np.concatenate([own.depth for own in parts]),
+        others,
         np.concatenate([own.seen for own in parts], axis=1),
     )
 
@@ -157,7 +159,7 @@ def sweep_image(
 def _correlate(one: Grey, xy: _Floats, two: Grey, at: _Floats) -> NDArray[np.float32]:
     """Correlations [n, d] of what is at pixels [n, 2] of an image, and at [n, d, 2] of another."""
     return _core.correlate_patches(
-        *(one.pixels, one.place(xy), two.pixels, two.place(at)), min_deviation=_LEAST_DEVIATION
+        one.pixels, one.place(xy), two.pixels, two.place(at), min_deviation=_LEAST_DEVIATION
     )
 
 

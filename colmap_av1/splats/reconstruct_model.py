@@ -64,7 +64,10 @@ def _tracked_points(
     rays = rays_of(seen, view, placed.camera_of_image)
     pinholes = [own.camera for own in views]
     points = triangulate_in(
-        *(run, placed, seen, view),
+        run,
+        placed,
+        seen,
+        view,
         options=run.options.triangulate,
         pinholes=pinholes,
         rays=rays,
@@ -159,7 +162,10 @@ def _written_cloud(
         show(lambda *_: None)
         return tracked
     return swept_cloud(
-        *(tracked, views, placed.take, show),
+        tracked,
+        views,
+        placed.take,
+        show,
         max_points=options.max_points,
         num_threads=run.options.match.run.num_threads,
         clock=clock,

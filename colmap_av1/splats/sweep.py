@@ -252,7 +252,10 @@ def _as_points(swept: Swept, views: Sequence[PosedCamera]) -> ModelPoints:
     error = np.nansum(apart, axis=0) / sees.sum(axis=1)
     point, own = np.nonzero(sees)
     return ModelPoints(
-        *(xyz, np.zeros((len(xyz), 3), np.uint8), error),
+        xyz,
+        np.zeros((len(xyz), 3), np.uint8),
+        error,
         np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(xyz)))]).astype(np.int64),
-        *(images[rows[own]], all_seen[rows[own], point]),
+        images[rows[own]],
+        all_seen[rows[own], point],
     )

@@ -125,13 +125,22 @@ def encode(
     if "mov" in file.container:
         # Frames that an edit list hides are frames all the same, and good ones.
         before += ["-ignore_editlist", "1"]
+    # fmt: off
     how = [
-        *("-i", f"file:{path}", *beside, "-map", f"0:{file.index}"),
-        *("-vf", ",".join([*_filters(file, options), encoder.upload])),
-        *("-fps_mode", "passthrough", "-enc_time_base", "demux"),
-        *("-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE, *encoder.words(quality, speed)),
-        *("-progress", "pipe:1", "-f", output_format, *carried),
+        "-i", f"file:{path}",
+        *beside,
+        "-map", f"0:{file.index}",
+        "-vf", ",".join([*_filters(file, options), encoder.upload]),
+        "-fps_mode", "passthrough",
+        "-enc_time_base", "demux",
+        "-c:v", encoder.ffmpeg_name,
+        "-g", KEY_FRAME_DISTANCE,
+        *encoder.words(quality, speed),
+        "-progress", "pipe:1",
+        "-f", output_format,
+        *carried,
     ]
+    # fmt: on
     mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
     if scaling(options):
         mark["downscale"] = float(options.downscale or 1)

@@ -199,12 +199,23 @@ def _encoders_of(program: str) -> str:
 
 def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:
     """Why an encoder does not work; None where it does."""
+    # fmt: off
     command = [
-        *(program, *TALK, "-nostdin", *encoder.before_input),
-        *("-f", "lavfi", "-i", "testsrc2=size=320x192:rate=25", "-frames:v", str(_PROBE_FRAMES)),
-        *("-vf", encoder.upload, "-c:v", encoder.ffmpeg_name, "-g", KEY_FRAME_DISTANCE),
-        *(*encoder.words(quality, speed), "-f", "null", "-"),
+        program,
+        *TALK,
+        "-nostdin",
+        *encoder.before_input,
+        "-f", "lavfi",
+        "-i", "testsrc2=size=320x192:rate=25",
+        "-frames:v", str(_PROBE_FRAMES),
+        "-vf", encoder.upload,
+        "-c:v", encoder.ffmpeg_name,
+        "-g", KEY_FRAME_DISTANCE,
+        *encoder.words(quality, speed),
+        "-f", "null",
+        "-",
     ]
+    # fmt: on
     try:
         run = subprocess.run(
             command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False

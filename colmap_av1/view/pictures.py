@@ -125,7 +125,10 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
                 stream.width, stream.height = size
             fitted = cv2.copyMakeBorder(
                 picture[: size[1], : size[0]],
-                *(0, max(0, size[1] - picture.shape[0]), 0, max(0, size[0] - picture.shape[1])),
+                0,
+                max(0, size[1] - picture.shape[0]),
+                0,
+                max(0, size[0] - picture.shape[1]),
                 cv2.BORDER_CONSTANT,
             )
             container.mux(stream.encode(av.VideoFrame.from_ndarray(fitted, format="bgr24")))

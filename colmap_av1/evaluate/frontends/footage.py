@@ -126,7 +126,9 @@ def choose_footage(
         existed = bool(existing_images(images, options.images.image_name))
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
-                *(video, images, options),
+                video,
+                images,
+                options,
                 listed={},
                 beside=folder / "result.json",
                 clock=clock,
@@ -149,7 +151,9 @@ def choose_footage(
 
     given = (options.images, options.camera, options.read, options.encode, options.tracks)
     depends_on = [
-        *(file_digest(video.path), given, images),
+        file_digest(video.path),
+        given,
+        images,
         digest_if_there(options.images.frame_list),
         [file_digest(images / n) for n in existing_images(images, options.images.image_name)],
     ]

@@ -177,11 +177,19 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
         "[a][b]libvmaf=feature=name=psnr|name=float_ssim:log_fmt=json:log_path=log.json"
     )
     with tempfile.TemporaryDirectory() as folder:
+        # fmt: off
         command = [
-            *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo"),
-            *("-pix_fmt", "bgr24", "-s", f"{width}x{2 * height}", "-i", "-"),
-            *("-filter_complex", graph, "-f", "null", "-"),
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-v", "error",
+            "-f", "rawvideo",
+            "-pix_fmt", "bgr24",
+            "-s", f"{width}x{2 * height}",
+            "-i", "-",
+            "-filter_complex", graph,
+            "-f", "null",
+            "-",
         ]
+        # fmt: on
         with subprocess.Popen(
             bound(command), cwd=folder, stdin=subprocess.PIPE, stderr=subprocess.PIPE
         ) as process:

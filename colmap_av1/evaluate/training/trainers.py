@@ -288,7 +288,7 @@ def _kept_gsplat(
         return {"states": [_plain(state) for state in states]}
 
     finished = run_stage_in(
-        *(folder, (GSPLAT, *key), make), products=[folder / "output"], made_by=_CODE
+        folder, (GSPLAT, *key), make, products=[folder / "output"], made_by=_CODE
     )
     states = tuple(_milestone(state) for state in finished.result["states"])
     return states[-1].seconds, states
