@@ -170,7 +170,8 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
     camera = ruler.camera_options(sequence.camera) if known else CameraOptions()
     case = next((case for case in ruler.CASES if case.name == name), ruler.Case(name))
     footage = prepare_footage(
-        *(video, folder / "footage"),
+        video,
+        folder / "footage",
         num_frames=sequence.num_frames,
         image_step=1,
         camera=camera,

@@ -102,7 +102,8 @@ def measure(name: str, folder: Path, console: Console) -> list[Row]:
     camera = CameraOptions() if sequence.camera is None else ruler.camera_options(sequence.camera)
     video = ruler.as_shot(sequence, folder / "source")
     footage = prepare_footage(
-        *(video, folder / "footage"),
+        video,
+        folder / "footage",
         num_frames=sequence.num_frames,
         image_step=case.image_step,
         camera=camera,

@@ -34,7 +34,10 @@ def make_tracks(xy: np.ndarray) -> Tracks:
     """Tracks [num_tracks, num_frames, 2] that all frames see."""
     count, length = xy.shape[:2]
     return Tracks(
-        *(length, WIDTH, HEIGHT, np.arange(count + 1, dtype=np.int64) * length),
+        length,
+        WIDTH,
+        HEIGHT,
+        np.arange(count + 1, dtype=np.int64) * length,
         frame=np.tile(np.arange(length, dtype=np.int32), count),
         xy=xy.reshape(-1, 2).astype(np.float32),
         sigma=np.full(count * length, 0.2, np.float32),
@@ -98,7 +101,11 @@ def test_images_of_several_cameras_see_one_scene() -> None:
 
     def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> TriangulatedPoints:
         return triangulate_tracks(
-            *(replace(seen, xy=xy), view, cameras, POSES, pinhole and [pinhole] * len(cameras)),
+            replace(seen, xy=xy),
+            view,
+            cameras,
+            POSES,
+            pinhole and [pinhole] * len(cameras),
             options=TriangulateOptions(),
             num_threads=1,
             progress=no_progress,

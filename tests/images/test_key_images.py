@@ -19,8 +19,13 @@ def sliding_tracks(steps: list[float]) -> Tracks:
     counts = np.bincount(track, minlength=x.size)
     xy = np.column_stack([at[track, frame], y.ravel()[track]]).astype(np.float32)
     return Tracks(
-        *(len(travelled), *_SIZE, np.concatenate([[0], np.cumsum(counts)])),
-        *(frame.astype(np.int32), xy, np.zeros(len(xy), np.float32), np.zeros(len(xy), np.bool_)),
+        len(travelled),
+        *_SIZE,
+        np.concatenate([[0], np.cumsum(counts)]),
+        frame.astype(np.int32),
+        xy,
+        np.zeros(len(xy), np.float32),
+        np.zeros(len(xy), np.bool_),
     )
 
 
@@ -59,8 +64,13 @@ def test_some_are_always() -> None:
 def test_no_track_at_all() -> None:
     tracks = sliding_tracks([1.0] * 29)
     nothing = Tracks(
-        *(30, *_SIZE, np.zeros(1, np.int64), tracks.frame[:0]),
-        *(tracks.xy[:0], tracks.sigma[:0], tracks.confirmed[:0]),
+        30,
+        *_SIZE,
+        np.zeros(1, np.int64),
+        tracks.frame[:0],
+        tracks.xy[:0],
+        tracks.sigma[:0],
+        tracks.confirmed[:0],
     )
     assert keys_of(nothing)[-1] == 29
 

@@ -118,7 +118,7 @@ def test_a_camera_that_turns_on_the_spot_gets_a_sphere() -> None:
 
 
 def test_no_tracks_give_no_points() -> None:
-    none = Observations(*(np.zeros(1, np.int64), np.empty(0, np.int64)), *(np.empty((0, 2)),) * 2)
+    none = Observations(np.zeros(1, np.int64), np.empty(0, np.int64), *(np.empty((0, 2)),) * 2)
     assert len(splat_points(none, views_of(moving(0.2)), SPLATS).xyz) == 0
 
 
@@ -228,8 +228,12 @@ def test_no_points_at_all() -> None:
     """Then the images get a wall before them, and no error."""
     views = posed(moving(0.1))
     none = ModelPoints(
-        *(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0)),
-        *(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 2))),
+        np.empty((0, 3)),
+        np.empty((0, 3), np.uint8),
+        np.empty(0),
+        np.zeros(1, np.int64),
+        np.empty(0, np.int64),
+        np.empty((0, 2)),
     )
     made = splat_cloud(none, views, None)
     assert coverage(views, made.xyz) > 0.99
