@@ -148,7 +148,7 @@ def densify(
     with unchanged(*inputs.states):
         # What can be refused is refused before the long work.
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
-        of_videos = images_of_videos(model, sizes, inputs, folder, options)
+        of_videos = images_of_videos(model, sizes, inputs, folder, options.match.images)
         context = RunContext.of(options.match.run, clock, progress)
         found = [_track(own, output, options, context) for own in of_videos]
         tracked = [images for images, _ in found]
@@ -207,20 +207,15 @@ def _track(
     Returns:
         The tracks in the images alone, and how the video was converted, in words.
     """
-    matching = chaining_for_points(options.match, options.triangulate)
-    opening = open_source(
-        images.video,
-        options.match,
-        beside=output,
-        clock=context.clock,
-        progress=context.progress,
-    )
+    chaining = chaining_for_points(options.match.tracks, options.triangulate)
+    opening = open_source(images.video, options.match.source, beside=output, context=context)
 
     def choose(tracked: TrackedVideo) -> ChosenImages:
         return choose_from_video(
             source,
             tracked.tracks,
-            options.match,
+            options.match.images,
+            options.match.reading,
             existing=images.names,
             folder=images.folder,
             context=context,
@@ -229,7 +224,7 @@ def _track(
     with opening as source, unchanged(source.stream.state):
         found = track_images(
             source,
-            matching,
+            replace(options.match.tracking, tracks=chaining),
             choose,
             masks=images.masks,
             refine=False,
@@ -264,7 +259,7 @@ def _pictures(
     """What gives the pictures of images; a folder keeps those of videos."""
     kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
     shown = [ShownVideo(own, kept=file) for own, file in zip(inputs.videos, kept, strict=True)]
-    return pictures_of(takes, shown, [photo.path for photo in photos], options.match)
+    return pictures_of(takes, shown, [photo.path for photo in photos], options.match.reading)
 
 
 def _coloured_cloud(

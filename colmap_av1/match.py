@@ -20,7 +20,7 @@ from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
-from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_chosen
+from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
@@ -206,6 +206,7 @@ def match(
     inputs = read_inputs(video, photos, options)
     if folder is not None:
         check_places(inputs.photos, folder)
+    context = RunContext.of(options.run, clock, progress)
     with unchanged(*inputs.states) as check_videos:
         images = _prepare(
             inputs,
@@ -213,10 +214,8 @@ def match(
             folder,
             options,
             beside=database,
-            clock=clock,
-            progress=progress,
+            context=context,
         )
-        context = RunContext.of(options.run, clock, progress)
         found = _match_images(images, database, listed, options, context)
         written = demote_bad_initial_pairs(found.matched, found.cameras, clock)
         num_written, blurred = 0, list[str]()
@@ -226,7 +225,7 @@ def match(
                 _check_images_of_others(images, folder, before, options)
                 num_written = place_photos(inputs.photos, folder)
                 labelled = zip(inputs.labels, images.videos, strict=True)
-                of_videos, blurred = write_all_chosen(labelled, folder, options, progress)
+                of_videos, blurred = write_all_prepared(labelled, folder, options.reading, progress)
                 num_written += of_videos
 
     with clock.measure("database"):
@@ -323,8 +322,7 @@ def _prepare(
     options: MatchOptions,
     *,
     beside: Path,
-    clock: Clock,
-    progress: Progress,
+    context: RunContext,
 ) -> _Images:
     """Find or choose the images of each video, and count them through."""
     videos = [
@@ -337,11 +335,10 @@ def _prepare(
                 listed=existing,
                 masks=masks,
                 beside=beside,
-                clock=clock,
-                progress=progress,
+                context=context,
             ),
             options,
-            clock,
+            context,
         )
         for video, label, masks, existing in zip(
             inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True
@@ -385,7 +382,7 @@ def _match_images(
             takes,
             [ShownVideo(own.source.pictures, own.display) for own in videos],
             [photo.path for photo in images.inputs.photos],
-            options,
+            options.reading,
         ),
         options=ImageMatchOptions(
             options.pairs, options.verify, options.links, least_length(options.tracks)
@@ -396,7 +393,7 @@ def _match_images(
 
 
 def _with_chosen_tracks(
-    prepared: PreparedImages, options: MatchOptions, clock: Clock
+    prepared: PreparedImages, options: MatchOptions, context: RunContext
 ) -> PreparedImages:
     """The images with the tracks that are matched, in place of all tracks of the video."""
     tracked = prepared.tracked
@@ -405,9 +402,9 @@ def _with_chosen_tracks(
         prepared.display,
         prepared.source.pictures.frame_rate,
         options.camera,
-        RunContext.of(options.run, clock),
+        context,
     )
-    with clock.measure("pairs"):
+    with context.clock.measure("pairs"):
         tracks = select_tracks(tracks.keep_frames(tracked.chosen.frames), options.density)
     video = replace(tracked.video, tracks=tracks, read_out=read_out)
     return replace(prepared, tracked=replace(tracked, video=video))

@@ -33,6 +33,7 @@ from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_apart, scratch_folder, whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
@@ -170,23 +171,25 @@ def reconstruct(
     checked = [*(own.path for own in inputs.videos), *options.match.files]
     check_gaussians_path(gaussians, checked, overwrite=overwrite)
     for own, masks in zip(inputs.videos, inputs.masks_of_videos, strict=True):
-        check_fit(options.match, own.picture_size, own.display.pixel_aspect)
+        check_fit(
+            options.match.camera, options.match.images, own.picture_size, own.display.pixel_aspect
+        )
         if masks is not None:
             count = count_shown(own)
             names = (
                 names_of_all(options.match.images, count) if count <= options.max_images else None
             )
             masks.check([own.picture_size], names, options.match.images)
+    context = RunContext.of(options.match.run, clock, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
         _remove_earlier_layout(stages)
         sources = tuple(
             opened.enter_context(
                 open_source(
                     own,
-                    with_stream_kept(_as_converted(options), stages, label),
+                    with_stream_kept(_as_converted(options), stages, label).source,
                     beside=output,
-                    clock=clock,
-                    progress=progress,
+                    context=context,
                 )
             )
             for own, label in zip(inputs.videos, inputs.labels, strict=True)

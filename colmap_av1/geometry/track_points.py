@@ -13,7 +13,7 @@ from colmap_av1.geometry.colmap_model import ModelPoints
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
-from colmap_av1.options import MatchOptions, TriangulateOptions
+from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress
 
@@ -34,24 +34,23 @@ _CHUNK = 1 << 18
 
 
 def chaining_for_points(
-    options: MatchOptions, triangulate: TriangulateOptions, *, is_downscaled: bool = False
-) -> MatchOptions:
+    options: TrackOptions, triangulate: TriangulateOptions, *, is_downscaled: bool = False
+) -> TrackOptions:
     """The options with more tracks, for points: short ones, and those that lie near another.
 
     Args:
-        options: those of chaining are changed where they leave the choice.
+        options: changed where they leave the choice.
         triangulate: how many observations a point has.
         is_downscaled: motion is searched in smaller pictures, whose tracks are corrected. There
             the squares of motion are as fine in them as a trainer needs points: more tracks would
             leave fewer of them corrected, at three times the time and twice the memory.
     """
-    tracks = options.tracks
-    if tracks.min_length is None:
+    if options.min_length is None:
         min_length = min(_TRACK_LENGTH, triangulate.min_observations)
-        tracks = replace(tracks, min_length=min_length)
-    if tracks.cell is None and not is_downscaled:
-        tracks = replace(tracks, cell=min(_CELL, tracks.seeding))
-    return replace(options, tracks=tracks)
+        options = replace(options, min_length=min_length)
+    if options.cell is None and not is_downscaled:
+        options = replace(options, cell=min(_CELL, options.seeding))
+    return options
 
 
 def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:

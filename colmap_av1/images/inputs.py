@@ -17,7 +17,7 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.images.takes import Takes, count_through
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
 from colmap_av1.video.metadata.lens import doubtful_lens
@@ -155,13 +155,13 @@ def read_inputs(
     for own in videos:
         check_is_plane(own.path, own.projection, own.picture_size[0])
     _check_different(videos)
-    _check_rates(videos, options)
+    _check_rates(videos, options.camera)
     places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
     if folder is not None:
         places.append(os.path.abspath(folder))
     labels = labels_of(places)
     found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
-    _check_one_camera(videos, found, options)
+    _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
     said = [(v.doubtful_times, doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
@@ -229,9 +229,9 @@ def _check_different(videos: Sequence[Video]) -> None:
                 raise VideoError(f"{video} and {other} are the same video: give it once")
 
 
-def _check_rates(videos: Sequence[Video], options: MatchOptions) -> None:
+def _check_rates(videos: Sequence[Video], options: CameraOptions) -> None:
     """Refuse a read-out time in milliseconds where nothing says how long a frame is."""
-    shutter = options.camera.rolling_shutter
+    shutter = options.rolling_shutter
     unknown = next((video for video in videos if video.frame_rate is None), None)
     if unknown is not None and shutter not in ("none", "estimate"):
         raise OptionError(
@@ -250,10 +250,9 @@ def _are_same(a: Video, b: Video) -> bool:
 
 
 def _check_one_camera(
-    videos: Sequence[Video], photos: Sequence[Photo], options: MatchOptions
+    videos: Sequence[Video], photos: Sequence[Photo], camera: CameraOptions
 ) -> None:
     """Refuse one camera, or given intrinsics, for pictures of several sizes."""
-    camera = options.camera
     sizes = {str(video): video.picture_size for video in videos}
     if camera.single_camera:
         sizes |= {str(photo.path): photo.size for photo in photos}

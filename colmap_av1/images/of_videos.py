@@ -11,7 +11,7 @@ from colmap_av1.images.choosing import check_frame_list
 from colmap_av1.images.files import size_of_images
 from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.masks import VideoMasks
-from colmap_av1.options import DensifyOptions
+from colmap_av1.options import ImageOptions
 from colmap_av1.video.facts import Video
 
 
@@ -31,7 +31,7 @@ def images_of_videos(
     sizes: Mapping[str, tuple[int, int]],
     inputs: Inputs,
     folder: Path | None,
-    options: DensifyOptions,
+    options: ImageOptions,
 ) -> list[VideoImages]:
     """The model's images of each video, of (width, height) by their names; refuses others.
 
@@ -58,7 +58,7 @@ def images_of_videos(
         images = _images_of_video(model, video, listed, own_folder, options)
         if masks is not None:
             sizes_of_masks = [images.size, video.picture_size]
-            masks.check(sizes_of_masks, images.names, options.match.images)
+            masks.check(sizes_of_masks, images.names, options)
         found.append(replace(images, masks=masks))
     return found
 
@@ -68,10 +68,10 @@ def _images_of_video(
     video: Video,
     sizes: Mapping[str, tuple[int, int]],
     folder: Path | None,
-    options: DensifyOptions,
+    options: ImageOptions,
 ) -> VideoImages:
     """The model's images of a video; refuses those that do not fit it."""
-    check_frame_list(options.match.images)
+    check_frame_list(options)
     if len(sizes) < 2:
         raise ModelError(
             f"{model}: only one image of {video} has a pose: give a model with two or more"

@@ -30,13 +30,13 @@ from colmap_av1.images.track_images import (
     decode_all,
     track_images,
 )
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOptions
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
     open_source,
 )
-from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.progress import Progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display, shown_size, turned_back
@@ -89,11 +89,14 @@ class _Fit:
         return self.display.pixel_aspect * width * image_height / (height * image_width)
 
 
-def check_fit(options: MatchOptions, size: tuple[int, int], pixel_aspect: float) -> None:
+def check_fit(
+    camera: CameraOptions, images: ImageOptions, size: tuple[int, int], pixel_aspect: float
+) -> None:
     """Refuse options that cannot give images of a video, before the long work.
 
     Args:
-        options: those of the images and of the camera are looked at.
+        camera: which camera the images have.
+        images: how they are chosen.
         size: (width, height) of the images.
         pixel_aspect: width of a pixel of theirs over its height.
 
@@ -101,8 +104,8 @@ def check_fit(options: MatchOptions, size: tuple[int, int], pixel_aspect: float)
         ImageError: the list of frames cannot be read.
         OptionError: the camera's parameters do not fit such pixels.
     """
-    make_camera(options.camera, *size, pixel_aspect)
-    check_frame_list(options.images)
+    make_camera(camera, *size, pixel_aspect)
+    check_frame_list(images)
 
 
 def prepare_images(
@@ -113,8 +116,7 @@ def prepare_images(
     listed: Mapping[str, tuple[int, int]],
     masks: VideoMasks | None = None,
     beside: Path,
-    clock: Clock,
-    progress: Progress,
+    context: RunContext,
 ) -> PreparedImages:
     """Chain the motion of a video into tracks and find or choose the frames that are images.
 
@@ -125,8 +127,7 @@ def prepare_images(
         listed: (width, height) of images that a database lists, by name.
         masks: what of the pictures counts; None: all.
         beside: the file that is being made, see `open_source`.
-        clock: gets the stages up to "choice".
-        progress: called in these stages.
+        context: gets the stages up to "choice".
 
     Raises:
         VideoError: the video cannot be read.
@@ -135,9 +136,9 @@ def prepare_images(
         OptionError: an option does not fit the video or its images.
     """
     # What can be refused is refused before the long work.
-    fit = _fit(video, folder, options, listed)
+    fit = _fit(video, folder, options.images, listed)
     display, size, existing = fit.display, fit.size, list(fit.existing)
-    check_fit(options, size, fit.pixel_aspect)
+    check_fit(options.camera, options.images, size, fit.pixel_aspect)
     if folder is not None:
         check_image_folder(folder, existing or options.images.image_name, size)
         if size != fit.video_size:
@@ -146,13 +147,12 @@ def prepare_images(
         names = existing or names_of_all(options.images, count_shown(video))
         masks.check([size, fit.video_size], names, options.images)
 
-    context = RunContext.of(options.run, clock, progress)
-
     def choose(tracked: TrackedVideo) -> ChosenImages:
         return choose_from_video(
             source,
             tracked.tracks,
-            options,
+            options.images,
+            options.reading,
             existing=existing,
             folder=folder,
             display=display,
@@ -160,12 +160,12 @@ def prepare_images(
         )
 
     with (
-        open_source(video, options, beside=beside, clock=clock, progress=progress) as source,
+        open_source(video, options.source, beside=beside, context=context) as source,
         unchanged(source.stream.state),
     ):
         found = track_images(
             source,
-            options,
+            options.tracking,
             choose,
             masks=masks,
             display=display,
@@ -178,7 +178,8 @@ def prepare_images(
         kept = zip(names, frames, strict=True)
         first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
         if not existing and first_kept is not None:
-            pictures = decode_all(source, found.tracks.num_frames, options, display, context)
+            num_frames = found.tracks.num_frames
+            pictures = decode_all(source, num_frames, options.reading, display, context)
             check_content([folder / first_kept[0]], [first_kept[1]], pictures)
     return PreparedImages(
         source=source,
@@ -192,14 +193,14 @@ def prepare_images(
 def _fit(
     video: Video,
     folder: Path | None,
-    options: MatchOptions,
+    options: ImageOptions,
     listed: Mapping[str, tuple[int, int]],
 ) -> _Fit:
     """Find existing images, and how they show the video; refuses those that do not fit."""
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
-        names = existing_images(folder, options.images.image_name)
+        names = existing_images(folder, options.image_name)
         existing = {name: image_size(folder / name) for name in names}
     back = _way_back(video, existing, folder)
     if back is not None:
@@ -210,67 +211,53 @@ def _fit(
     return _Fit(existing, display, video_size, size)
 
 
-def write_chosen(
-    pictures: Video,
-    folder: Path,
-    chosen: ChosenImages,
-    options: MatchOptions,
-    *,
-    display: Display,
-    progress: Progress,
+def write_prepared(
+    prepared: PreparedImages, folder: Path, read: ReadOptions, progress: Progress
 ) -> int:
-    """Write the chosen frames of a video as images, see `write_images`.
+    """Write the images of a video, see `write_images`.
 
     Args:
-        pictures: the video.
-        folder: where the images go.
-        chosen: the images.
-        options: those of reading and the threads are used.
-        display: how pictures are cut and turned.
+        prepared: the images.
+        folder: where they go.
+        read: how the video is decoded.
         progress: called in the stage "images".
 
     Returns:
         The number of images written; the others were there.
     """
+    chosen = prepared.tracked.chosen
     return write_images(
-        pictures,
+        prepared.source.pictures,
         folder,
         chosen.names,
         chosen.frames.tolist(),
-        num_threads=options.run.num_threads,
-        operating_point=options.read.operating_point,
-        display=display,
+        num_threads=read.num_threads,
+        operating_point=read.operating_point,
+        display=prepared.display,
         progress=lambda done: progress("images", done, len(chosen.names)),
     )
 
 
-def write_all_chosen(
+def write_all_prepared(
     videos: Iterable[tuple[str, PreparedImages]],
     folder: Path,
-    options: MatchOptions,
+    read: ReadOptions,
     progress: Progress,
 ) -> tuple[int, list[str]]:
-    """Write the chosen frames of videos as images, see `write_chosen`.
+    """Write the images of videos, see `write_prepared`.
 
     Args:
         videos: the folder of each video's images in that of all, and these.
         folder: where the images go.
-        options: as of `write_chosen`.
-        progress: as of `write_chosen`.
+        read: how the videos are decoded.
+        progress: called in the stage "images".
 
     Returns:
         The number of images written, and what the user should know of all images.
     """
     num_written, warnings = 0, list[str]()
     for label, own in videos:
-        num_written += write_chosen(
-            own.source.pictures,
-            folder / label,
-            own.tracked.chosen,
-            options,
-            display=own.display,
-            progress=progress,
-        )
+        num_written += write_prepared(own, folder / label, read, progress)
         warning = blur_warning([folder / label / name for name in own.tracked.chosen.names])
         warnings += [warning] if warning is not None else []
     return num_written, warnings

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import ReadOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video
@@ -137,7 +137,7 @@ def pictures_of(
     takes: Takes,
     videos: Sequence[ShownVideo],
     photos: Sequence[Path],
-    options: MatchOptions,
+    options: ReadOptions,
 ) -> Pictures:
     """What gives the pictures of images.
 
@@ -145,7 +145,7 @@ def pictures_of(
         takes: the images.
         videos: the videos.
         photos: the files of the photos.
-        options: those of reading are used.
+        options: how videos are decoded.
 
     Returns:
         A function that decodes those videos which the asked images are of, up to the last of them.
@@ -166,7 +166,7 @@ def pictures_of(
                 decoded = decodable_frames(
                     shown.video,
                     max(image_of) + 1,
-                    options.reading,
+                    options,
                     shown.display,
                     wanted=image_of,
                     use="pictures are looked at",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import VideoError
 from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.masks import VideoMasks
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import ImageOptions, ReadOptions, TrackingOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
@@ -55,7 +55,7 @@ class TrackedImages:
 
 def track_images(
     source: VideoSource,
-    options: MatchOptions,
+    options: TrackingOptions,
     choose: Callable[[TrackedVideo], ChosenImages],
     *,
     masks: VideoMasks | None,
@@ -72,15 +72,16 @@ def track_images(
 
     Args:
         source: the video.
-        options: those of reading, chaining and refinement are used.
+        options: how motion is read and chained, and tracks are refined.
         choose: chooses the images by the masked tracks.
         masks: masks of the video; None: all pixels count.
         display: how images show the pictures; None: as players do.
         one_size: refuse frames of several sizes, see `track_video`.
         frames: int32 [n] frames among which images are chosen; tracks are kept in the images alone.
             None: tracks are kept in all frames.
-        refine: correct tracks of downscaled motion, see `refine_in_images`.
-        context: its clock gets the stages of `track_video` and "choice".
+        refine: correct tracks of downscaled motion that are not refined yet, see
+            `refine_in_images`.
+        context: gets the stages of `track_video`, "choice" and "refinement".
 
     Raises:
         VideoError: the video shows no frame, or frames of another size than its container says.
@@ -89,15 +90,13 @@ def track_images(
             has no mask.
         OptionError: an option does not fit the video or its images.
     """
-    clock, progress = context.clock, context.progress
     min_length = least_length(options.tracks) if frames is None else _MIN_IMAGES
     video = track_video(
         source,
         options,
         one_size=one_size,
         frames=frames,
-        clock=clock,
-        progress=progress,
+        context=context,
     )
     video = replace(video, tracks=_as_displayed(video.tracks, source, display))
     if masks is not None:
@@ -106,20 +105,19 @@ def track_images(
             tracks=masks.on_frames(video.tracks, min_length),
             inter_share=masks.on_motion(video.inter_share),
         )
-    with clock.measure("choice"):
+    with context.clock.measure("choice"):
         chosen = choose(video)
         if frames is not None:
             tracks = video.tracks.keep_frames(chosen.frames).keep_long(min_length)
             video = replace(video, tracks=tracks)
-    if refine:
+    if refine and options.refine.refine == "none":
         video = refine_in_images(
             video,
             source,
             chosen.frames,
-            options,
+            options.read,
             display=display,
-            clock=clock,
-            progress=progress,
+            context=context,
         )
     if masks is not None:
         video = replace(video, tracks=masks.on_tracks(video.tracks, chosen, min_length))
@@ -129,7 +127,8 @@ def track_images(
 def choose_from_video(
     source: VideoSource,
     tracks: Tracks,
-    options: MatchOptions,
+    options: ImageOptions,
+    read: ReadOptions,
     *,
     existing: Sequence[str] = (),
     folder: Path | None,
@@ -141,7 +140,8 @@ def choose_from_video(
     Args:
         source: the video.
         tracks: tracks through all its frames.
-        options: those of images and reading are used.
+        options: how images are chosen.
+        read: how pictures are decoded.
         existing: names of images that exist.
         folder: folder of the images; None: no picture is decoded.
         display: how images show the pictures; None: as players do.
@@ -149,18 +149,18 @@ def choose_from_video(
     """
     return choose_images(
         tracks,
-        options.images,
+        options,
         existing=existing,
         folder=folder,
         times=lambda: times_of_frames(source, tracks.num_frames),
-        decode=lambda: decode_all(source, tracks.num_frames, options, display, context),
+        decode=lambda: decode_all(source, tracks.num_frames, read, display, context),
     )
 
 
 def decode_all(
     source: VideoSource,
     num_frames: int,
-    options: MatchOptions,
+    options: ReadOptions,
     display: Display | None,
     context: RunContext,
 ) -> Iterator[tuple[int, _Image]]:
@@ -168,7 +168,7 @@ def decode_all(
     pictures = decodable_frames(
         source.pictures,
         num_frames,
-        options.reading,
+        options,
         display,
         use="pictures are looked at",
     )

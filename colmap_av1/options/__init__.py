@@ -7,6 +7,8 @@ from colmap_av1.options.commands import (
     MatchOptions,
     OnExisting,
     ReconstructOptions,
+    SourceOptions,
+    TrackingOptions,
 )
 from colmap_av1.options.compare import CompareOptions, LearnedOptions
 from colmap_av1.options.images import ImageOptions, MaskOptions
@@ -47,7 +49,9 @@ __all__ = [
     "ReconstructOptions",
     "RefineOptions",
     "RunOptions",
+    "SourceOptions",
     "TrackOptions",
+    "TrackingOptions",
     "TriangulateOptions",
     "VerifyOptions",
     "ViewOptions",

@@ -21,6 +21,25 @@ OnExisting = Literal["error", "append", "replace"]
 
 
 @dataclass(frozen=True)
+class SourceOptions:
+    """The options of finding or making the AV1 stream of a video, see `MatchOptions`."""
+
+    read: ReadOptions = ReadOptions()
+    encode: EncodeOptions = EncodeOptions()
+    keep_stream: str | os.PathLike[str] | None = None
+    reencode: bool = False
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """The options of tracking a video, see `MatchOptions`."""
+
+    read: ReadOptions = ReadOptions()
+    tracks: TrackOptions = TrackOptions()
+    refine: RefineOptions = RefineOptions()
+
+
+@dataclass(frozen=True)
 class MatchOptions(Options):
     """Options of `match`."""
 
@@ -65,6 +84,16 @@ class MatchOptions(Options):
         if self.read.num_threads is not None:
             return self.read
         return replace(self.read, num_threads=self.run.num_threads)
+
+    @property
+    def source(self) -> SourceOptions:
+        """How the AV1 stream of a video is found or made."""
+        return SourceOptions(self.reading, self.encode, self.keep_stream, self.reencode)
+
+    @property
+    def tracking(self) -> TrackingOptions:
+        """How a video is tracked."""
+        return TrackingOptions(self.reading, self.tracks, self.refine)
 
 
 @dataclass(frozen=True)

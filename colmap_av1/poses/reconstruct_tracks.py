@@ -23,7 +23,7 @@ from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
-from colmap_av1.options import MatchOptions, ReconstructOptions, RefineOptions
+from colmap_av1.options import ReconstructOptions, RefineOptions, TrackingOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource, count_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
@@ -71,6 +71,11 @@ class Run:
     positions: ImagePositions | None = None
 
     @property
+    def context(self) -> RunContext:
+        """Clock, progress, threads and seed of the run."""
+        return RunContext.of(self.options.match.run, self.clock, self.progress)
+
+    @property
     def files(self) -> tuple[FileState, ...]:
         """All files as they were at the start."""
         photos = [photo.state for photo in self.inputs.photos]
@@ -85,7 +90,7 @@ class Run:
         """What gives the pictures of images, see `pictures_of`."""
         videos = [ShownVideo(own.pictures, kept=own.kept) for own in self.sources]
         photos = [photo.path for photo in self.inputs.photos]
-        return pictures_of(takes, videos, photos, self.options.match)
+        return pictures_of(takes, videos, photos, self.options.match.reading)
 
 
 @dataclass(frozen=True)
@@ -135,21 +140,22 @@ def stage_of_video(run: Run, video: int) -> str:
 
 def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     """Chain the motion of a video into tracks and choose the frames that are images."""
-    source, clock = run.sources[video], run.clock
-    options = chaining_for_points(
-        run.options.match, run.options.triangulate, is_downscaled=source.is_downscaled
+    source, options = run.sources[video], run.options.match
+    chaining = chaining_for_points(
+        options.tracks, run.options.triangulate, is_downscaled=source.is_downscaled
     )
+    tracking = replace(options.tracking, tracks=chaining)
     name, shown = stage_of_video(run, video), source.pictures
 
     def make(partial: Path) -> TracksResult:
-        found, is_long = _track_and_choose(run, video, options, partial)
+        found, is_long = _track_and_choose(run, video, tracking, partial)
         chosen, tracked = found.chosen, found.video
         tracks, read_out = without_shutter(
             tracked.tracks,
             shown.display,
             shown.frame_rate,
             options.camera,
-            RunContext.of(options.run, clock),
+            run.context,
         )
         # Of a long video no other frame is of use from here on.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
@@ -161,7 +167,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     mapping = run.options.mapping
     choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
     shutter = shutter_settings(options.camera)
-    given = (options.images, choice, options.read, options.tracks, options.refine, shutter)
+    given = (options.images, choice, options.read, chaining, options.refine, shutter)
     listed = digest_if_there(options.images.frame_list)
     masked = run.inputs.masks.digest if run.inputs.masks is not None else None
     return run_stage(
@@ -176,32 +182,32 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
 
 
 def _track_and_choose(
-    run: Run, video: int, options: MatchOptions, folder: Path
+    run: Run, video: int, options: TrackingOptions, folder: Path
 ) -> tuple[TrackedImages, bool]:
     """Chain the motion of a video into tracks, and choose its images.
 
     Returns:
         The tracks and images, and whether the video is long.
     """
-    source = run.sources[video]
-    if not options.images.ways and count_frames(source) > run.options.max_images:
+    source, images = run.sources[video], run.options.match.images
+    if not images.ways and count_frames(source) > run.options.max_images:
         return _track_long(run, video, options), True
-    context = RunContext.of(options.run, run.clock, run.progress)
 
     def choose(tracked: TrackedVideo) -> ChosenImages:
         return choose_from_video(
             source,
             pose_tracks(run, tracked.tracks),
-            options,
+            images,
+            options.read,
             folder=folder,
-            context=context,
+            context=run.context,
         )
 
     masks = run.inputs.masks_of_videos[video]
-    return track_images(source, options, choose, masks=masks, context=context), False
+    return track_images(source, options, choose, masks=masks, context=run.context), False
 
 
-def _track_long(run: Run, video: int, options: MatchOptions) -> TrackedImages:
+def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages:
     """The tracks of a video with more frames than `max_images`, in chosen images alone.
 
     These are chosen among evenly spread frames. The motion is read twice, first for the choice
@@ -215,8 +221,7 @@ def _track_long(run: Run, video: int, options: MatchOptions) -> TrackedImages:
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_OF_UNIT
     # Motion between all neighbouring frames is needed to correct the shutter.
-    has_shutter = options.camera.rolling_shutter != "none"
-    context = RunContext.of(options.run, run.clock, run.progress)
+    has_shutter = run.options.match.camera.rolling_shutter != "none"
     track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
 
     if options.refine.refine == "none" and not has_shutter and held <= _MOST_HELD:
@@ -225,25 +230,23 @@ def _track_long(run: Run, video: int, options: MatchOptions) -> TrackedImages:
             few = tracked.tracks.every_nth(_FEWER)
             return _spread_in(run, video, replace(tracked, tracks=few), candidates)
 
-        return track(options, choose, frames=candidates, context=context)
+        return track(options, choose, frames=candidates, context=run.context)
 
     with run.clock.measure("choice"):
         chosen = track(
-            replace(
-                run.options.match,
-                tracks=replace(run.options.match.tracks, seeding=_SEEDING),
-                refine=RefineOptions(),
+            TrackingOptions(
+                options.read, replace(run.options.match.tracks, seeding=_SEEDING), RefineOptions()
             ),
             lambda tracked: _spread_in(run, video, tracked, candidates),
             frames=candidates,
             refine=False,
-            context=replace(context, clock=Clock()),
+            context=replace(run.context, clock=Clock()),
         ).chosen
     return track(
         options,
         lambda _: chosen,
         frames=None if has_shutter else chosen.frames,
-        context=context,
+        context=run.context,
     )
 
 

@@ -21,12 +21,18 @@ from colmap_av1.errors import (
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, inspect
 from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import EncodeOptions, MatchOptions, ReadOptions
+from colmap_av1.options import (
+    EncodeOptions,
+    MatchOptions,
+    ReadOptions,
+    SourceOptions,
+    TrackingOptions,
+)
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_spread_tracks, refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.util.files import remove_leftovers, scratch_folder
-from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
@@ -94,7 +100,7 @@ class TrackedVideo:
 
 @contextmanager
 def open_source(
-    video: Video, options: MatchOptions, *, beside: Path, clock: Clock, progress: Progress
+    video: Video, options: SourceOptions, *, beside: Path, context: RunContext
 ) -> Iterator[VideoSource]:
     """Find the AV1 stream of a video, or make it by converting; motion is read from it.
 
@@ -102,10 +108,9 @@ def open_source(
 
     Args:
         video: a video of any codec.
-        options: those of encoding and reading are used.
+        options: whether and how a stream is made.
         beside: the file or folder that is being made, which gets the stream beside it meanwhile.
-        clock: gets the stage "encoding" where a stream is made.
-        progress: called for the stage "encoding".
+        context: gets the stage "encoding" where a stream is made.
 
     Raises:
         VideoError: the video cannot be converted.
@@ -114,31 +119,31 @@ def open_source(
     """
     # Of a run that was killed while it converted another video.
     remove_leftovers(beside.resolve().parent, beside.resolve().name)
-    if video.codec == "av1" and not (options.reencode and inspect(video, options.reading).reasons):
+    if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
         yield VideoSource(video, video)
         return
     strict = options.read.strict
     how = with_downscale(options.encode, video.picture_size)
     if options.keep_stream is not None:
-        with clock.measure("encoding"):
+        with context.clock.measure("encoding"):
             made = stream_of(
                 video,
                 options.keep_stream,
                 strict=strict,
                 options=how,
-                progress=progress,
+                progress=context.progress,
             )
         yield _made_source(video, made, how, is_kept=True)
         return
     with _scratch(beside) as folder:
-        with clock.measure("encoding"):
+        with context.clock.measure("encoding"):
             made = encode(
                 video,
                 folder / "stream.mp4",
                 strict=strict,
                 telemetry=False,  # the video itself is asked
                 options=how,
-                progress=progress,
+                progress=context.progress,
             )
         yield _made_source(video, made, how, is_kept=False)
 
@@ -192,30 +197,29 @@ def _scratch(beside: Path) -> Iterator[Path]:
 
 def track_video(
     source: VideoSource,
-    options: MatchOptions,
+    options: TrackingOptions,
     *,
     one_size: bool,
     frames: NDArray[np.int32] | None = None,
-    clock: Clock,
-    progress: Progress,
+    context: RunContext,
 ) -> TrackedVideo:
     """Chain the motion of a video into tracks as it is read, and refine them.
 
     Args:
         source: the video.
-        options: those of reading, chaining and refinement are used.
+        options: how motion is read and chained, and tracks are refined.
         one_size: refuse shown frames of several sizes, as refinement does.
         frames: int32 [n] the frames, as players show them, whose observations are kept; None: all.
-        clock: gets the stages "motion" and "tracks", with refinement "decoding" and
+        context: gets the stages "motion" and "tracks", with refinement "decoding" and
             "refinement".
-        progress: called for the stages "motion" and "refinement".
 
     Raises:
         VideoError: the video shows no frame.
         BitstreamError: the stream is damaged, and strict or before its second frame.
         ImageError: the frames change their size and must not.
     """
-    motion: Iterable[FrameMotion] = read_motion(source.stream, options.reading)
+    clock, progress = context.clock, context.progress
+    motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
     if one_size or options.refine.refine != "none":
         motion = _of_one_size(motion)
     structure = Structure()
@@ -243,7 +247,7 @@ def track_video(
             with clock.measure("refinement"):
                 pictures = clock.iterate(
                     "decoding",
-                    decodable_frames(source.pictures, tracks.num_frames, options.reading),
+                    decodable_frames(source.pictures, tracks.num_frames, options.read),
                 )
                 tracks = refine_tracks(
                     tracks,
@@ -315,39 +319,37 @@ def refine_in_images(
     tracked: TrackedVideo,
     source: VideoSource,
     frames: NDArray[np.int32],
-    options: MatchOptions,
+    options: ReadOptions,
     *,
     display: Display | None = None,
-    clock: Clock,
-    progress: Progress,
+    context: RunContext,
 ) -> TrackedVideo:
     """Correct the tracks that poses come from where motion was searched in smaller pictures.
 
-    Poses then are as exact as those of motion at full size. What is refined already, and a video
-    whose motion is of full size, is left as it is.
+    Poses then are as exact as those of motion at full size. The tracks of a video whose motion is
+    of full size stay as they are.
 
     Args:
         tracked: tracks of the video.
         source: the video.
         frames: int32 [n] frames that become images, ascending.
-        options: those of reading are used.
+        options: how the video is decoded.
         display: how images show the pictures; None: as players do.
-        clock: gets the stage "refinement".
-        progress: called for the stage "refinement".
+        context: gets the stage "refinement".
 
     Raises:
         BitstreamError: the video is damaged, and strict.
     """
-    if not source.is_downscaled or options.refine.refine != "none":
+    if not source.is_downscaled:
         return tracked
-    with clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
+    with context.clock.measure("refinement"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         wanted = frozenset(frames.tolist())
         num_frames = int(frames[-1]) + 1
         pictures = decodable_frames(
             source.pictures,
             num_frames,
-            options.reading,
+            options,
             display,
             wanted=wanted,
             kept=source.kept,
@@ -356,7 +358,7 @@ def refine_in_images(
             tracked.tracks,
             frames,
             pictures,
-            lambda done: progress("refinement", done, len(frames)),
+            lambda done: context.progress("refinement", done, len(frames)),
         )
     notes = (*tracked.warnings, *(str(w.message) for w in caught))
     return replace(tracked, tracks=tracks, warnings=notes)

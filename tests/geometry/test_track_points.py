@@ -15,7 +15,7 @@ from colmap_av1.geometry.track_points import (
     triangulate_tracks,
 )
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.options import MatchOptions, TrackOptions, TriangulateOptions
+from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import no_progress
 
@@ -65,15 +65,11 @@ def make_points(observation: list[list[int]]) -> TriangulatedPoints:
 def test_points_come_from_short_tracks_too(
     given: TrackOptions, min_observations: int, min_length: int, cell: int
 ) -> None:
-    options = replace(MatchOptions(), tracks=given)
-    tracks = chaining_for_points(
-        options, TriangulateOptions(min_observations=min_observations)
-    ).tracks
+    triangulate = TriangulateOptions(min_observations=min_observations)
+    tracks = chaining_for_points(given, triangulate)
     assert (tracks.min_length, tracks.cell) == (min_length, cell)
     assert replace(tracks, min_length=given.min_length, cell=given.cell) == given
-    smaller = chaining_for_points(
-        options, TriangulateOptions(min_observations=min_observations), is_downscaled=True
-    ).tracks
+    smaller = chaining_for_points(given, triangulate, is_downscaled=True)
     assert (smaller.min_length, smaller.cell) == (min_length, given.cell)
 
 

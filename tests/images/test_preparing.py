@@ -16,7 +16,8 @@ from colmap_av1.images.files import write_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.preparing import PreparedImages, prepare_images
 from colmap_av1.options import EncodeOptions, ImageOptions, MatchOptions, ReadOptions
-from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.progress import Clock
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import stream_of
 from colmap_av1.video.facts import read_video
@@ -39,8 +40,7 @@ def prepared(
         options,
         listed=listed or {},
         beside=BESIDE,
-        clock=Clock(),
-        progress=no_progress,
+        context=RunContext(),
     )
 
 
@@ -52,8 +52,7 @@ def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
         replace(OPTIONS, images=ImageOptions(num_images=5)),
         listed={},
         beside=BESIDE,
-        clock=clock,
-        progress=lambda stage, done, total: told.add(stage),
+        context=RunContext(clock, lambda stage, done, total: told.add(stage)),
     )
     assert told == {"motion"}
     assert list(clock.seconds) == ["motion", "tracks", "choice"]

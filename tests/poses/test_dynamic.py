@@ -47,6 +47,7 @@ from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import VideoSource, track_video
 from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 
@@ -305,9 +306,7 @@ class Passed:
 def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     video = read_video(SCENE)
     source = VideoSource(video, video)
-    every = track_video(
-        source, MatchOptions(), one_size=True, clock=Clock(), progress=no_progress
-    ).tracks
+    every = track_video(source, MatchOptions().tracking, one_size=True, context=RunContext()).tracks
     frames = np.arange(NUM_FRAMES, dtype=np.int32)
     left = 60 + 14 * np.arange(NUM_FRAMES)
     column = np.arange(640)

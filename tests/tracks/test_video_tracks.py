@@ -22,7 +22,8 @@ from colmap_av1.tracks.video_tracks import (
     track_video,
     with_stream_kept,
 )
-from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.progress import Clock
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 
@@ -34,13 +35,13 @@ def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
     """A video that is not converted: its stream outlasts the source."""
     beside = video.with_name("a.db")
     with open_source(
-        read_video(video), options, beside=beside, clock=Clock(), progress=no_progress
+        read_video(video), options.source, beside=beside, context=RunContext()
     ) as source:
         return source
 
 
 def tracked(source: VideoSource, options: MatchOptions = OPTIONS) -> TrackedVideo:
-    return track_video(source, options, one_size=False, clock=Clock(), progress=no_progress)
+    return track_video(source, options.tracking, one_size=False, context=RunContext())
 
 
 @pytest.fixture(scope="module")
@@ -51,21 +52,19 @@ def phone(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_path: Path) -> None:
-    beside, clock = tmp_path / "a.db", Clock()
-    with open_source(
-        read_video(phone), OPTIONS, beside=beside, clock=clock, progress=no_progress
-    ) as source:
+    beside, context = tmp_path / "a.db", RunContext()
+    with open_source(read_video(phone), OPTIONS.source, beside=beside, context=context) as source:
         assert source.pictures.path == phone
         assert source.stream.codec == "av1"
         assert source.stream.path.parent.parent == tmp_path
         assert not source.is_kept
         assert tracked(source).tracks.num_frames == 6
-    assert list(clock.seconds) == ["encoding"]
+    assert list(context.clock.seconds) == ["encoding"]
     assert not list(tmp_path.iterdir())
     assert list(phone.parent.iterdir()) == [phone]
     with (
         pytest.raises(RuntimeError),
-        open_source(read_video(phone), OPTIONS, beside=beside, clock=clock, progress=no_progress),
+        open_source(read_video(phone), OPTIONS.source, beside=beside, context=context),
     ):
         raise RuntimeError
     assert not list(tmp_path.iterdir())
@@ -88,10 +87,9 @@ def test_a_folder_that_takes_no_stream(phone: Path, tmp_path: Path) -> None:
         pytest.raises(EncodeError, match=r"ermission.*--keep_stream"),
         open_source(
             read_video(phone),
-            OPTIONS,
+            OPTIONS.source,
             beside=tmp_path / "a.db",
-            clock=Clock(),
-            progress=no_progress,
+            context=RunContext(),
         ),
     ):
         pass
@@ -169,10 +167,9 @@ def test_stages_do_not_count_twice(clip: Path) -> None:
     with clock.measure("all"):
         track_video(
             opened(clip),
-            lk,
+            lk.tracking,
             one_size=True,
-            clock=clock,
-            progress=lambda *w: told.append(w),
+            context=RunContext(clock, lambda *w: told.append(w)),
         )
     whole = clock.seconds.pop("all")
     assert set(clock.seconds) == {"motion", "tracks", "decoding", "refinement"}

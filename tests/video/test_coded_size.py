@@ -25,7 +25,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.video_tracks import open_source, track_video
-from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import encode as encode_video
@@ -166,9 +166,13 @@ def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None
         options = MatchOptions(
             encode=EncodeOptions("libaom", downscale=downscale), tracks=TrackOptions(min_length=3)
         )
-        how = {"clock": Clock(), "progress": no_progress}
-        with open_source(read_video(courtyard), options, beside=tmp_path / "x", **how) as source:
-            found[downscale] = track_video(source, options, one_size=True, **how).tracks
+        context = RunContext()
+        with open_source(
+            read_video(courtyard), options.source, beside=tmp_path / "x", context=context
+        ) as source:
+            found[downscale] = track_video(
+                source, options.tracking, one_size=True, context=context
+            ).tracks
     assert {(t.width, t.height) for t in found.values()} == {(640, 360)}
     ratio = np.median(found[2].sigma) / np.median(found[1].sigma)
     assert 1.3 < ratio < 3

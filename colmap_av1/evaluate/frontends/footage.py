@@ -11,7 +11,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.files import existing_images, write_images
 from colmap_av1.images.names import image_names
-from colmap_av1.images.preparing import PreparedImages, prepare_images, write_chosen
+from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
 from colmap_av1.matching.image_matches import pair_images, verify_images
 from colmap_av1.options import (
     CameraOptions,
@@ -23,7 +23,7 @@ from colmap_av1.options import (
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.util.digests import digest_if_there, file_digest
-from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.facts import Video, read_video
@@ -122,7 +122,7 @@ def choose_footage(
     images = image_path if image_path is not None else folder / "images"
 
     def make() -> dict[str, Any]:
-        clock = Clock()
+        context = RunContext.of(options.run, progress=progress)
         existed = bool(existing_images(images, options.images.image_name))
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
@@ -131,13 +131,11 @@ def choose_footage(
                 options,
                 listed={},
                 beside=folder / "result.json",
-                clock=clock,
-                progress=progress,
+                context=context,
             )
             chosen = prepared.tracked.chosen
             check_video()
-            pictures, display = prepared.source.pictures, prepared.display
-            write_chosen(pictures, images, chosen, options, display=display, progress=progress)
+            write_prepared(prepared, images, options.reading, progress)
         return {
             "names": chosen.names,
             "frames": chosen.frames.tolist(),

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from colmap_av1.geometry.cameras import is_square
 from colmap_av1.matching.shutter.correct import rows_down
 from colmap_av1.matching.shutter.estimate import estimate_read_out
-from colmap_av1.options import MatchOptions, ReadOptions
+from colmap_av1.options import ReadOptions, TrackingOptions
 from colmap_av1.tracks.video_tracks import VideoSource, track_video
-from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.facts import read_video
 
 # Share of the time by which it may be off in all parts of a video: velocities are means, so it
@@ -62,16 +63,15 @@ def estimate_video_read_out(
         return "the container says no frame rate"
     if not is_square(opened.display.pixel_aspect):
         return "pixels are not square"
-    how = MatchOptions(read=options if options is not None else ReadOptions())
+    context = RunContext(progress=progress if progress is not None else no_progress)
     tracks = track_video(
         VideoSource(opened, opened),
-        how,
+        TrackingOptions(options if options is not None else ReadOptions()),
         one_size=True,
-        clock=Clock(),
-        progress=progress if progress is not None else no_progress,
+        context=context,
     ).tracks
     down = rows_down(opened.display, (tracks.width, tracks.height))
-    found = estimate_read_out(tracks, down, None, how.run.seed)
+    found = estimate_read_out(tracks, down, None, context.seed)
     if isinstance(found, str):
         return found
     period = 1000 / opened.frame_rate

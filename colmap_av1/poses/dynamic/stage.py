@@ -94,8 +94,8 @@ def without_moving(tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], run
     }
     if not by_frame:
         return tracks
-    options = chaining_for_points(run.options.match, run.options.triangulate)
-    return mask_tracks(tracks, by_frame, least_length(options.tracks), scaled=False)
+    options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
+    return mask_tracks(tracks, by_frame, least_length(options), scaled=False)
 
 
 def _write(path: Path, masks: Mapping[str, Mask]) -> None:
