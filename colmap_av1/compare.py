@@ -344,7 +344,7 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
         similarity, errors = fit_similarity(poses, given.poses), pose_errors(poses, given.poses)
         if similarity is None or errors is None or errors.ate > _LARGEST_ATE * errors.extent:
             continue
-        return replace(given, points=similarity.move(points), cloud_source=name)
+        return replace(given, points=similarity.apply(points), cloud_source=name)
     return given
 
 
@@ -368,13 +368,13 @@ def _measure(
     if reference.poses is not None:
         similarity = fit_similarity(poses, reference.poses)
     if similarity is not None:
-        points = similarity.move(points)
+        points = similarity.apply(points)
         if reference.points is not None and reference.cloud_source != column.name:
             column = replace(column, cloud=cloud_distances(points, reference.points))
         assert reference.poses is not None
         if reference.pose_source != column.name:
             column = replace(column, poses=pose_errors(poses, reference.poses))
-        poses = similarity.move_poses(poses)
+        poses = similarity.apply_to_poses(poses)
     cloud = Cloud(
         points, _colours(model), poses, _focal_length(model), is_aligned=similarity is not None
     )

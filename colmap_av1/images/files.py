@@ -31,6 +31,7 @@ from colmap_av1.images.png import png_bytes
 from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
+from colmap_av1.util.spread import evenly_spread
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
@@ -386,7 +387,7 @@ def blur_warning(files: Sequence[Path]) -> str | None:
     Raises:
         ImageError: an image is missing or cannot be read.
     """
-    some = [files[i] for i in np.linspace(0, len(files) - 1, _NUM_DETAILED).round().astype(int)]
+    some = [files[i] for i in evenly_spread(len(files), _NUM_DETAILED, rounded=True)]
     greys = [grey_within(read_image(file), _DETAILED_SIZE) for file in some]
     if float(np.median([_detail(grey) for grey in greys])) < _LEAST_DETAIL:
         return (

@@ -70,8 +70,8 @@ def test_models_are_aligned_by_their_cameras() -> None:
     assert np.isnan(poses[-1]).all()
     similarity = fit_similarity(image_poses(moved, names), poses[:-1])
     assert similarity is not None
-    np.testing.assert_allclose(similarity.move(point_cloud(moved)), point_cloud(model), atol=1e-6)
+    np.testing.assert_allclose(similarity.apply(point_cloud(moved)), point_cloud(model), atol=1e-6)
     np.testing.assert_allclose(
-        similarity.move_poses(image_poses(moved, names)), poses[:-1], atol=1e-6
+        similarity.apply_to_poses(image_poses(moved, names)), poses[:-1], atol=1e-6
     )
     assert fit_similarity(np.full_like(poses, np.nan), poses) is None

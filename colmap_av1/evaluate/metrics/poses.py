@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.sequence import frame_number
+from colmap_av1.geometry.alignment import Similarity
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
 
 
@@ -41,31 +42,6 @@ class PoseErrors:
     max_rotation: float
     relative_translation: float
     relative_rotation: float
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """A similarity transformation, x' = scale * rotation x + translation.
-
-    Attributes:
-        scale: the scale.
-        rotation: float64 [3, 3].
-        translation: float64 [3].
-    """
-
-    scale: float
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-
-    def move(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points [n, 3] in the other coordinates."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def move_poses(self, cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses [n, 3, 4] of the same cameras in the other coordinates."""
-        rotation = cam_from_world[:, :, :3] @ self.rotation.T
-        centres = self.move(camera_centres(cam_from_world))
-        return np.dstack([rotation, -np.einsum("nij,nj->ni", rotation, centres)])
 
 
 def fit_similarity(
@@ -116,7 +92,10 @@ def pose_errors(
     if similarity is None:
         return None
     both = _in_both(cam_from_world, truth)
-    aligned, true_centres = similarity.move_poses(cam_from_world[both]), camera_centres(truth[both])
+    aligned, true_centres = (
+        similarity.apply_to_poses(cam_from_world[both]),
+        camera_centres(truth[both]),
+    )
     distance = np.linalg.norm(camera_centres(aligned) - true_centres, axis=1)
     angle = _rotation_errors(cam_from_world[both][:, :, :3], truth[both][:, :, :3])
     relative = _relative_errors(aligned, truth[both])

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.tracks.tracks import Tracks
 
 SPANS = (1, 2, 4, 8, 16)
@@ -67,17 +68,17 @@ def epipolar_errors(
         pairs of frames without known poses or without a baseline are left out.
     """
     pairs = pairs_at_span(tracks, span, max_pairs=max_pairs)
-    essential = _essential_matrices(cam_from_world, span)[tracks.frame[pairs[:, 0]]]
-    rays = [_rays(camera, tracks.xy[pairs[:, side]]) for side in (0, 1)]
-    line_in_b = np.einsum("nij,nj->ni", essential, rays[0])
-    line_in_a = np.einsum("nji,nj->ni", essential, rays[1])
-    residual = np.abs(np.einsum("ni,ni->n", rays[1], line_in_b))
-    slope = np.hypot(
-        np.hypot(line_in_b[:, 0], line_in_b[:, 1]), np.hypot(line_in_a[:, 0], line_in_a[:, 1])
-    )
-    with np.errstate(invalid="ignore"):
-        distance = camera.mean_focal_length() * residual / slope
-    return np.asarray(distance[np.isfinite(distance)], dtype=np.float64)
+    frame = tracks.frame[pairs[:, 0]]
+    errors = np.full(len(pairs), np.nan)
+    for a in np.unique(frame):
+        of_a = np.flatnonzero(frame == a)
+        pose = cam_from_world[a]
+        essential = essential_of_poses(pose, cam_from_world[a + span])
+        # What rounding leaves of a camera at rest is no direction.
+        if np.linalg.norm(essential) > 1e-12 * (1 + np.linalg.norm(pose[:, 3])):
+            rays = [_rays(camera, tracks.xy[pairs[of_a, side]]) for side in (0, 1)]
+            errors[of_a] = camera.mean_focal_length() * sampson_error(essential, *rays)
+    return np.asarray(errors[np.isfinite(errors)], dtype=np.float64)
 
 
 def exact_errors(
@@ -109,28 +110,6 @@ def exact_errors(
     return np.asarray(errors[np.isfinite(errors).all(1)], dtype=np.float64)
 
 
-def _essential_matrices(cam_from_world: NDArray[np.float64], span: int) -> NDArray[np.float64]:
-    """[num_frames, 3, 3] from each frame to the one `span` later; NaN where there is none."""
-    essential = np.full((len(cam_from_world), 3, 3), np.nan)
-    if span >= len(cam_from_world):
-        return essential
-    a, b = cam_from_world[:-span], cam_from_world[span:]
-    rotation = b[:, :, :3] @ a[:, :, :3].transpose(0, 2, 1)
-    turned = np.einsum("nij,nj->ni", rotation, a[:, :, 3])
-    baseline = b[:, :, 3] - turned
-    # What rounding leaves of a camera at rest is no direction.
-    at_rest = np.linalg.norm(baseline, axis=1) <= 1e-12 * (1 + np.linalg.norm(turned, axis=1))
-    baseline[at_rest] = np.nan
-    x, y, z = baseline.T
-    o = np.zeros_like(x)
-    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)
-    essential[:-span] = cross @ rotation
-    return essential
-
-
 def _rays(camera: pycolmap.Camera, xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[n, 3] rays of positions [n, 2], one unit long along the camera's axis."""
-    if not len(xy):
-        return np.empty((0, 3))
-    normalised = np.asarray(camera.cam_from_img(xy.astype(np.float64)), dtype=np.float64)
-    return np.concatenate([normalised, np.ones((len(xy), 1))], axis=1)
+    """[2, n] undistorted positions (x / z, y / z) of positions [n, 2]."""
+    return np.transpose(np.asarray(camera.cam_from_img(xy.astype(np.float64)), dtype=np.float64))
