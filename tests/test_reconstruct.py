@@ -7,13 +7,12 @@ import os
 import re
 import shutil
 import sqlite3
-import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -48,126 +47,45 @@ from colmap_av1.video.unchanged import file_state
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 
-@dataclass(frozen=True)
-class RawCamera:
-    model_id: int
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class RawImage:
-    qvec: tuple[float, ...]
-    tvec: tuple[float, ...]
-    camera_id: int
-    name: str
-    xy: np.ndarray
-    point_ids: np.ndarray
-
-
-@dataclass(frozen=True)
-class RawPoint:
-    xyz: tuple[float, ...]
-    rgb: tuple[int, ...]
-    error: float
-    track: tuple[tuple[int, int], ...]
-
-
-class Bytes:
-    def __init__(self, path: Path) -> None:
-        self._data = path.read_bytes()
-        self._at = 0
-
-    def take(self, layout: str) -> tuple:
-        values = struct.unpack_from("<" + layout, self._data, self._at)
-        self._at += struct.calcsize("<" + layout)
-        return values
-
-    def text(self) -> str:
-        end = self._data.index(b"\0", self._at)
-        text = self._data[self._at : end].decode()
-        self._at = end + 1
-        return text
-
-    def check_end(self) -> None:
-        assert self._at == len(self._data)
-
-
-def raw_model(folder: Path) -> tuple[dict, dict, dict]:
-    num_params = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
-    file = Bytes(folder / "cameras.bin")
-    cameras = {}
-    for _ in range(file.take("Q")[0]):
-        camera_id, model_id, width, height = file.take("iiQQ")
-        params = file.take(f"{num_params[model_id]}d")
-        cameras[camera_id] = RawCamera(model_id, width, height, params)
-    file.check_end()
-    file = Bytes(folder / "images.bin")
-    images = {}
-    for _ in range(file.take("Q")[0]):
-        image_id, *pose, camera_id = file.take("idddddddi")
-        name = file.text()
-        count = file.take("Q")[0]
-        rows = np.array(file.take("ddq" * count)).reshape(-1, 3)
-        images[image_id] = RawImage(
-            tuple(pose[:4]), tuple(pose[4:]), camera_id, name, rows[:, :2], rows[:, 2].astype(int)
-        )
-    file.check_end()
-    file = Bytes(folder / "points3D.bin")
-    points = {}
-    for _ in range(file.take("Q")[0]):
-        values = file.take("QdddBBBd")
-        length = file.take("Q")[0]
-        flat = file.take("ii" * length)
-        track = tuple(zip(flat[::2], flat[1::2], strict=True))
-        points[values[0]] = RawPoint(values[1:4], values[4:7], values[7], track)
-    file.check_end()
-    return cameras, images, points
-
-
 def test_files_agree(made: ReconstructReport) -> None:
-    """Both files tell the same of every observation, and the errors are those of the poses."""
-    cameras, images, points = raw_model(made.output / "sparse" / "0")
-    ((camera_id, camera),) = cameras.items()
-    assert {image.camera_id for image in images.values()} == {camera_id}
-    fx, fy, cx, cy = camera.params
-    assert len(points) == made.num_points
-    assert sum(len(i.point_ids) for i in images.values()) == made.num_observations
-    assert sum(len(p.track) for p in points.values()) == made.num_observations
-    rotation = {
-        i: pycolmap.Rotation3d(np.array([*image.qvec[1:], image.qvec[0]])).matrix()
-        for i, image in images.items()
-    }
-    for point_id in list(points)[::101]:
-        point = points[point_id]
-        assert len({image_id for image_id, _ in point.track}) >= 3
+    """Images and points have the same observations, and the errors are those of the poses."""
+    model = pycolmap.Reconstruction(made.output / "sparse" / "0")
+    (camera,) = model.cameras.values()
+    assert model.num_points3D() == made.num_points
+    assert model.compute_num_observations() == made.num_observations
+    for point_id in sorted(model.points3D)[::101]:
+        point = model.points3D[point_id]
         errors = []
-        for image_id, index in point.track:
-            image = images[image_id]
-            assert image.point_ids[index] == point_id
-            x, y, z = rotation[image_id] @ point.xyz + image.tvec
-            assert z > 0
-            at = np.array([fx * x / z + cx, fy * y / z + cy])
-            errors.append(np.linalg.norm(at - image.xy[index]))
+        for seen in point.track.elements:
+            image = model.images[seen.image_id]
+            keypoint = image.points2D[seen.point2D_idx]
+            assert keypoint.point3D_id == point_id
+            at = camera.img_from_cam(image.cam_from_world() * point.xyz)
+            errors.append(np.linalg.norm(at - keypoint.xy))
+        assert len({seen.image_id for seen in point.track.elements}) >= 3
         assert max(errors) <= 2.0 + 1e-6
         assert np.mean(errors) == pytest.approx(point.error, abs=1e-6)
+    assert model.compute_mean_reprojection_error() == pytest.approx(made.mean_error)
 
 
-def test_graphdeco(made: ReconstructReport) -> None:
-    """One of two pinhole models, flat names without more dots, colours, and no stale cloud."""
-    cameras, images, points = raw_model(made.output / "sparse" / "0")
-    assert all(camera.model_id in (0, 1) for camera in cameras.values())
-    for image in images.values():
-        assert Path(image.name).name == image.name
-        # It takes for the stem what comes before the first dot.
+def test_trainers_can_read_the_model(made: ReconstructReport) -> None:
+    """A pinhole camera, flat names with one dot, images in order of their names, and colours.
+
+    gaussian-splatting takes two pinhole models only, and a name up to its first dot; gsplat pairs
+    sorted names with sorted files; OpenSplat finds an image by its file name.
+    """
+    folder = made.output / "sparse" / "0"
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in folder.iterdir()}
+    model = pycolmap.Reconstruction(folder)
+    names = [image.name for image in model.images.values()]
+    assert sorted(names) == sorted(p.name for p in (made.output / "images").iterdir())
+    assert len(names) == made.num_registered == NUM_IMAGES
+    for image in model.images.values():
         assert image.name.split(".")[0] == Path(image.name).stem
-        camera = cameras[image.camera_id]
+        assert image.camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE")
         picture = cv2.imread(str(made.output / "images" / image.name))
-        assert picture.shape == (camera.height, camera.width, 3)
-    assert not list(made.output.glob("**/*.ply"))
-    rgb = np.array([point.rgb for point in points.values()])
-    assert rgb.min() >= 0
+        assert picture.shape == (image.camera.height, image.camera.width, 3)
+    rgb = np.array([point.color for point in model.points3D.values()])
     assert rgb.max() > 100
     assert rgb.std() > 10
 
@@ -184,36 +102,6 @@ def test_colours_are_pixels_of_the_images(made: ReconstructReport) -> None:
             x, y = model.images[seen.image_id].points2D[seen.point2D_idx].xy.astype(int)
             shown.add(tuple(pictures[seen.image_id][y, x].tolist()))
         assert tuple(point.color.tolist()) in shown
-
-
-def test_gsplat(made: ReconstructReport) -> None:
-    """Files and images in their sorted order stand for each other."""
-    _, images, _ = raw_model(made.output / "sparse" / "0")
-    names = sorted(image.name for image in images.values())
-    assert names == sorted(p.name for p in (made.output / "images").iterdir())
-    assert len(names) == made.num_registered == NUM_IMAGES
-    reconstruction = pycolmap.Reconstruction(made.output / "sparse" / "0")
-    assert reconstruction.num_points3D() == made.num_points
-    assert reconstruction.compute_mean_reprojection_error() == pytest.approx(made.mean_error)
-
-
-def test_nerfstudio(made: ReconstructReport) -> None:
-    """A perspective model, by way of `--colmap-path sparse/0 --images-path images`."""
-    cameras, images, points = raw_model(made.output / "sparse" / "0")
-    assert {camera.model_id for camera in cameras.values()} <= {0, 1, 2, 3, 4, 5}
-    assert all((made.output / "images" / image.name).is_file() for image in images.values())
-    assert min(len(point.track) for point in points.values()) >= 3
-
-
-def test_opensplat(made: ReconstructReport) -> None:
-    """Binary files alone; an image is found by the file name of its path."""
-    folder = made.output / "sparse" / "0"
-    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in folder.iterdir()}
-    cameras, images, _ = raw_model(folder)
-    assert {camera.model_id for camera in cameras.values()} <= {0, 1, 2, 4}
-    # Unit quaternions, w first.
-    for image in images.values():
-        assert np.linalg.norm(image.qvec) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
