@@ -119,9 +119,7 @@ def test_video_that_changes(clip: Path, tmp_path: Path, when: str) -> None:
         if stage == when and done == 9:
             video.touch()
 
-    with pytest.raises(
-        VideoError, match=r"v\.mp4: changed or disappeared while it was read: leave it"
-    ):
+    with pytest.raises(VideoError, match="changed"):
         densify(model, video, tmp_path / "dense", progress=change)
     assert {p.name for p in tmp_path.iterdir()} == {"model", "v.mp4"}
     assert densify(model, video, tmp_path / "dense").num_points > 500
@@ -132,18 +130,18 @@ def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: P
     with pytest.raises(ImageError, match="640x360"):
         densify(model, clip, tmp_path / "dense")
     shuffled = true_model(tmp_path / "shuffled", truth, range(60), shuffle=7)
-    with pytest.raises(ModelError, match="of the video's tracks agree with the model's poses"):
+    with pytest.raises(ModelError, match="agree"):
         densify(shuffled, SCENE, tmp_path / "dense")
-    with pytest.raises(ModelError, match="holds no COLMAP model"):
+    with pytest.raises(ModelError, match="no COLMAP model"):
         densify(tmp_path, SCENE, tmp_path / "dense")
     (tmp_path / "empty").mkdir()
     write_model(tmp_path / "empty", {7: truth.camera}, [], no_points())
-    with pytest.raises(ModelError, match="no image of the model has a pose"):
+    with pytest.raises(ModelError, match="pose"):
         densify(tmp_path / "empty", SCENE, tmp_path / "dense")
     few = true_model(tmp_path / "few", truth, range(20))
-    with pytest.raises(ImageError, match="do not say which frames"):
+    with pytest.raises(ImageError, match="frames"):
         densify(few, SCENE, tmp_path / "dense")
-    with pytest.raises(OptionError, match="cannot be made in"):
+    with pytest.raises(OptionError, match=r"cameras\.bin"):
         densify(model, SCENE, model / "cameras.bin" / "dense")
     with pytest.raises(OptionError, match="not empty"):
         densify(model, SCENE, model)

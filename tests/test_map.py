@@ -143,26 +143,26 @@ def test_bad_input(database: Path, images: Path, tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="no such file"):
         map_database(tmp_path / "no.db", images, output)
     (tmp_path / "empty.db").write_bytes(b"")
-    with pytest.raises(DatabaseError, match="is an empty file"):
+    with pytest.raises(DatabaseError, match="empty"):
         map_database(tmp_path / "empty.db", images, output)
     unmatched = tmp_path / "unmatched.db"
     shutil.copyfile(database, unmatched)
     with sqlite3.connect(unmatched) as connection:
         connection.execute("DELETE FROM two_view_geometries")
     connection.close()
-    with pytest.raises(DatabaseError, match="no pair has 15 verified matches"):
+    with pytest.raises(DatabaseError, match="15"):
         map_database(unmatched, images, output)
     with pytest.raises(ImageError, match="no such folder"):
         map_database(database, tmp_path / "nowhere", output)
     (tmp_path / "some").mkdir()
-    with pytest.raises(ImageError, match=r"frame_000000.png: is missing, but the database lists"):
+    with pytest.raises(ImageError, match=r"frame_000000\.png"):
         map_database(database, tmp_path / "some", output)
     for path in images.iterdir():
         cv2.imwrite(str(tmp_path / "some" / path.name), np.zeros((8, 16, 3), np.uint8))
-    with pytest.raises(ImageError, match="is 16x8, but its camera in the database 640x360"):
+    with pytest.raises(ImageError, match="16x8"):
         map_database(database, tmp_path / "some", output)
     assert not list(tmp_path.glob("*model*"))
-    with pytest.raises(OptionError, match="is there and not empty"):
+    with pytest.raises(OptionError, match="not empty"):
         map_database(database, images, tmp_path / "some")
 
 

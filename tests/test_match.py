@@ -172,7 +172,7 @@ def test_cameras_of_listed_images_stay(clip: Path, tmp_path: Path, camera: Camer
     write_images(clip, folder, [f"{i:04d}.png" for i in range(16)], range(16))
     listing_database(folder, database)
     before = database.read_bytes()
-    with pytest.raises(OptionError, match=r"its images have cameras, so .* would change nothing"):
+    with pytest.raises(OptionError, match="cameras"):
         match(database, clip, options=MatchOptions(camera=camera))
     assert database.read_bytes() == before
 
@@ -274,7 +274,7 @@ def test_options_that_do_not_fit_leave_nothing(
 
 def test_every_frame_intra(encode: Encode, tmp_path: Path) -> None:
     intra = encode(make_frames(6), tmp_path / "intra.mp4", *AV1[:-1], "1")
-    with pytest.raises(VideoError, match="nothing to match"):
+    with pytest.raises(VideoError, match="nothing"):
         match(tmp_path / "a.db", intra, options=MatchOptions(links=LinkOptions(links="none")))
     assert not (tmp_path / "a.db").exists()
     # Without motion pictures connect the images.
@@ -290,7 +290,7 @@ def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     cut = tmp_path / "cut.ivf"
     cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * 0.9)])
     strict = MatchOptions(read=ReadOptions(strict=True))
-    with pytest.raises(BitstreamError, match=r"cut\.ivf: cut off"):
+    with pytest.raises(BitstreamError, match=r"cut\.ivf"):
         match(tmp_path / "a.db", cut, options=strict)
     assert not (tmp_path / "a.db").exists()
     report = match(tmp_path / "a.db", cut, image_path=tmp_path / "frames", options=ALL)
@@ -313,7 +313,7 @@ def test_locked_database(clip: Path, tmp_path: Path) -> None:
     connection.execute("DELETE FROM matches")
     connection.execute("DELETE FROM two_view_geometries")
     connection.execute("BEGIN IMMEDIATE")
-    with pytest.raises(DatabaseError, match="in use by another process"):
+    with pytest.raises(DatabaseError, match="in use"):
         match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
     connection.execute("ROLLBACK")
     connection.close()
@@ -329,9 +329,9 @@ def test_matches_of_listed_images_are_added_to_or_replaced(clip: Path, tmp_path:
     match(database, clip)
     first = tables(database)
     before = database.read_bytes()
-    with pytest.raises(DatabaseError, match="--on_existing append adds to them, replace removes"):
+    with pytest.raises(DatabaseError, match="--on_existing"):
         match(database, clip)
-    with pytest.raises(DatabaseError, match="these very keypoints already"):
+    with pytest.raises(DatabaseError, match="already"):
         match(database, clip, options=MatchOptions(on_existing="append"))
     assert database.read_bytes() == before
     longer = TrackOptions(min_length=6)
@@ -347,7 +347,7 @@ def test_matches_of_listed_images_are_added_to_or_replaced(clip: Path, tmp_path:
 def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path) -> None:
     other = encode(make_frames(2, 96, 64), tmp_path / "other.mp4")
     write_images(other, tmp_path / "frames", ["frame_000000.png"], [0])
-    with pytest.raises(ImageError, match="is 96x64, the video 192x128"):
+    with pytest.raises(ImageError, match="96x64"):
         match(tmp_path / "a.db", clip, image_path=tmp_path / "frames")
     assert not (tmp_path / "a.db").exists()
     assert len(list((tmp_path / "frames").iterdir())) == 1
@@ -396,12 +396,12 @@ fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 def test_video_that_changes_its_size(encode: Encode, tmp_path: Path) -> None:
     both = encode_two_sizes(encode, tmp_path / "both.obu", 8)
-    with pytest.raises(ImageError, match="from 192x128 to 128x128"):
+    with pytest.raises(ImageError, match="128x128"):
         match(tmp_path / "a.db", both, image_path=tmp_path / "frames")
     assert not (tmp_path / "frames").exists()
     assert not (tmp_path / "a.db").exists()
     assert match(tmp_path / "a.db", both).num_images == 16
-    with pytest.raises(ImageError, match="from 192x128 to 128x128"):
+    with pytest.raises(ImageError, match="128x128"):
         match(tmp_path / "b.db", both, options=LK)
 
 
@@ -430,7 +430,7 @@ def test_images_that_do_not_fit_the_video(clip: Path, tmp_path: Path) -> None:
     write_images(clip, tmp_path / "cut", [f"{i:03d}.png" for i in range(10)], range(10))
     database = listing_database(tmp_path / "cut", tmp_path / "a.db")
     before = database.read_bytes()
-    with pytest.raises(ImageError, match="there are 10 images, the video has 16 frames"):
+    with pytest.raises(ImageError, match="10 images"):
         match(database, clip)
     assert database.read_bytes() == before
     options = MatchOptions(images=ImageOptions(first_number=0))
@@ -456,9 +456,7 @@ def test_video_that_changes(
         if stage == when and done == 3:
             change(video)
 
-    with pytest.raises(
-        VideoError, match=r"v\.mp4: changed or disappeared while it was read: leave it"
-    ):
+    with pytest.raises(VideoError, match="changed"):
         match(tmp_path / "a.db", video, image_path=tmp_path / "frames", progress=progress)
     video.unlink(missing_ok=True)
     assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []

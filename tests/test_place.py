@@ -127,7 +127,7 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     ends = camera_centres(np.array([images[f"frame_{k:06}.png"].cam_from_world for k in (3, 48)]))
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(metres, rel=1e-6)
     wrong = replace(OPTIONS, place=PlaceOptions(scale="2=frame_000003.png,frame_000001.png"))
-    with pytest.raises(OptionError, match=r"no image 'frame_000001\.png' with a pose"):
+    with pytest.raises(OptionError, match=r"frame_000001\.png"):
         reconstruct(video, placed.output, options=wrong)
     assert (again.output / "place.json").exists()
 

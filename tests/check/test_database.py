@@ -368,7 +368,7 @@ def test_interrupted_write_is_told(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", textwrap.dedent(script), path], check=False)
     assert path.with_name("given.db-journal").stat().st_size > 0
     before = listing(tmp_path)
-    with pytest.raises(DatabaseError, match="a write to it was interrupted"):
+    with pytest.raises(DatabaseError, match="interrupted"):
         check(path)
     assert listing(tmp_path) == before
 

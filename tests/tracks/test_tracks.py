@@ -248,9 +248,9 @@ def test_arrays_of_any_memory_layout_are_read_and_of_another_kind_refused() -> N
             displacement(replace(motion, blocks=wrong))
     with pytest.raises(TypeError, match="block_index"):
         displacement(replace(motion, block_index=motion.block_index[0]))
-    with pytest.raises(TypeError, match=r"gm_type is not an array int32 \[7\]"):
+    with pytest.raises(TypeError, match="gm_type"):
         displacement(replace(motion, header=motion.header | {"gm_type": None}))
-    with pytest.raises(TypeError, match="frame_width is not an integer"):
+    with pytest.raises(TypeError, match="frame_width"):
         displacement(replace(motion, header=motion.header | {"frame_width": "wide"}))
     with pytest.raises(KeyError, match="force_integer_mv"):
         displacement(replace(motion, header={"show_frame": 1, "frame_width": 64}))

@@ -170,7 +170,7 @@ def test_example_clip_turned(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
 
 def test_turn_by_other_angles_is_refused(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     turned = ffmpeg("-display_rotation", "30", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
-    with pytest.raises(VideoError, match="no multiple of 90 degrees"):
+    with pytest.raises(VideoError, match="90 degrees"):
         match(tmp_path / "a.db", turned)
     assert not (tmp_path / "a.db").exists()
 

