@@ -207,27 +207,31 @@ def _track(
     Returns:
         The tracks in the images alone, and how the video was converted, in words.
     """
-    chaining = chaining_for_points(options.match.tracks, options.triangulate)
-    opening = open_source(images.video, options.match.source, beside=output, context=context)
+    matching = options.match
 
     def choose(tracked: TrackedVideo) -> ChosenImages:
         return choose_from_video(
             source,
             tracked.tracks,
-            options.match.images,
-            options.match.reading,
+            matching.images,
+            matching.reading,
             existing=images.names,
             folder=images.folder,
             context=context,
         )
 
-    with opening as source, unchanged(source.stream.state):
+    with (
+        open_source(images.video, matching.source, beside=output, context=context) as source,
+        unchanged(source.stream.state),
+    ):
+        chaining = chaining_for_points(
+            matching.tracks, options.triangulate, is_downscaled=source.is_downscaled
+        )
         found = track_images(
             source,
-            replace(options.match.tracking, tracks=chaining),
+            replace(matching.tracking, tracks=chaining),
             choose,
             masks=images.masks,
-            refine=False,
             context=context,
         )
     tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.size)
