@@ -290,11 +290,13 @@ def _check_images_of_others(
         ImageError: an image shows something else than the frame it should.
     """
     for label, own in zip(images.inputs.labels, images.videos, strict=True):
-        for name, frame in zip(own.chosen.names, own.chosen.frames.tolist(), strict=True):
+        for name, frame in zip(
+            own.tracked.chosen.names, own.tracked.chosen.frames.tolist(), strict=True
+        ):
             path = folder / label / name
             if path not in before and path.exists():
                 pictures = decodable_frames(
-                    own.source.pictures, own.tracks.num_frames, options.reading, own.display
+                    own.source.pictures, own.tracked.tracks.num_frames, options.reading, own.display
                 )
                 check_content([path], [frame], pictures)
                 break
