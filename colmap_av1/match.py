@@ -24,7 +24,7 @@ from colmap_av1.images.preparing import PreparedImages, prepare_images, write_al
 from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
-from colmap_av1.matching.gaps import matching_warnings
+from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
@@ -374,7 +374,10 @@ def _match_images(
         takes,
         [
             SelectedTracks(
-                own.source.pictures.path, own.tracked.tracks, own.tracked.video.inter_share
+                own.source.pictures.path,
+                own.tracked.tracks,
+                own.tracked.video.inter_share,
+                fast_frames(own.tracked.tracks),
             )
             for own in videos
         ],

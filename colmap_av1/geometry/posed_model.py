@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import (
@@ -55,6 +56,27 @@ def posed_model(
     cameras = {i: copy.copy(reconstruction.cameras[i]) for i in sorted(used)}
     points = model_points(reconstruction, images) if with_points else no_points()
     return PosedModel(cameras, images, points)
+
+
+def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
+    """Reprojection error of each observation of a model's points, in pixels.
+
+    Returns:
+        float64 [num_observations] in the order of the points' observations; infinite where a point
+        lies behind the camera.
+    """
+    points = model.points
+    xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
+    errors = np.full(len(points.image), np.inf)
+    by_image = np.argsort(points.image, kind="stable")
+    bounds = np.searchsorted(points.image[by_image], np.arange(len(model.images) + 1))
+    for image, first, last in zip(model.images, bounds[:-1], bounds[1:], strict=True):
+        own = by_image[first:last]
+        in_camera = xyz[own] @ image.cam_from_world[:, :3].T + image.cam_from_world[:, 3]
+        ahead = in_camera[:, 2] > 0
+        shown = model.cameras[image.camera_id].img_from_cam(in_camera[ahead])
+        errors[own[ahead]] = np.linalg.norm(shown - points.xy[own[ahead]], axis=1)
+    return errors
 
 
 def write_posed_model(path: Path, model: PosedModel) -> None:

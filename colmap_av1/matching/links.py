@@ -25,8 +25,8 @@ from colmap_av1.images.takes import Pictures, Takes
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import (
-    FeatureExtractor,
     Features,
+    extract_features,
     masked_features,
     match_features,
 )
@@ -53,6 +53,11 @@ from colmap_av1.util.spread import evenly_spread
 # Images on either side of a gap, by their distance from it. The nearest see most in common, the
 # others give the scale.
 _AROUND_GAP = (0, 1, 2, 4, 7)
+# Where the camera moves fast, few tracks carry the scale: the pictures of all images are matched
+# with those of their neighbours, as COLMAP's sequential matcher does, and loops are looked for by
+# every second image. Motion between images that as many inliers link is left out.
+_FAST_INLIERS = 50
+_LOOP_STEP = 2
 # Images that a first look compares with the motion: most suspect gaps are ordinary.
 _FIRST_LOOK = (0, 2)
 # Loops are looked for in images whose distance is this share of the span that tracks reach ...
@@ -124,6 +129,8 @@ class LinkReport:
         num_revisits: those of them that close a loop.
         num_between: those between different videos or photos.
         gaps: gaps that motion does not bridge, in order.
+        fast: first and last frames of stretches in which the camera moves fast and all pictures
+            were matched with those of their neighbours; frames are counted through.
         videos: (name, first frame) of each video if there are several; frames are counted through.
         parts: the names of the videos in each connected group, if there are several groups.
         unlinked_photos: names of photos that nothing connects with a video.
@@ -137,6 +144,7 @@ class LinkReport:
     num_revisits: int = 0
     num_between: int = 0
     gaps: tuple[Gap, ...] = ()
+    fast: tuple[tuple[int, int], ...] = ()
     videos: tuple[tuple[str, int], ...] = ()
     parts: tuple[tuple[str, ...], ...] = ()
     unlinked_photos: tuple[str, ...] = ()
@@ -222,6 +230,7 @@ def link_images(
     inter_share: NDArray[np.float32],
     pictures: Pictures,
     *,
+    fast: NDArray[np.bool_],
     pairs: PairOptions,
     verify: VerifyOptions,
     links: LinkOptions,
@@ -239,6 +248,7 @@ def link_images(
         cameras: the camera of each image; images share a camera if it is the same object.
         inter_share: float32 [num_frames], see `TrackedVideo`; any numbers for photos.
         pictures: gives the pictures of images.
+        fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
         pairs: fewest matches of a pair, for the message.
         verify: how links are verified.
         links: whether and where links are wanted.
@@ -255,7 +265,7 @@ def link_images(
         known = found[effort]
         missing = sorted(set(wanted) - known.keys())
         with context.clock.measure("links"):
-            known |= extract_features(
+            known |= features_of_images(
                 missing, pictures, cameras, takes.masks, links, effort=effort, context=context
             )
         return {image: known[image] for image in wanted if image in known}
@@ -270,6 +280,7 @@ def link_images(
                 matched,
                 cameras,
                 features,
+                offsets=pairs.offsets,
                 verify=verify,
                 options=links,
                 context=context,
@@ -277,12 +288,12 @@ def link_images(
 
     suspect = suspect_gaps(takes, matched, inter_share, links)
     gaps = suspect.certain
-    plan = plan_links(takes, matched, gaps, images_apart, links)
+    plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
     if links.links != "none" and (suspect.maybe.any() or suspect.probes):
         first = _first_look(suspect, takes)
         features_of([*first.wanted, *plan.wanted], "light")  # decode the videos once
         gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, takes)
-        plan = plan_links(takes, matched, gaps, images_apart, links)
+        plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
         linked = link(plan)
     else:
@@ -292,7 +303,8 @@ def link_images(
         # What lies on either side of a cut may continue anywhere in the videos.
         plan = replace(plan, loop=_spread_over_videos(takes, matched, images_apart))
         linked = link(plan)
-    if plan.wanted and (linked.report.frames_of_gaps("few tracks") or linked.report.parts):
+    few = linked.report.frames_of_gaps("few tracks")
+    if plan.effort == "light" and plan.wanted and (few or linked.report.parts):
         linked = link(thorough_plan(plan, takes))
     if len(linked.matched.pairs) == 0:
         if links.links != "none" and not found["light"]:
@@ -320,6 +332,8 @@ class Plan:
         around: the images whose pictures are matched across each.
         loop: images in which loops are looked for.
         between: images that are compared with those of other videos and photos.
+        fast: stretches of images in which the camera moves fast; all are matched with their
+            neighbours.
         effort: effort of the search for features.
     """
 
@@ -327,13 +341,18 @@ class Plan:
     around: list[list[int]]
     loop: list[int]
     between: list[int]
+    fast: tuple[range, ...] = ()
     effort: Literal["light", "full"] = "light"
 
     @property
     def wanted(self) -> list[int]:
         """All images whose pictures are needed, ascending."""
         return sorted(
-            {image for images in [*self.around, self.loop, self.between] for image in images}
+            {
+                image
+                for images in [*self.around, *self.fast, self.loop, self.between]
+                for image in images
+            }
         )
 
 
@@ -417,6 +436,8 @@ def plan_links(
     gaps: NDArray[np.bool_],
     images_apart: float,
     options: LinkOptions,
+    *,
+    fast: NDArray[np.bool_],
 ) -> Plan:
     """Choose the pictures at gaps, for loops in long videos, and between videos.
 
@@ -426,22 +447,44 @@ def plan_links(
         gaps: bool [num_images - 1] gaps that motion does not bridge.
         images_apart: see `link_images`.
         options: whether and where links are wanted.
+        fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
     """
     if options.links == "none":
         return Plan(np.empty(0, np.int64), [], [], [])
     chosen = np.flatnonzero(gaps)
     around = [_images_around(gap, takes.images_of(int(takes.take[gap]))) for gap in chosen.tolist()]
+    stretches = _stretches(fast, takes)
     loop: list[int] = []
     for video in range(len(takes.videos)):
         images = takes.images_of(video)
         least = max(_LONG * _reach(matched, images), _LEAST_IMAGES / images_apart)
         if options.links != "auto" or len(images) >= least:
             loop += _spread_images(takes, matched, video, images_apart)
+    if stretches:
+        loop = sorted({*loop, *(i for own in stretches for i in own[::_LOOP_STEP])})
     between: list[int] = []
     if takes.num_takes > 1:
         between = _spread_over_videos(takes, matched, images_apart)
         between += range(takes.images_of(len(takes.videos)).start, len(takes.take))
-    return Plan(chosen, around, loop, between)
+    return Plan(
+        chosen,
+        around,
+        loop,
+        between,
+        stretches,
+        effort="full" if stretches else "light",
+    )
+
+
+def _stretches(chosen: NDArray[np.bool_], takes: Takes) -> tuple[range, ...]:
+    """Images of one video that are chosen and follow each other: bool [num_images]."""
+    found: list[range] = []
+    for video in range(len(takes.videos)):
+        images = takes.images_of(video)
+        edges = np.diff(chosen[images.start : images.stop].astype(np.int8), prepend=0, append=0)
+        starts, stops = (np.flatnonzero(edges == k) + images.start for k in (1, -1))
+        found += map(range, starts.tolist(), stops.tolist())
+    return tuple(found)
 
 
 def thorough_plan(plan: Plan, takes: Takes) -> Plan:
@@ -515,17 +558,27 @@ def _link(
     cameras: Sequence[pycolmap.Camera],
     features: dict[int, Features],
     *,
+    offsets: Sequence[int],
     verify: VerifyOptions,
     options: LinkOptions,
     context: RunContext,
 ) -> LinkedImages:
-    """Link the images of a plan by their features, see `link_images`."""
+    """Link the images of a plan by their features, see `link_images`.
+
+    In fast stretches, images are matched with those at distances of `offsets`.
+    """
 
     def matched_pairs(pairs: set[tuple[int, int]]) -> Links:
         ordered = np.array(sorted(pairs), dtype=np.int32).reshape(-1, 2)
         return match_pairs(ordered, features, cameras, verify, context)
 
     across = {(i, j) for images in plan.around for i in images for j in images if i < j}
+    across |= {
+        (i, i + offset)
+        for images in plan.fast
+        for offset in offsets
+        for i in images[: -min(offset, len(images))]
+    }
     loops = _loop_pairs(takes, matched, plan.loop, features, options, seed=context.seed) - across
     between = _pairs_between(plan.between, features, takes, options, seed=context.seed)
     tried = across | loops | between
@@ -537,7 +590,13 @@ def _link(
     if beside:
         links = links.joined(matched_pairs(beside))
     contradicted = contradicted_gaps(plan.gaps, links, matched, cameras)
-    merged = merge_links(matched, links, features, contradicted)
+    in_fast = {image for images in plan.fast for image in images[:-1]}
+    linked = [
+        i
+        for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True)
+        if j == i + 1 and i in in_fast and len(geometry.inlier_matches) >= _FAST_INLIERS
+    ]
+    merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
         num_images=len(plan.wanted),
         looked_again=bool(plan.loop),
@@ -546,6 +605,10 @@ def _link(
         num_revisits=len(loops & found),
         num_between=len(between & found),
         gaps=_gaps_after_linking(plan.gaps, contradicted, merged, takes),
+        fast=tuple(
+            (int(takes.images.frames[own[0]]), int(takes.images.frames[own[-1]]))
+            for own in plan.fast
+        ),
         same_videos=_same_videos(links, features, cameras, takes),
     )
     tracks = links_as_tracks(
@@ -554,7 +617,7 @@ def _link(
     return LinkedImages(merged, tracks, _with_parts(report, merged, takes))
 
 
-def extract_features(
+def features_of_images(
     wanted: list[int],
     pictures: Pictures,
     cameras: Sequence[pycolmap.Camera],
@@ -565,10 +628,10 @@ def extract_features(
     context: RunContext,
 ) -> dict[int, Features]:
     """Features of the pictures of images outside masked pixels, in pixels of the images."""
-    extractor = FeatureExtractor(options.max_link_features, effort)
     found: dict[int, Features] = {}
     for image, picture in pictures(wanted):
-        features = masked_features(extractor.extract(picture), picture, masks[image])
+        features = extract_features(picture, options.max_link_features, effort)
+        features = masked_features(features, picture, masks[image])
         width, height = int(cameras[image].width), int(cameras[image].height)
         scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
         found[image] = replace(features, xy=features.xy * scale)
@@ -842,9 +905,9 @@ def merge_links(
     matched: MatchedImages,
     links: Links,
     features: dict[int, Features],
-    contradicted: Sequence[int],
+    left_out: Sequence[int],
 ) -> MatchedImages:
-    """Add linked features and their matches; leave out motion across contradicted gaps."""
+    """Add linked features and their matches; leave out motion across some gaps."""
     used: dict[int, set[int]] = {}
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
         used.setdefault(i, set()).update(geometry.inlier_matches[:, 0].tolist())
@@ -858,7 +921,7 @@ def merge_links(
         )
         num_tracks += len(indices)
     rows: dict[tuple[int, int], tuple[NDArray[np.uint32], TwoViewGeometry]] = {}
-    gap = np.array(contradicted, dtype=np.int64)
+    gap = np.array(left_out, dtype=np.int64)
     for k, (i, j) in enumerate(matched.pairs.tolist()):
         if not np.any((i <= gap) & (gap < j)):
             rows[i, j] = matched.matches[k], matched.geometries[k]

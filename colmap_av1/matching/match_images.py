@@ -34,11 +34,13 @@ class SelectedTracks:
         path: the file that messages name.
         tracks: the selected tracks.
         inter_share: float32 [num_frames], see `TrackedVideo`.
+        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
     """
 
     path: Path
     tracks: Tracks
     inter_share: NDArray[np.float32]
+    fast: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,12 @@ def match_images(
         made.of_images,
         np.concatenate([*(video.inter_share for video in videos), no_motion]),
         pictures,
+        fast=np.concatenate(
+            [
+                *(own.fast[takes.of_video(k).frames] for k, own in enumerate(videos)),
+                np.zeros(len(no_motion), np.bool_),
+            ]
+        ),
         pairs=options.pairs,
         verify=options.verify,
         links=options.links,

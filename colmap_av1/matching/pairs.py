@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
+from colmap_av1.geometry.colmap_model import ModelPoints
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
@@ -16,6 +18,9 @@ from colmap_av1.tracks.tracks import Tracks, order_by_frame
 # image, n growing with the span, so the number of pairs stays linear in the number of
 # images even where tracks live as long as the video.
 _UNTHINNED_SPAN = 64
+# Images up to which all pairs that share tracks are taken, and pairs for each image in all.
+_NEAR = 10
+_MOST_PAIRS = 30
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,62 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
         )
         for frame, start, stop in zip(chosen, bounds[:-1], bounds[1:], strict=True)
     ]
+
+
+def keypoints_of_points(points: ModelPoints, num_images: int) -> list[ImageKeypoints]:
+    """The observations of a model's points as keypoints; each point is a track.
+
+    Args:
+        points: the points. A second observation of a point in an image is left out.
+        num_images: number of images of the model.
+    """
+    track = np.repeat(np.arange(len(points.offsets) - 1), np.diff(points.offsets))
+    order = np.lexsort((track, points.image))
+    bounds = np.searchsorted(points.image[order], np.arange(num_images + 1))
+    keypoints = []
+    for image, (first, last) in enumerate(pairwise(bounds.tolist())):
+        own, index = np.unique(track[order[first:last]], return_index=True)
+        xy = points.xy[order[first:last][index]].astype(np.float32)
+        keypoints.append(ImageKeypoints(image, xy, own))
+    return keypoints
+
+
+def covisible_pairs(keypoints: Sequence[ImageKeypoints], min_matches: int) -> NDArray[np.int32]:
+    """Choose image pairs among all that share tracks, also where a place is seen again.
+
+    Neighbours up to ten images apart are all paired. Of the others, where they are many, those
+    that share the most tracks among similar pairs.
+
+    Args:
+        keypoints: the keypoints of the images, in display order.
+        min_matches: fewest tracks that the images of a pair share.
+
+    Returns:
+        int32 [m, 2] indices into `keypoints`, first < second, in ascending order.
+    """
+    from scipy.sparse import csr_array  # noqa: PLC0415 - slow to import
+
+    image = np.repeat(np.arange(len(keypoints)), [len(k.track) for k in keypoints])
+    track = np.concatenate([k.track for k in keypoints])
+    seen = csr_array((np.ones(len(track), np.int32), (image, track)))
+    shared = (seen @ seen.T).tocoo()
+    first, second = shared.coords
+    kept = (first < second) & (shared.data >= min_matches)
+    first, second, count = first[kept], second[kept], shared.data[kept]
+    near = second - first <= _NEAR
+    step = 1
+    while True:
+        # The best pair of each square of pairs (first, second).
+        square = (first // step) * (len(keypoints) + 1) + second // step
+        order = np.lexsort((second, first, -count, square))
+        best = np.zeros(len(first), np.bool_)
+        best[order[np.unique(square[order], return_index=True)[1]]] = True
+        chosen = near | best
+        if np.count_nonzero(chosen) <= _MOST_PAIRS * len(keypoints):
+            break
+        step += 1
+    pairs = np.column_stack([first[chosen], second[chosen]])
+    return pairs[np.lexsort(pairs.T[::-1])].astype(np.int32)
 
 
 def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:

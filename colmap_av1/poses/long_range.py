@@ -16,7 +16,7 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
-from colmap_av1.matching.features.sift import Features, masked_features, quick_features
+from colmap_av1.matching.features.sift import Features, extract_features, masked_features
 from colmap_av1.matching.links import match_pairs
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.options import VerifyOptions
@@ -139,7 +139,7 @@ class FarViewCheck:
         `mask` says what of it counts.
         """
         if index in self._wanted:
-            features = quick_features(picture, _NUM_FEATURES)
+            features = extract_features(picture, _NUM_FEATURES)
             self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> FarViews:

@@ -23,8 +23,12 @@ from colmap_av1.poses.reconstruct_poses import (
 )
 from colmap_av1.poses.reconstruct_stages import MatchesResult, match_stage, read_links
 from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks
+from colmap_av1.poses.remapping import remap_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
+
+# Mappings of a run at most: the second one finds nearly all that a third one does.
+_MOST_MAPPINGS = 3
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,8 @@ def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
     if posed.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
-    looked_at = posed.matches.result.links.frames_of_gaps()
+    links = posed.matches.result.links
+    looked_at = [*links.frames_of_gaps(), *links.fast]
     seams = [
         (frame_of[first], frame_of[second])
         for first, second in posed.adjustment.result.doubtful_seams
@@ -159,7 +164,7 @@ def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
     return [
         after
         for before, after in seams
-        if not any(first <= before and after <= second for first, second in looked_at)
+        if not any(first <= before and after <= last for first, last in looked_at)
     ]
 
 
@@ -181,6 +186,9 @@ def _pose_stages(
     posed = refined_poses(
         run, matched, mapped, believed=believed, takes=takes, keyed=keyed, in_place=in_place
     )
+    links = posed.matches.result.links
+    if links.gaps or links.fast:
+        posed = remapped_poses(run, posed, takes)
     linked = matched.result.links.looked_again
     far_views = far_view_stage(run, posed.tracks, takes, posed.moving, posed.last, linked=linked)
     return replace(posed, far_views=far_views)
@@ -191,6 +199,32 @@ def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tu
     links, broken = read_links(run.stages)
     tracks = Tracks.in_sequence([own.tracks for own in videos], takes.num_frames)
     return tracks.split_after_frames(broken.tolist()), links
+
+
+def remapped_poses(run: Run, posed: Posed, takes: Takes) -> Posed:
+    """Map the adjusted observations again, and adjust, as long as that lowers the cost.
+
+    See `remapping` for why.
+    """
+    for number in range(2, _MOST_MAPPINGS + 1):
+        if posed.adjustment is None or not posed.in_place:
+            return posed
+        again = remap_stage(run, takes, posed.adjustment, number=number)
+        if not again.result.is_better:
+            return posed
+        placed: Kept[PosesResult] = again
+        adjustment = adjustment_stage(
+            run,
+            posed.tracks,
+            posed.links,
+            takes,
+            placed,
+            moved=posed.adjustment.digest,
+            corners=partial(corners_in_images, run, posed.moving),
+            name=f"adjusted_{number}",
+        )
+        posed = replace(posed, adjustment=adjustment)
+    return posed
 
 
 def refined_poses(

@@ -47,15 +47,15 @@ _FEW_TRACKS = 100
 # Tracks of an image that the global mapper starts from, the longest ones, and share of the error
 # that steps lower or end, where an adjustment follows: half the time of 200, to the same poses. But
 # what links videos or images is short, and all of it needed; revisits make long tracks longer.
-_START_TRACKS = 100
-_TOLERANCE = 1e-4
+START_TRACKS = 100
+TOLERANCE = 1e-4
 # Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
 # of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
 # end of a video, say, the mapper may leave images that are off by more with all they see.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
-_LOSS_SCALES = (1.0, 0.25)
+LOSS_SCALES = (1.0, 0.25)
 # Beside corners, one in so many of them: each is less exact, and all may be off one way. They
 # drift, by three times as much over twenty images as over three, and bend what corners hold
 # straight: so they are cut to pieces of so many images.
@@ -130,12 +130,12 @@ def pose_stage(
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     hangs = links.num_between or reasons & {"contradicted", "few tracks"}
-    start_tracks = None if hangs else _START_TRACKS
-    tolerance = _TOLERANCE if mapping.adjust and not hangs else None
+    start_tracks = None if hangs else START_TRACKS
+    tolerance = TOLERANCE if mapping.adjust and not hangs else None
     how = MapOptions(
         mapper=mapper,
         forward_motion=forward and mapper == "incremental",
-        refine_intrinsics=_refines_intrinsics(options),
+        refine_intrinsics=refines_intrinsics(options),
         seed=options.match.run.seed,
         num_threads=mapping.mapper_threads,
     )
@@ -217,7 +217,8 @@ def _registered(model: PosedModel, takes: Takes) -> dict[str, int]:
     }
 
 
-def _refines_intrinsics(options: ReconstructOptions) -> bool:
+def refines_intrinsics(options: ReconstructOptions) -> bool:
+    """Whether focal length and distortion are refined: by default those that are not given."""
     if options.mapping.refine_intrinsics is not None:
         return options.mapping.refine_intrinsics
     return options.match.camera.camera_params is None
@@ -332,6 +333,7 @@ def adjustment_stage(
     moved: str | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
+    name: str = "adjusted",
 ) -> Kept[AdjustedResult]:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
@@ -350,9 +352,10 @@ def adjustment_stage(
         follow: corrects the chosen tracks in the images that have a pose.
         corners: looks for corners of these images' pictures, which take part whole, and corrects
             poses that these contradict.
+        name: of the file with the adjusted model, and of the stage.
     """
     options = run.options
-    refine = _refines_intrinsics(options)
+    refine = refines_intrinsics(options)
 
     def make(partial: Path) -> AdjustedResult:
         placed = read_posed_images(run, posed, takes)
@@ -376,7 +379,7 @@ def adjustment_stage(
             adjust_model(
                 folder,
                 refine_intrinsics=refine,
-                loss_scales=_LOSS_SCALES,
+                loss_scales=LOSS_SCALES,
                 seed=options.match.run.seed,
                 num_threads=options.mapping.mapper_threads,
                 log=run.stages / "adjustment.log",
@@ -385,9 +388,9 @@ def adjustment_stage(
             adjusted = without_unseen_images(folder)
         joints = model_joints(adjusted)
         result = posed_model(adjusted, with_points=True)
-        write_posed_model(partial / "adjusted.npz", result)
+        write_posed_model(partial / f"{name}.npz", result)
         return AdjustedResult(
-            poses="adjusted.npz",
+            poses=f"{name}.npz",
             num_registered=len(result.images),
             registered=_registered(result, takes),
             doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
@@ -396,14 +399,14 @@ def adjustment_stage(
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
-    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, _LOSS_SCALES, FEW_SEEN, refine, *how)
+    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, LOSS_SCALES, FEW_SEEN, refine, *how)
     return run_stage(
         run.stages,
-        "adjustment",
+        name,
         [posed.digest, given, moved],
         AdjustedResult,
         into=run.stages,
-        products=["adjusted.npz"],
+        products=[f"{name}.npz"],
         make=make,
     )
 
@@ -415,12 +418,12 @@ def _write_black_points(
     sets: Sequence[tuple[Tracks, TriangulateOptions]],
 ) -> int:
     """Write a model of the images and of points of sets of tracks; returns how many points."""
-    points = joined_points([_black_points(run, placed, *own) for own in sets])
+    points = joined_points([black_points(run, placed, *own) for own in sets])
     write_model(folder, placed.cameras, placed.images, points)
     return len(points.xyz)
 
 
-def _black_points(
+def black_points(
     run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
     """Points of tracks in the images that have a pose, without colours."""
@@ -464,7 +467,11 @@ class PosedImages:
 
 def read_posed_images(run: Run, posed: Kept[PosesResult], takes: Takes) -> PosedImages:
     """The images with the poses that a stage left."""
-    poses = read_posed_model(run.stages / posed.result.poses)
+    return posed_images_of(read_posed_model(run.stages / posed.result.poses), takes)
+
+
+def posed_images_of(poses: PosedModel, takes: Takes) -> PosedImages:
+    """The images that have a pose in a model."""
     posed_by_name = poses.by_name
     names = takes.images.names
     index = [i for i, name in enumerate(names) if name in posed_by_name]

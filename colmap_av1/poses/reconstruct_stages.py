@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.images.takes import Takes
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
+from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.matching.match_images import (
@@ -186,10 +187,11 @@ def _selected_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> l
     selected = []
     for video, own in enumerate(videos):
         with run.clock.measure("pairs"):
-            tracks = pose_tracks(run, own.tracks).keep_frames(takes.of_video(video).frames)
-            sparse = select_tracks(tracks, density)
+            tracks = pose_tracks(run, own.tracks)
+            fast = fast_frames(tracks)
+            sparse = select_tracks(tracks.keep_frames(takes.of_video(video).frames), density)
         path = run.sources[video].pictures.path
-        selected.append(SelectedTracks(path, sparse, own.inter_share))
+        selected.append(SelectedTracks(path, sparse, own.inter_share, fast))
     return selected
 
 

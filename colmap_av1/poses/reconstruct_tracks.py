@@ -21,6 +21,7 @@ from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
+from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
 from colmap_av1.options import ReconstructOptions, RefineOptions, TrackingOptions
@@ -267,11 +268,14 @@ def key_images_of_video(
     run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
 ) -> NDArray[np.int64]:
     """The key images among some images of a video, by their index."""
-    mapping = run.options.mapping
+    mapping, links = run.options.mapping, run.options.match.links
+    always = images_to_link(inter_share, chosen.frames, links)
+    if links.links != "none":
+        always |= fast_frames(tracks)[chosen.frames]
     return key_images(
         tracks,
         chosen.frames,
-        images_to_link(inter_share, chosen.frames, run.options.match.links),
+        always,
         spacing=mapping.pose_spacing,
         num_cells=mapping.pose_tracks_per_image,
     )

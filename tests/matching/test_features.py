@@ -1,33 +1,25 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Literal
 
 import cv2
 import numpy as np
 import pytest
 
-from colmap_av1.matching.features.sift import (
-    FeatureExtractor,
-    Features,
-    match_features,
-    quick_features,
-)
+from colmap_av1.matching.features.sift import extract_features, match_features
 
 
-def light_features(picture: np.ndarray, max_num_features: int) -> Features:
-    return FeatureExtractor(max_num_features).extract(picture)
-
-
-@pytest.mark.parametrize("features_of", [light_features, quick_features])
+@pytest.mark.parametrize("effort", ["light", "full"])
 @pytest.mark.parametrize("size", [(1920, 1080), (1601, 901)])
 def test_features_of_large_pictures_are_found_where_they_are(
-    size: tuple[int, int], features_of: Callable[[np.ndarray, int], Features]
+    size: tuple[int, int], effort: Literal["light", "full"]
 ) -> None:
     """A large picture, in which features are looked for in a smaller one, and a part of it."""
     noise = np.random.default_rng(0).standard_normal((135, 240)).astype(np.float32)
     large = cv2.resize(cv2.GaussianBlur(noise, (0, 0), 1.0), size, interpolation=cv2.INTER_CUBIC)
     large = cv2.cvtColor(np.clip(128 + 90 * large, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-    whole, part = features_of(large, 1500), features_of(large[200:800, 400:1200], 1500)
+    whole = extract_features(large, 1500, effort)
+    part = extract_features(large[200:800, 400:1200], 1500, effort)
     assert whole.xy.max() > 0.9 * size[0]
     matches = match_features(whole, part)
     assert len(matches) > 100
@@ -38,6 +30,6 @@ def test_features_of_large_pictures_are_found_where_they_are(
 
 def test_plain_pictures_have_no_features() -> None:
     for size in ((1, 1), (40, 60)):
-        found = quick_features(np.full((*size, 3), 90, np.uint8), 100)
+        found = extract_features(np.full((*size, 3), 90, np.uint8), 100)
         assert found.xy.shape == (0, 2)
         assert found.descriptors.shape == (0, 128)

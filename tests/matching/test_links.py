@@ -25,7 +25,7 @@ from colmap_av1.evaluate import model_poses
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import match
 from colmap_av1.matching.features.retrieval import similar_images
-from colmap_av1.matching.features.sift import FeatureExtractor, Features, match_features
+from colmap_av1.matching.features.sift import Features, extract_features, match_features
 from colmap_av1.matching.links import Links, links_as_tracks
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import (
@@ -61,8 +61,7 @@ def _without(left_out: range) -> NDArray[np.uint8]:
 
 def test_features_agree_with_the_truth() -> None:
     images = pictures()
-    extractor = FeatureExtractor(1500)
-    a, b = extractor.extract(images[0]), extractor.extract(images[30])
+    a, b = extract_features(images[0], 1500), extract_features(images[30], 1500)
     matches = match_features(a, b)
     assert len(matches) > 100
     with np.load(TRUTH) as truth:
@@ -82,15 +81,13 @@ def test_features_agree_with_the_truth() -> None:
 
 
 def test_no_features_match_nothing() -> None:
-    extractor = FeatureExtractor(100)
-    plain = extractor.extract(np.full((64, 64, 3), 128, np.uint8))
+    plain = extract_features(np.full((64, 64, 3), 128, np.uint8), 100)
     assert plain.xy.shape == (0, 2)
-    assert len(match_features(plain, extractor.extract(pictures()[0]))) == 0
+    assert len(match_features(plain, extract_features(pictures()[0], 100))) == 0
 
 
 def test_similar_images_see_the_same() -> None:
-    extractor = FeatureExtractor(800)
-    there = [extractor.extract(image) for image in pictures()[::6]]
+    there = [extract_features(image, 800) for image in pictures()[::6]]
     back = [copy.deepcopy(f) for f in reversed(there)]
     features = [*there, *back]
     count = len(features)
@@ -103,8 +100,7 @@ def test_similar_images_see_the_same() -> None:
 
 
 def test_images_without_features_are_like_none() -> None:
-    extractor = FeatureExtractor(100)
-    plain = extractor.extract(np.full((64, 64, 3), 128, np.uint8))
+    plain = extract_features(np.full((64, 64, 3), 128, np.uint8), 100)
     allowed = ~np.eye(3, dtype=bool)
     assert len(similar_images([plain] * 3, allowed, 1)) <= 3
 

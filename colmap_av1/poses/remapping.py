@@ -1,0 +1,213 @@
+"""A second mapping, from the observations that the first poses were adjusted on.
+
+An adjustment goes to the nearest minimum of its cost. Where few tracks cross a fast turn, the first
+mapping may start it at a bent model, which no adjustment straightens. The corners that were found
+with these poses are longer and more exact than the tracks that the first mapping had, even then:
+mapped anew, they give another start. The one that ends at the lower cost is right.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
+
+from colmap_av1.database.writing import write_matched_images
+from colmap_av1.geometry.colmap_model import read_model, write_model
+from colmap_av1.geometry.posed_model import (
+    PosedModel,
+    posed_model,
+    read_posed_model,
+    reprojection_errors,
+    write_posed_model,
+)
+from colmap_av1.geometry.track_points import seen_in, to_model_points
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.image_matches import PairedImages, verify_images
+from colmap_av1.matching.pairs import covisible_pairs, keypoints_of_points, pair_matches
+from colmap_av1.options import MapOptions
+from colmap_av1.poses.mapper import adjust_model, map_poses
+from colmap_av1.poses.reconstruct_poses import (
+    FROM_PICTURES,
+    LOSS_SCALES,
+    START_TRACKS,
+    TOLERANCE,
+    AdjustedResult,
+    PosesResult,
+    posed_images_of,
+    refines_intrinsics,
+    triangulate_in,
+)
+from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.stages import Kept, run_stage
+
+# Share of the observations that another model keeps, at least: less does not explain them.
+_LEAST_KEPT = 0.9
+# A start is better if its cost is below this share of the other's: two starts that end in the same
+# minimum differ by far less, a bent model by a fifth.
+_LOWER = 0.99
+
+
+@dataclass(frozen=True)
+class RemappedResult(PosesResult):
+    """What `remap_stage` found.
+
+    Attributes:
+        kept: share of the observations of its images that the second mapping agrees with.
+        cost: mean robust cost of these by the poses they were adjusted on.
+        new_cost: the same by the second mapping, adjusted on these observations.
+    """
+
+    kept: float
+    cost: float
+    new_cost: float
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the second mapping fits the observations better than the first."""
+        return self.kept >= _LEAST_KEPT and self.new_cost < _LOWER * self.cost
+
+
+def remap_stage(
+    run: Run, takes: Takes, adjusted: Kept[AdjustedResult], *, number: int
+) -> Kept[RemappedResult]:
+    """Map the images again, by the observations that their poses were adjusted on.
+
+    Args:
+        run: what every stage is given.
+        takes: the images.
+        adjusted: the stage that adjusted them.
+        number: of the mapping, 2 or more.
+    """
+    name = f"remapped_{number}"
+
+    def make(partial: Path) -> RemappedResult:
+        known = read_posed_model(run.stages / adjusted.result.poses)
+        with run.clock.measure("poses"):
+            found = _map_observations(run, known)
+        left = found if found is not None else known
+        write_posed_model(partial / f"{name}.npz", PosedModel(left.cameras, left.images))
+        if found is None:
+            return RemappedResult(
+                f"{name}.npz", len(known.images), {}, kept=0.0, cost=0.0, new_cost=0.0
+            )
+        with run.clock.measure("adjustment"):
+            kept, cost, new_cost = _costs(run, takes, known, found)
+        return RemappedResult(
+            f"{name}.npz", len(found.images), {}, kept=kept, cost=cost, new_cost=new_cost
+        )
+
+    return run_stage(
+        run.stages,
+        name,
+        [
+            adjusted.digest,
+            START_TRACKS,
+            TOLERANCE,
+            LOSS_SCALES,
+            _LEAST_KEPT,
+            run.options.match.verify,
+        ],
+        RemappedResult,
+        into=run.stages,
+        products=[f"{name}.npz"],
+        make=make,
+    )
+
+
+def _map_observations(run: Run, known: PosedModel) -> PosedModel | None:
+    """Map the observations of a model's points by COLMAP's global mapper; None: it failed."""
+    options = run.options
+    context = RunContext.of(options.match.run, run.clock, run.progress)
+    cameras = [known.cameras[image.camera_id] for image in known.images]
+    keypoints = keypoints_of_points(known.points, len(known.images))
+    pairs = covisible_pairs(keypoints, options.match.pairs.min_matches)
+    paired = PairedImages(
+        keypoints, pairs, [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs.tolist()]
+    )
+    matched = verify_images(paired, cameras, options.match.verify, context)
+    with tempfile.TemporaryDirectory() as folder:
+        database, models = Path(folder) / "database.db", Path(folder) / "models"
+        write_matched_images(database, [i.name for i in known.images], cameras, matched)
+        sizes = map_poses(
+            database,
+            models,
+            MapOptions(
+                mapper="global",
+                refine_intrinsics=refines_intrinsics(options),
+                seed=options.match.run.seed,
+                num_threads=options.mapping.mapper_threads,
+            ),
+            image_path=None,
+            log=run.stages / "mapper.log",
+            num_images=len(known.images),
+            progress=run.progress,
+            start_tracks=START_TRACKS,
+            tolerance=TOLERANCE,
+        )
+        return posed_model(read_model(models / "0")) if sizes else None
+
+
+def _costs(
+    run: Run, takes: Takes, known: PosedModel, found: PosedModel
+) -> tuple[float, float, float]:
+    """Compare a model with another start, adjusted on the observations of the model's points.
+
+    Args:
+        run: what every stage is given.
+        takes: the images.
+        known: the model, with points.
+        found: poses of all its images, or of some.
+
+    Returns:
+        The share of the observations in images of `found` that agree with it, and their mean robust
+        costs by both.
+    """
+    placed = posed_images_of(found, takes)
+    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    frames = np.array([frame_of[image.name] for image in known.images], np.int32)
+    points = known.points
+    tracks = Tracks(
+        num_frames=takes.num_frames,
+        width=max(int(camera.width) for camera in known.cameras.values()),
+        height=max(int(camera.height) for camera in known.cameras.values()),
+        offsets=points.offsets,
+        frame=frames[points.image],
+        xy=points.xy.astype(np.float32),
+        sigma=np.zeros(len(points.image), np.float32),
+        confirmed=np.ones(len(points.image), np.bool_),
+    )
+    in_both = np.isin(tracks.frame, placed.frames)
+    seen, view = seen_in(tracks, placed.frames)
+    agreeing = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    if len(agreeing.xyz) == 0:
+        return 0.0, 0.0, 0.0
+    xy = seen.xy[agreeing.observation].astype(np.float64)
+    with tempfile.TemporaryDirectory() as model:
+        folder = Path(model)
+        write_model(folder, placed.cameras, placed.images, to_model_points(agreeing, view, xy))
+        adjust_model(
+            folder,
+            refine_intrinsics=refines_intrinsics(run.options),
+            loss_scales=LOSS_SCALES,
+            seed=run.options.match.run.seed,
+            num_threads=run.options.mapping.mapper_threads,
+            log=run.stages / "adjustment.log",
+        )
+        adjusted = posed_model(read_model(folder), with_points=True)
+    known_errors = reprojection_errors(known)[in_both][agreeing.observation]
+    return (
+        len(agreeing.observation) / len(view),
+        _mean_cost(known_errors),
+        _mean_cost(reprojection_errors(adjusted)),
+    )
+
+
+def _mean_cost(errors: NDArray[np.float64]) -> float:
+    """Mean of the loss of reprojection errors in pixels that adjustments lower last, Cauchy's."""
+    return float(np.log1p((errors / LOSS_SCALES[-1]) ** 2).mean())

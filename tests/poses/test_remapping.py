@@ -1,0 +1,100 @@
+"""A bent model gives way to a second mapping of its own observations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+from colmap_av1.matching.gaps import fast_frames
+from colmap_av1.matching.pairs import covisible_pairs, keypoints_of_points
+from colmap_av1.poses.remapping import RemappedResult
+from colmap_av1.tracks.tracks import Tracks
+
+NUM_IMAGES = 30
+
+
+def model(shift: float = 0.0) -> PosedModel:
+    """A camera that moves along x before points, seen in the picture shifted by some pixels."""
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform([-2, -1, 4], [5, 1, 6], (400, 3))
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240]
+    )
+    images, image, point, xy = [], [], [], []
+    for i in range(NUM_IMAGES):
+        pose = np.hstack([np.eye(3), [[-0.1 * i], [0], [0]]])
+        images.append(ModelImage(i + 1, f"{i:03}.png", 1, pose))
+        at = np.asarray(camera.img_from_cam(xyz + pose[:, 3]))
+        inside = np.flatnonzero((at >= 0).all(1) & (at < [640, 480]).all(1))
+        image.append(np.full(len(inside), i))
+        point.append(inside)
+        xy.append(at[inside] + [shift, 0])
+    order = np.lexsort((np.concatenate(image), np.concatenate(point)))
+    counts = np.bincount(np.concatenate(point), minlength=len(xyz))
+    points = ModelPoints(
+        xyz=xyz,
+        rgb=np.zeros((len(xyz), 3), np.uint8),
+        error=np.zeros(len(xyz)),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        image=np.concatenate(image)[order],
+        xy=np.concatenate(xy)[order],
+    )
+    return PosedModel({1: camera}, images, points)
+
+
+def test_errors_are_those_in_the_pictures() -> None:
+    assert np.allclose(reprojection_errors(model()), 0)
+    assert np.allclose(reprojection_errors(model(shift=3.0)), 3)
+
+
+def test_points_behind_a_camera_are_infinitely_wrong() -> None:
+    own = model()
+    own.points.xyz[:, 2] *= -1
+    assert np.isinf(reprojection_errors(own)).all()
+
+
+def test_all_images_that_share_points_are_paired() -> None:
+    keypoints = keypoints_of_points(model().points, NUM_IMAGES)
+    seen = [set(own.track.tolist()) for own in keypoints]
+    pairs = covisible_pairs(keypoints, 15)
+    expected = {
+        (i, j)
+        for i in range(NUM_IMAGES)
+        for j in range(i + 1, NUM_IMAGES)
+        if len(seen[i] & seen[j]) >= 15
+    }
+    assert {tuple(pair) for pair in pairs.tolist()} == expected
+
+
+def test_a_start_counts_that_explains_nearly_all_observations_better() -> None:
+    def result(kept: float, new_cost: float) -> RemappedResult:
+        return RemappedResult("", 3, {}, kept=kept, cost=1.0, new_cost=new_cost)
+
+    assert result(kept=0.97, new_cost=0.8).is_better
+    assert not result(kept=0.97, new_cost=1.0).is_better
+    assert not result(kept=0.5, new_cost=0.1).is_better
+
+
+def tracks_of_lengths(length: int) -> Tracks:
+    """Twenty tracks that begin in each frame and last as long."""
+    num_frames = 60
+    first = np.repeat(np.arange(num_frames), 20)
+    frames = [np.arange(f, min(num_frames, f + length)) for f in first.tolist()]
+    count = sum(map(len, frames))
+    return Tracks(
+        num_frames=num_frames,
+        width=64,
+        height=64,
+        offsets=np.cumsum([0, *map(len, frames)]).astype(np.int64),
+        frame=np.concatenate(frames).astype(np.int32),
+        xy=np.zeros((count, 2), np.float32),
+        sigma=np.zeros(count, np.float32),
+        confirmed=np.zeros(count, np.bool_),
+    )
+
+
+def test_frames_are_fast_where_tracks_end_soon() -> None:
+    assert fast_frames(tracks_of_lengths(6)).all()
+    assert not fast_frames(tracks_of_lengths(40)).any()
