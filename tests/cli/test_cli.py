@@ -266,8 +266,8 @@ def test_interrupt_exits_with_130(encode: Encode, tmp_path: Path) -> None:
     assert process.returncode == 130
     assert out == ""
     assert err == "colmap-av1: interrupted\n"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames", "long.mp4"]
-    assert all(p.suffix == ".png" and p.name[0] != "." for p in (tmp_path / "frames").iterdir())
+    assert {p.name for p in tmp_path.iterdir()} <= {"frames", "long.mp4"}
+    assert all(p.suffix == ".png" and p.name[0] != "." for p in tmp_path.glob("frames/*"))
 
 
 def test_terminal_sees_progress_and_a_table(clip: Path, tmp_path: Path) -> None:
