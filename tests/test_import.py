@@ -49,7 +49,7 @@ def test_every_public_name_exists() -> None:
 
 def test_numpy_is_imported_before_pycolmap(tmp_path: Path) -> None:
     """In the other order the writing of a PNG file ends the process."""
-    for name in ("check", "run_batch"):
+    for name in ("check", "reconstruct"):
         run = run_python(
             f"import colmap_av1, sys; colmap_av1.{name}; print(*sys.modules)", tmp_path
         )
