@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
@@ -309,11 +310,13 @@ class _Images:
     Attributes:
         inputs: the videos and photos.
         videos: the images of each video, with the tracks that are matched in place of all.
+        fast: of each video, where the camera moves fast: bool [num_frames], see `fast_frames`.
         takes: all images, counted through.
     """
 
     inputs: Inputs
     videos: Sequence[PreparedImages]
+    fast: Sequence[NDArray[np.bool_]]
     takes: Takes
 
 
@@ -327,7 +330,7 @@ def _prepare(
     context: RunContext,
 ) -> _Images:
     """Find or choose the images of each video, and count them through."""
-    videos = [
+    found = [
         # All tracks of a video are its largest arrays: they make room for the next.
         _with_chosen_tracks(
             prepare_images(
@@ -346,10 +349,11 @@ def _prepare(
             inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True
         )
     ]
+    videos = [own for own, _ in found]
     takes = inputs.takes(
         [own.tracked.chosen for own in videos], [own.tracked.tracks.num_frames for own in videos]
     )
-    return _Images(inputs, videos, takes)
+    return _Images(inputs, videos, [fast for _, fast in found], takes)
 
 
 def _match_images(
@@ -377,9 +381,9 @@ def _match_images(
                 own.source.pictures.path,
                 own.tracked.tracks,
                 own.tracked.video.inter_share,
-                fast_frames(own.tracked.tracks),
+                fast,
             )
-            for own in videos
+            for own, fast in zip(videos, images.fast, strict=True)
         ],
         images.inputs.no_motion,
         cameras,
@@ -399,9 +403,14 @@ def _match_images(
 
 def _with_chosen_tracks(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
-) -> PreparedImages:
-    """The images with the tracks that are matched, in place of all tracks of the video."""
+) -> tuple[PreparedImages, NDArray[np.bool_]]:
+    """Choose the tracks of a video that are matched.
+
+    Returns:
+        The images with these tracks in place of all, and where by all tracks the camera moves fast.
+    """
     tracked = prepared.tracked
+    fast = fast_frames(tracked.tracks)
     tracks, read_out = without_shutter(
         tracked.tracks,
         prepared.display,
@@ -412,7 +421,7 @@ def _with_chosen_tracks(
     with context.clock.measure("pairs"):
         tracks = select_tracks(tracks.keep_frames(tracked.chosen.frames), options.density)
     video = replace(tracked.video, tracks=tracks, read_out=read_out)
-    return replace(prepared, tracked=replace(tracked, video=video))
+    return replace(prepared, tracked=replace(tracked, video=video)), fast
 
 
 def _length_quantiles(tracks: Sequence[Tracks]) -> dict[float, int]:

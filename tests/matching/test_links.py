@@ -241,6 +241,13 @@ def test_text_over_the_pictures_is_no_place_seen_again(
     assert report.links.num_revisits < 25
 
 
+def test_no_picture_is_decoded_for_a_calm_video(shared: Path, tmp_path: Path) -> None:
+    """The selection of tracks that are matched leaves fewer of them long than there are."""
+    report = match(tmp_path / "a.db", shared / "sequences" / "log_building" / "clip.mp4")
+    assert report.links.num_images == 0
+    assert report.links.fast == ()
+
+
 @pytest.mark.slow
 def test_jerk_that_only_the_model_shows(
     encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
