@@ -15,7 +15,7 @@ import secrets
 import shutil
 import socket
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -111,13 +111,12 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be given its name.
     """
-    partial = _hidden(path)
-    try:
-        with _held(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR):
+    with _held(path, lambda partial: partial.touch(exist_ok=False), os.O_RDWR) as partial:
+        try:
             yield partial
             partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -175,8 +174,8 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
         _undo_exchange(folder / before)
     for leftover in glob.glob(f"{pattern}.partial", root_dir=folder):
         path = folder / leftover
-        if _is_left(path):
-            with contextlib.suppress(OSError):  # what cannot be removed does no harm
+        with _left(path) as is_left, contextlib.suppress(OSError):  # what stays does no harm
+            if is_left:
                 shutil.rmtree(path) if _is_folder(path) else path.unlink()
 
 
@@ -204,8 +203,8 @@ def _exchange(path: Path, partial: Path) -> None:
 
 def _undo_exchange(before: Path) -> None:
     """Put the old content of a folder back."""
-    if _is_left(before.with_suffix(".partial")):
-        with contextlib.suppress(OSError):
+    with _left(before.with_suffix(".partial")) as is_left, contextlib.suppress(OSError):
+        if is_left:
             _move_entries(before, _place_of(before))
             before.rmdir()
 
@@ -213,13 +212,12 @@ def _undo_exchange(before: Path) -> None:
 def _finish_exchange(old: Path) -> None:
     """Put the rest of the new content of a folder in place, and remove the old one."""
     partial = old.with_suffix(".partial")
-    if not _is_left(partial):
-        return
-    with contextlib.suppress(OSError):
-        if partial.exists():
+    with _left(partial) as is_left, contextlib.suppress(OSError):
+        if is_left and partial.exists():
             _move_entries(partial, _place_of(old))
             partial.rmdir()
-        shutil.rmtree(old)
+        if is_left:
+            shutil.rmtree(old)
 
 
 def _place_of(hidden: Path) -> Path:
@@ -240,46 +238,77 @@ def _hidden(path: Path) -> Path:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    partial = _hidden(path)
-    try:
-        partial.mkdir(parents=True)
-        with _held(partial, os.O_RDONLY):
+    with _held(path, lambda partial: partial.mkdir(parents=True), os.O_RDONLY) as partial:
+        try:
             yield partial
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager
-def _held(path: Path, how: int) -> Iterator[None]:
-    """Open a file or folder, and hold a lock on it, where there are locks."""
-    if fcntl is None:
-        yield
-        return
-    descriptor = os.open(path, how, 0o666)
+def _held(path: Path, make: Callable[[Path], None], how: int) -> Iterator[Path]:
+    """Make a hidden file or folder beside a path, and hold a lock on it, where there are locks.
+
+    Until it is locked another process may take it for a leftover. Then it is made again.
+
+    Args:
+        path: the path.
+        make: makes the file or folder.
+        how: flags to open it with.
+    """
+    while True:
+        partial = _hidden(path)
+        make(partial)
+        if fcntl is None:
+            yield partial
+            return
+        try:
+            descriptor = os.open(partial, how)
+        except FileNotFoundError:
+            continue
+        try:
+            if _lock(descriptor) and partial.exists():
+                yield partial
+                return
+        finally:
+            os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file or folder; False where another process holds it."""
     try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _is_left(path: Path) -> bool:
-    """Whether nobody holds a hidden file or folder any more; False where that cannot be known."""
-    if fcntl is None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
+    except OSError:  # a file system without locks
+        pass
+    return True
+
+
+@contextmanager
+def _left(path: Path) -> Iterator[bool]:
+    """Whether nobody holds a hidden file or folder any more; the body then holds it.
+
+    False where that cannot be known.
+    """
+    if fcntl is None:
+        yield False
+        return
     how = os.O_RDONLY if _is_folder(path) else os.O_RDWR  # as some file systems want it
     try:
         descriptor = os.open(path, how | os.O_NOFOLLOW)
     except OSError:
-        return not os.path.lexists(path)
+        yield not os.path.lexists(path)
+        return
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_left = True
+        except OSError:
+            is_left = False
+        yield is_left
     finally:
         os.close(descriptor)
-    return True
 
 
 @contextmanager
@@ -292,15 +321,7 @@ def only_run(lock: Path) -> Iterator[bool]:
         OSError: the file cannot be made.
     """
     with lock.open("ab") as file:
-        held = True
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                held = False
-            except OSError:  # a file system without locks
-                pass
-        yield held
+        yield fcntl is None or _lock(file.fileno())
 
 
 def may_read(path: Path) -> bool:

@@ -3,7 +3,10 @@ from __future__ import annotations
 import os
 import re
 import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from killed_runs import kill_while_replacing, kill_while_writing
@@ -112,6 +115,28 @@ def test_what_the_killed_left_is_removed(how: str, tmp_path: Path) -> None:
     assert [name for name in names_in(tmp_path) if "other" not in name] == ["model [1]"]
     remove_leftovers(tmp_path)
     assert names_in(tmp_path) == ["model [1]"]
+
+
+@locks
+@pytest.mark.parametrize("how", [whole_file, scratch_folder])
+def test_what_is_being_made_is_no_leftover(how: Callable[[Path], Any], tmp_path: Path) -> None:
+    """Shards of a batch begin at once in one folder, and each looks for leftovers there."""
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.is_set():
+            remove_leftovers(tmp_path)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        for _ in range(300):
+            with how(tmp_path / "video") as partial:
+                assert partial.exists()
+                (partial if partial.is_file() else partial / "points").write_text("1")
+    finally:
+        ended.set()
+        thread.join()
 
 
 @locks
