@@ -149,7 +149,7 @@ sys.stdout.buffer.write(bytes([*image_size(path)]) + read_image(path).tobytes())
 """
     words = [sys.executable, "-c", code, str(tmp_path)]
     environment = {**os.environ, "LC_ALL": locale, "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
-    done = subprocess.run(words, env=environment, capture_output=True, check=True)
+    done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, check=True)
     assert done.stdout == bytes([8, 8]) + picture.tobytes()
 
 

@@ -187,5 +187,5 @@ raise SystemExit(3)
 """
     words = [sys.executable, "-c", code, str(clip), str(num_threads)]
     for _ in range(5):  # one in ten was ended by a signal
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        done = subprocess.run(words, cwd=clip.parent, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (3, "")

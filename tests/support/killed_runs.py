@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 _WHILE_WRITING = """
@@ -37,10 +39,19 @@ with whole_folder(Path(sys.argv[1]), overwrite=True) as partial:
 
 def kill_while_writing(how: str, path: Path) -> None:
     """Let a process die while it writes a file or folder."""
-    subprocess.run([sys.executable, "-c", _WHILE_WRITING, how, str(path)], check=False)
+    assert _ended(_WHILE_WRITING, how, path) == -signal.SIGKILL
 
 
 def kill_while_replacing(folder: Path, steps: int) -> None:
-    """Let a process die after some steps of replacing a folder's files by new ones, a and c."""
-    command = [sys.executable, "-c", _WHILE_REPLACING, str(folder), str(steps)]
-    subprocess.run(command, check=False)
+    """Let a process die after some steps of replacing a folder's files by new ones, a and c.
+
+    With more steps than there are, it ends by itself.
+    """
+    assert _ended(_WHILE_REPLACING, folder, steps) in (-signal.SIGKILL, 0)
+
+
+def _ended(program: str, *words: object) -> int:
+    """Exit status of a program run outside the checkout, which hides the installed package."""
+    command = [sys.executable, "-c", program, *map(str, words)]
+    with tempfile.TemporaryDirectory() as folder:
+        return subprocess.run(command, cwd=folder, check=False).returncode
