@@ -205,7 +205,7 @@ def _track(
     """Track a video in pixels of its images.
 
     Returns:
-        The tracks in the images alone, and how the video was converted, in words.
+        The tracks, in the frames that are images only, and a description of the conversion.
     """
     matching = options.match
 

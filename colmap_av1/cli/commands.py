@@ -48,7 +48,7 @@ _FAILED_TRAINING = 3
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a command that is no field of its options.
+    """An argument of a command that is not a field of its options.
 
     Attributes:
         names: its spellings.
@@ -268,7 +268,7 @@ def _check(namespace: argparse.Namespace) -> int:
 
 
 def _check_model(namespace: argparse.Namespace) -> bool:
-    """Print what a model is like; whether it holds together."""
+    """Print the diagnosis of a model, and return whether it holds together."""
     from colmap_av1.check.model import check_model
     from colmap_av1.geometry.colmap_model import read_model
 

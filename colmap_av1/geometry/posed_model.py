@@ -49,8 +49,11 @@ class PosedModel:
 def posed_model(
     reconstruction: pycolmap.Reconstruction, *, with_points: bool = False
 ) -> PosedModel:
-    """The cameras and registered images of a pycolmap.Reconstruction, and its points if asked."""
-    images = list(posed_images(reconstruction).values())
+    """The cameras and registered images of a pycolmap.Reconstruction, and its points if asked.
+
+    The images are in the order of their ids; pycolmap keeps them in none.
+    """
+    images = sorted(posed_images(reconstruction).values(), key=lambda image: image.image_id)
     used = {image.camera_id for image in images}
     # Copies: pycolmap's own would go with the reconstruction.
     cameras = {i: copy.copy(reconstruction.cameras[i]) for i in sorted(used)}

@@ -61,6 +61,30 @@ def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[
     return seen, place[seen.frame]
 
 
+def tracks_of_points(
+    points: ModelPoints, frames: NDArray[np.int32], num_frames: int, size: tuple[int, int]
+) -> Tracks:
+    """The observations of a model's points as tracks, one for each point.
+
+    Args:
+        points: the points; an image sees each at most once.
+        frames: int32 [num_images] the frame of each image.
+        num_frames: number of frames of all videos.
+        size: (width, height) of the largest image.
+    """
+    count = len(points.image)
+    return Tracks(
+        num_frames=num_frames,
+        width=size[0],
+        height=size[1],
+        offsets=points.offsets,
+        frame=frames[points.image],
+        xy=points.xy.astype(np.float32),
+        sigma=np.zeros(count, np.float32),
+        confirmed=np.ones(count, np.bool_),
+    )
+
+
 def triangulate_tracks(
     tracks: Tracks,
     view: NDArray[np.int64],

@@ -55,7 +55,7 @@ from colmap_av1.util.spread import evenly_spread
 _AROUND_GAP = (0, 1, 2, 4, 7)
 # Where the camera moves fast, few tracks carry the scale: the pictures of all images are matched
 # with those of their neighbours, as COLMAP's sequential matcher does, and loops are looked for by
-# every second image. Motion between images that as many inliers link is left out.
+# every second image. Motion is left out where pictures link neighbours by this many inliers.
 _FAST_INLIERS = 50
 _LOOP_STEP = 2
 # Images that a first look compares with the motion: most suspect gaps are ordinary.
@@ -291,7 +291,8 @@ def link_images(
     plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
     if links.links != "none" and (suspect.maybe.any() or suspect.probes):
         first = _first_look(suspect, takes)
-        features_of([*first.wanted, *plan.wanted], "light")  # decode the videos once
+        also = plan.wanted if plan.effort == "light" else []
+        features_of([*first.wanted, *also], "light")  # decode the videos once
         gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, takes)
         plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
@@ -477,7 +478,7 @@ def plan_links(
 
 
 def _stretches(chosen: NDArray[np.bool_], takes: Takes) -> tuple[range, ...]:
-    """Images of one video that are chosen and follow each other: bool [num_images]."""
+    """Ranges of consecutive images of one video that are chosen: bool [num_images]."""
     found: list[range] = []
     for video in range(len(takes.videos)):
         images = takes.images_of(video)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.colmap_model import ModelPoints
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
@@ -18,7 +16,8 @@ from colmap_av1.tracks.tracks import Tracks, order_by_frame
 # image, n growing with the span, so the number of pairs stays linear in the number of
 # images even where tracks live as long as the video.
 _UNTHINNED_SPAN = 64
-# Images up to which all pairs that share tracks are taken, and pairs for each image in all.
+# Distance in images up to which all pairs that share tracks are taken, and the mean number of pairs
+# per image that all together may not exceed.
 _NEAR = 10
 _MOST_PAIRS = 30
 
@@ -88,29 +87,11 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     ]
 
 
-def keypoints_of_points(points: ModelPoints, num_images: int) -> list[ImageKeypoints]:
-    """The observations of a model's points as keypoints; each point is a track.
-
-    Args:
-        points: the points. A second observation of a point in an image is left out.
-        num_images: number of images of the model.
-    """
-    track = np.repeat(np.arange(len(points.offsets) - 1), np.diff(points.offsets))
-    order = np.lexsort((track, points.image))
-    bounds = np.searchsorted(points.image[order], np.arange(num_images + 1))
-    keypoints = []
-    for image, (first, last) in enumerate(pairwise(bounds.tolist())):
-        own, index = np.unique(track[order[first:last]], return_index=True)
-        xy = points.xy[order[first:last][index]].astype(np.float32)
-        keypoints.append(ImageKeypoints(image, xy, own))
-    return keypoints
-
-
 def covisible_pairs(keypoints: Sequence[ImageKeypoints], min_matches: int) -> NDArray[np.int32]:
-    """Choose image pairs among all that share tracks, also where a place is seen again.
+    """Choose image pairs that share tracks, at any distance, as where a place is seen again.
 
-    Neighbours up to ten images apart are all paired. Of the others, where they are many, those
-    that share the most tracks among similar pairs.
+    All neighbours up to ten images apart are paired. If the other pairs are too many, only the one
+    that shares the most tracks is kept of each group of similar pairs.
 
     Args:
         keypoints: the keypoints of the images, in display order.

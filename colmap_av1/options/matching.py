@@ -51,9 +51,9 @@ class LinkOptions(Options):
 
     links: Literal["auto", "none", "sift"] = option(
         "auto",
-        "auto: match pictures across gaps that motion does not carry over and, in videos much "
-        "longer than tracks reach, between places seen again; sift: look for places seen again in "
-        "any video; none: use motion alone",
+        "auto: match pictures across gaps that motion does not carry over, where the camera moves "
+        "fast and, in videos much longer than tracks reach, between places seen again; sift: look "
+        "for places seen again in any video; none: use motion alone",
         common=True,
     )
     max_link_features: int = option(1500, "most features of a picture", least=50)

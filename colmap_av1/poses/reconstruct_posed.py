@@ -186,11 +186,12 @@ def _pose_stages(
     posed = refined_poses(
         run, matched, mapped, believed=believed, takes=takes, keyed=keyed, in_place=in_place
     )
-    links = posed.matches.result.links
+    links = matched.result.links
     if links.gaps or links.fast:
         posed = remapped_poses(run, posed, takes)
-    linked = matched.result.links.looked_again
-    far_views = far_view_stage(run, posed.tracks, takes, posed.moving, posed.last, linked=linked)
+    far_views = far_view_stage(
+        run, posed.tracks, takes, posed.moving, posed.last, linked=links.looked_again
+    )
     return replace(posed, far_views=far_views)
 
 
@@ -204,27 +205,25 @@ def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tu
 def remapped_poses(run: Run, posed: Posed, takes: Takes) -> Posed:
     """Map the adjusted observations again, and adjust, as long as that lowers the cost.
 
-    See `remapping` for why.
+    See `remapping` for why. Poses that no adjustment by corners has left stay as they are.
     """
+    adjustment = posed.adjustment
+    if adjustment is None or not posed.in_place:
+        return posed
     for number in range(2, _MOST_MAPPINGS + 1):
-        if posed.adjustment is None or not posed.in_place:
-            return posed
-        again = remap_stage(run, takes, posed.adjustment, number=number)
+        again = remap_stage(run, takes, adjustment, number=number)
         if not again.result.is_better:
-            return posed
-        placed: Kept[PosesResult] = again
+            break
         adjustment = adjustment_stage(
             run,
             posed.tracks,
             posed.links,
             takes,
-            placed,
-            moved=posed.adjustment.digest,
+            again,
             corners=partial(corners_in_images, run, posed.moving),
-            name=f"adjusted_{number}",
+            number=number,
         )
-        posed = replace(posed, adjustment=adjustment)
-    return posed
+    return replace(posed, adjustment=adjustment)
 
 
 def refined_poses(

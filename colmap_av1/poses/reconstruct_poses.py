@@ -333,7 +333,7 @@ def adjustment_stage(
     moved: str | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
-    name: str = "adjusted",
+    number: int = 1,
 ) -> Kept[AdjustedResult]:
     """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
 
@@ -352,9 +352,10 @@ def adjustment_stage(
         follow: corrects the chosen tracks in the images that have a pose.
         corners: looks for corners of these images' pictures, which take part whole, and corrects
             poses that these contradict.
-        name: of the file with the adjusted model, and of the stage.
+        number: of the mapping that the poses come from.
     """
     options = run.options
+    suffix = f"_{number}" if number > 1 else ""
     refine = refines_intrinsics(options)
 
     def make(partial: Path) -> AdjustedResult:
@@ -376,21 +377,14 @@ def adjustment_stage(
             num_points = _write_black_points(run, folder, placed, sets)
             check_agreement(num_points, spread.num_tracks)
             run.progress("adjustment", 0, 1)
-            adjust_model(
-                folder,
-                refine_intrinsics=refine,
-                loss_scales=LOSS_SCALES,
-                seed=options.match.run.seed,
-                num_threads=options.mapping.mapper_threads,
-                log=run.stages / "adjustment.log",
-            )
+            adjust_in(run, folder)
             run.progress("adjustment", 1, 1)
             adjusted = without_unseen_images(folder)
         joints = model_joints(adjusted)
         result = posed_model(adjusted, with_points=True)
-        write_posed_model(partial / f"{name}.npz", result)
+        write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
-            poses=f"{name}.npz",
+            poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
             registered=_registered(result, takes),
             doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
@@ -402,12 +396,24 @@ def adjustment_stage(
     given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, LOSS_SCALES, FEW_SEEN, refine, *how)
     return run_stage(
         run.stages,
-        name,
+        f"adjustment{suffix}",
         [posed.digest, given, moved],
         AdjustedResult,
         into=run.stages,
-        products=[f"{name}.npz"],
+        products=[f"adjusted{suffix}.npz"],
         make=make,
+    )
+
+
+def adjust_in(run: Run, folder: Path) -> None:
+    """Bundle-adjust the model in a folder, as the options of the run say; it is overwritten."""
+    adjust_model(
+        folder,
+        refine_intrinsics=refines_intrinsics(run.options),
+        loss_scales=LOSS_SCALES,
+        seed=run.options.match.run.seed,
+        num_threads=run.options.mapping.mapper_threads,
+        log=run.stages / "adjustment.log",
     )
 
 
@@ -418,12 +424,12 @@ def _write_black_points(
     sets: Sequence[tuple[Tracks, TriangulateOptions]],
 ) -> int:
     """Write a model of the images and of points of sets of tracks; returns how many points."""
-    points = joined_points([black_points(run, placed, *own) for own in sets])
+    points = joined_points([_black_points(run, placed, *own) for own in sets])
     write_model(folder, placed.cameras, placed.images, points)
     return len(points.xyz)
 
 
-def black_points(
+def _black_points(
     run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
     """Points of tracks in the images that have a pose, without colours."""

@@ -108,7 +108,7 @@ def run_stage(
     """Run a stage, unless an earlier run finished it with the same input.
 
     What it makes appears under its name when it is complete, never in part; what was there until
-    then stays. Of what is there only files of an earlier run are replaced.
+    then stays. Only files of an earlier run are replaced.
 
     Args:
         stages: the folder of the stages.

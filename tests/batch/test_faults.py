@@ -83,7 +83,7 @@ def test_a_video_that_takes_too_long(clips: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("number", "reason"), [("SIGKILL", "killed"), ("SIGSEGV", "crashed")])
 def test_a_process_that_ends(number: str, reason: str, clips: Path, tmp_path: Path) -> None:
-    """What the system kills is tried again, what ends by itself is not; others go on."""
+    """A process that is killed is tried again, one that crashes is not; other videos go on."""
     sent: list[int] = []
 
     def harm(counts: Counts, _: object) -> None:

@@ -7,8 +7,9 @@ import pycolmap
 
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.matching.gaps import fast_frames
-from colmap_av1.matching.pairs import covisible_pairs, keypoints_of_points
+from colmap_av1.matching.pairs import covisible_pairs, image_keypoints
 from colmap_av1.poses.remapping import RemappedResult
 from colmap_av1.tracks.tracks import Tracks
 
@@ -56,7 +57,9 @@ def test_points_behind_a_camera_are_infinitely_wrong() -> None:
 
 
 def test_all_images_that_share_points_are_paired() -> None:
-    keypoints = keypoints_of_points(model().points, NUM_IMAGES)
+    frames = np.arange(NUM_IMAGES, dtype=np.int32)
+    tracks = tracks_of_points(model().points, frames, NUM_IMAGES, (640, 480))
+    keypoints = image_keypoints(tracks, frames.tolist())
     seen = [set(own.track.tolist()) for own in keypoints]
     pairs = covisible_pairs(keypoints, 15)
     expected = {
@@ -98,3 +101,8 @@ def tracks_of_lengths(length: int) -> Tracks:
 def test_frames_are_fast_where_tracks_end_soon() -> None:
     assert fast_frames(tracks_of_lengths(6)).all()
     assert not fast_frames(tracks_of_lengths(40)).any()
+
+
+def test_frames_after_the_last_image_are_not_fast() -> None:
+    images = np.arange(0, 60, 8, dtype=np.int32)
+    assert not fast_frames(tracks_of_lengths(40).keep_frames(images)).any()

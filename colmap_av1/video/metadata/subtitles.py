@@ -120,8 +120,8 @@ def to_places(
         place: the position of the whole video; None: unknown.
 
     Returns:
-        float64 [n, 3], NaN where order or unit are not certain; and in this case what is not
-        certain, in words.
+        float64 [n, 3], NaN if their order or unit is not certain; and in that case a description of
+        what is uncertain.
     """
     places = np.full((len(written), 3), np.nan)
     doubt = None
