@@ -262,7 +262,7 @@ def _pictures(
 ) -> Pictures:
     """What gives the pictures of images; a folder keeps those of videos."""
     kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
-    shown = [ShownVideo(own, kept=file) for own, file in zip(inputs.videos, kept, strict=True)]
+    shown = list(map(ShownVideo.as_played, inputs.videos, kept))
     return pictures_of(takes, shown, [photo.path for photo in photos], options.match.reading)
 
 

@@ -6,6 +6,7 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
-from colmap_av1.errors import DatabaseError
+from colmap_av1.errors import DatabaseError, ModelError, VideoError
 from colmap_av1.geometry.cameras import check_pixel_aspect
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.inputs import Inputs, read_inputs
@@ -24,9 +25,9 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
-from colmap_av1.matching.cameras import ImageCameras, Shape, new_cameras, shape_of
+from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
-from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.image_matches import MatchedImages, PairedImages
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.matching.match_images import (
@@ -36,13 +37,23 @@ from colmap_av1.matching.match_images import (
     match_images,
 )
 from colmap_av1.matching.shutter.correct import without_shutter
-from colmap_av1.options import MatchOptions
+from colmap_av1.options import ImageOptions, MatchOptions, ReconstructOptions
+from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
+from colmap_av1.poses.reconstruct_tracks import (
+    Run,
+    TracksResult,
+    VideoTracks,
+    encoding_for_pictures,
+)
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.cpus import one_blas_thread
+from colmap_av1.util.files import scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.stages import Kept
+from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
 _NO_PAIRS = np.empty((0, 2), dtype=np.int32)
@@ -66,8 +77,8 @@ class MatchReport:
         num_images: images of the database.
         num_written_images: image files written; others were there or not asked for.
         masked: share of the images' pixels that masks leave out; None without masks.
-        num_tracks: tracks in the videos.
-        track_lengths: quantiles of the number of frames that see a track, from 0 (shortest)
+        num_tracks: tracks of the videos that images are matched along.
+        track_lengths: quantiles of the number of images that see a track, from 0 (shortest)
             to 1 (longest); empty without a track.
         num_observations: keypoints of all images.
         focal_length: of the first video, in heights of a pixel, where it was estimated from the
@@ -83,6 +94,8 @@ class MatchReport:
         forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
             with no pair unless its options allow that, and the focal length cannot be found.
         links: what connects images where motion does not.
+        estimate: what the joint estimate says that the matches agree with; None: each pair was
+            verified by itself.
         seconds: wall time of each stage.
         warnings: what the user should know, such as damage of the stream.
     """
@@ -110,6 +123,7 @@ class MatchReport:
     configs: dict[str, int]
     forward_motion: bool
     links: LinkReport
+    estimate: JointEstimate | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -208,17 +222,24 @@ def match(
     if folder is not None:
         check_places(inputs.photos, folder)
     context = RunContext.of(options.run, clock, progress)
-    with unchanged(*inputs.states) as check_videos:
+    with unchanged(*inputs.states) as check_videos, ExitStack() as opened:
+        scratch = None
+        if _is_joint(folder, options):
+            scratch = opened.enter_context(scratch_folder(database))
+            options = replace(options, encode=encoding_for_pictures(options.encode))
         images = _prepare(
             inputs,
             listed_of_videos(database, listed, inputs),
             folder,
             options,
             beside=database,
+            scratch=scratch,
             context=context,
         )
-        found = _match_images(images, database, listed, options, context)
-        written = demote_bad_initial_pairs(found.matched, found.cameras, clock)
+        cameras = _listed_cameras(database, listed, images) if listed else None
+        found = _match_images(images, cameras, scratch, options, context)
+        poses = found.poses if isinstance(found, JointMatches) else ()
+        written = demote_bad_initial_pairs(found.matched, found.cameras, clock, poses)
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -240,7 +261,6 @@ def match(
             places=positions.places,
         )
     videos = images.videos
-    tracks = [own.tracked.tracks for own in videos]
     kinds = Counter(geometry.config.name for geometry in written.geometries)
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
@@ -254,13 +274,13 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        num_frames=sum(own.num_frames for own in tracks),
+        num_frames=images.takes.num_frames - len(inputs.photos),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_images=len(written.keypoints),
         num_written_images=num_written,
         masked=images.takes.masked,
-        num_tracks=sum(own.num_tracks for own in tracks),
-        track_lengths=_length_quantiles(tracks),
+        num_tracks=found.num_tracks,
+        track_lengths=_length_quantiles(written),
         num_observations=sum(len(keypoints.xy) for keypoints in written.keypoints),
         focal_length=found.focal_length,
         read_outs=tuple(own.tracked.video.read_out for own in videos),
@@ -271,6 +291,7 @@ def match(
         configs=dict(sorted(kinds.items())),
         forward_motion=written.forward_motion,
         links=found.links,
+        estimate=found.estimate if isinstance(found, JointMatches) else None,
         seconds=clock.seconds,
         warnings=(*inputs.warnings, *notes, *blurred),
     )
@@ -309,7 +330,7 @@ class _Images:
 
     Attributes:
         inputs: the videos and photos.
-        videos: the images of each video, with the tracks that are matched in place of all.
+        videos: the images of each video, with its tracks in their pixels.
         fast: of each video, where the camera moves fast: bool [num_frames], see `fast_frames`.
         takes: all images, counted through.
     """
@@ -319,6 +340,22 @@ class _Images:
     fast: Sequence[NDArray[np.bool_]]
     takes: Takes
 
+    @property
+    def shown(self) -> tuple[ShownVideo, ...]:
+        """The videos, as their pictures are looked at."""
+        return tuple(
+            ShownVideo(v.source.pictures, v.size, v.pixel_aspect, v.display, v.source.kept)
+            for v in self.videos
+        )
+
+
+def _is_joint(folder: Path | None, options: MatchOptions) -> bool:
+    """Whether matches are to agree with a joint estimate."""
+    if options.verify.verify == "auto":
+        # A camera of its own for each image is adjusted to the image's errors.
+        return folder is not None and options.camera.single_camera is not False
+    return options.verify.verify == "joint"
+
 
 def _prepare(
     inputs: Inputs,
@@ -327,49 +364,129 @@ def _prepare(
     options: MatchOptions,
     *,
     beside: Path,
+    scratch: Path | None,
     context: RunContext,
 ) -> _Images:
-    """Find or choose the images of each video, and count them through."""
-    found = [
-        # All tracks of a video are its largest arrays: they make room for the next.
-        _with_chosen_tracks(
-            prepare_images(
-                video,
-                folder / label if folder is not None else None,
-                options,
-                listed=existing,
-                masks=masks,
-                beside=beside,
-                context=context,
-            ),
+    """Find or choose the images of each video, and count them through.
+
+    Args:
+        inputs: the videos and photos.
+        listed: (width, height) of the images of each video that a database lists, by name.
+        folder: folder of the images; None: none are wanted.
+        options: all options.
+        beside: the database.
+        scratch: folder that keeps decoded pictures for a joint estimate; None: there is none, and
+            only tracks that are matched are kept.
+        context: gets the stages.
+    """
+    videos, fast = [], []
+    for number, (video, label, masks, existing) in enumerate(
+        zip(inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True)
+    ):
+        prepared = prepare_images(
+            video,
+            folder / label if folder is not None else None,
             options,
-            context,
+            listed=existing,
+            masks=masks,
+            beside=beside,
+            context=context,
         )
-        for video, label, masks, existing in zip(
-            inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True
-        )
-    ]
-    videos = [own for own, _ in found]
+        fast.append(fast_frames(prepared.tracked.tracks))
+        prepared = _without_shutter(prepared, options, context)
+        if scratch is not None:
+            kept = KeptPictures(scratch / f"{number}.raw")
+            prepared = replace(prepared, source=replace(prepared.source, kept=kept))
+        else:
+            # All tracks of a video are its largest arrays: they make room for the next.
+            prepared = _with_selected_tracks(prepared, options, context)
+        videos.append(prepared)
     takes = inputs.takes(
         [own.tracked.chosen for own in videos], [own.tracked.tracks.num_frames for own in videos]
     )
-    return _Images(inputs, videos, [fast for _, fast in found], takes)
+    return _Images(inputs, videos, fast, takes)
 
 
 def _match_images(
     images: _Images,
-    database: Path,
-    listed: Sequence[DatabaseImage],
+    cameras: ImageCameras | None,
+    scratch: Path | None,
     options: MatchOptions,
     context: RunContext,
 ) -> ImageMatches:
-    """Match the images; their cameras are those of the database where it lists the images."""
+    """Match the images, by a joint estimate if there is a folder for it and it succeeds.
+
+    Args:
+        images: the images.
+        cameras: those of a database that lists the images; None: they are made anew.
+        scratch: the folder.
+        options: all options.
+        context: gets the stages.
+    """
+    if scratch is None:
+        return _match_pairs(images, cameras, options, context)
+    try:
+        return _match_jointly(images, cameras, scratch, options, context)
+    except (ModelError, VideoError) as error:
+        reason = f"each pair is verified by itself, as a joint estimate fails: {error}"
+    videos = [_with_selected_tracks(own, options, context) for own in images.videos]
+    found = _match_pairs(replace(images, videos=videos), cameras, options, context)
+    return replace(found, warnings=(*found.warnings, reason))
+
+
+def _match_jointly(
+    images: _Images,
+    cameras: ImageCameras | None,
+    scratch: Path,
+    options: MatchOptions,
+    context: RunContext,
+) -> JointMatches:
+    """Match the images by what agrees with an estimate of all poses."""
+    stages = scratch / ".stages"
+    stages.mkdir()
+    # The images are chosen.
+    chosen = replace(options, images=ImageOptions())
+    run = Run(
+        images.inputs,
+        tuple(own.source for own in images.videos),
+        images.shown,
+        scratch,
+        stages,
+        ReconstructOptions(match=chosen),
+        context.clock,
+        context.progress,
+        cameras=cameras,
+    )
+    tracked = [own.tracked for own in images.videos]
+    return match_jointly(
+        run,
+        [VideoTracks(own.tracks, own.chosen, own.video.inter_share) for own in tracked],
+        images.takes,
+        [
+            Kept(
+                TracksResult(own.tracks.num_frames, own.tracks.num_tracks, own.video.read_out, ()),
+                digest="",
+                resumed=False,
+            )
+            for own in tracked
+        ],
+        options.density,
+    )
+
+
+def _match_pairs(
+    images: _Images,
+    listed: ImageCameras | None,
+    options: MatchOptions,
+    context: RunContext,
+) -> ImageMatches:
+    """Match the images along their tracks, each pair by itself."""
     takes, videos = images.takes, images.videos
+    shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in images.shown]
 
     def cameras(paired: PairedImages) -> ImageCameras:
-        shapes = [shape_of(v.source.pictures, v.size, v.pixel_aspect) for v in videos]
-        if listed:
-            return _listed_cameras(database, listed, takes, shapes)
+        if listed is not None:
+            return listed
         return new_cameras(
             paired, takes, shapes, images.inputs.photos, options.camera, context=context
         )
@@ -388,10 +505,7 @@ def _match_images(
         images.inputs.no_motion,
         cameras,
         pictures_of(
-            takes,
-            [ShownVideo(own.source.pictures, own.display) for own in videos],
-            [photo.path for photo in images.inputs.photos],
-            options.reading,
+            takes, images.shown, [photo.path for photo in images.inputs.photos], options.reading
         ),
         options=ImageMatchOptions(
             options.pairs, options.verify, options.links, least_length(options.tracks)
@@ -401,16 +515,11 @@ def _match_images(
     )
 
 
-def _with_chosen_tracks(
+def _without_shutter(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
-) -> tuple[PreparedImages, NDArray[np.bool_]]:
-    """Choose the tracks of a video that are matched.
-
-    Returns:
-        The images with these tracks in place of all, and where by all tracks the camera moves fast.
-    """
+) -> PreparedImages:
+    """The images with their tracks corrected for the shutter's read-out, if that is wanted."""
     tracked = prepared.tracked
-    fast = fast_frames(tracked.tracks)
     tracks, read_out = without_shutter(
         tracked.tracks,
         prepared.display,
@@ -418,15 +527,24 @@ def _with_chosen_tracks(
         options.camera,
         context,
     )
-    with context.clock.measure("pairs"):
-        tracks = select_tracks(tracks.keep_frames(tracked.chosen.frames), options.density)
     video = replace(tracked.video, tracks=tracks, read_out=read_out)
-    return replace(prepared, tracked=replace(tracked, video=video)), fast
+    return replace(prepared, tracked=replace(tracked, video=video))
 
 
-def _length_quantiles(tracks: Sequence[Tracks]) -> dict[float, int]:
-    """Quantiles of the lengths of all tracks; empty without a track."""
-    lengths = np.concatenate([own.lengths for own in tracks])
+def _with_selected_tracks(
+    prepared: PreparedImages, options: MatchOptions, context: RunContext
+) -> PreparedImages:
+    """The images with the tracks that are matched, in place of all."""
+    tracked = prepared.tracked
+    with context.clock.measure("pairs"):
+        tracks = select_tracks(tracked.tracks.keep_frames(tracked.chosen.frames), options.density)
+    return replace(prepared, tracked=tracked.with_tracks(tracks))
+
+
+def _length_quantiles(matched: MatchedImages) -> dict[float, int]:
+    """Quantiles of the number of images that see each track; empty without a track."""
+    lengths = np.bincount(np.concatenate([own.track for own in matched.keypoints]))
+    lengths = lengths[lengths > 0]
     if len(lengths) == 0:
         return {}
     found = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
@@ -460,14 +578,15 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
 
 
 def _listed_cameras(
-    database: Path, listed: Sequence[DatabaseImage], takes: Takes, shapes: Sequence[Shape]
+    database: Path, listed: Sequence[DatabaseImage], images: _Images
 ) -> ImageCameras:
     """The cameras of a database that lists the images."""
+    takes = images.takes
     of_images = listed_cameras(database, listed, takes.images.names)
     notes: dict[str, None] = {}
-    for video, shape in enumerate(shapes):
+    for video, shown in enumerate(images.shown):
         camera = of_images[takes.images_of(video).start]
         notes |= dict.fromkeys(
-            check_pixel_aspect(camera, shape.pixel_aspect, "import the images with one of these")
+            check_pixel_aspect(camera, shown.pixel_aspect, "import the images with one of these")
         )
     return ImageCameras(of_images, None, tuple(notes))

@@ -17,11 +17,13 @@ from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
+from colmap_av1.images.takes import ShownVideo
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
+    encoding_for_pictures,
     read_tracks,
     stage_of_video,
     track_stage,
@@ -199,7 +201,8 @@ def reconstruct(
             replace(own, kept=KeptPictures(scratch / f"{number}.raw"))
             for number, own in enumerate(sources)
         )
-        run = Run(inputs, sources, output, stages, options, clock, progress)
+        shown = tuple(ShownVideo.as_played(own.pictures, own.kept) for own in sources)
+        run = Run(inputs, sources, shown, output, stages, options, clock, progress)
         try:
             report = _run_stages(run)
         except ColmapAv1Error:  # which may come of a change
@@ -225,11 +228,10 @@ def _remove_earlier_layout(stages: Path) -> None:
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
-    """The options with which videos are converted: quickly where pictures correct the poses."""
-    encode = options.match.encode
-    if encode.effort == "auto" and options.mapping.adjust:
-        encode = replace(encode, effort="quick")
-    return replace(options.match, encode=encode)
+    """The options with which videos are converted."""
+    if not options.mapping.adjust:
+        return options.match
+    return replace(options.match, encode=encoding_for_pictures(options.match.encode))
 
 
 def _run_stages(run: Run) -> ReconstructReport:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # each is slow to import
     from colmap_av1.matching.links import LinkReport
     from colmap_av1.matching.shutter.of_video import VideoReadOut
     from colmap_av1.motion.info import StreamReport
+    from colmap_av1.poses.joint_matches import JointEstimate
     from colmap_av1.reconstruct import ReconstructReport
 
 Rows = list[tuple[str, str]]
@@ -55,11 +56,23 @@ def match_rows(report: MatchReport) -> Rows:
         ("configurations", ", ".join(f"{k} {n}" for k, n in report.configs.items())),
         *_link_rows(report.links),
     ]
+    if report.estimate is not None:
+        rows += _estimate_rows(report.estimate, report.num_images)
     if report.focal_length is not None:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
+    """What the joint estimate says that matches agree with."""
+    poses = f"{estimate.num_registered} of {num_images} images with a pose"
+    return [
+        ("joint estimate", poses),
+        *_moving_row(estimate.moving),
+        *_far_view_rows(estimate.far_views, estimate.far_views_largest),
+    ]
 
 
 def map_rows(report: MapReport) -> Rows:

@@ -234,6 +234,7 @@ def write_prepared(
         num_threads=read.num_threads,
         operating_point=read.operating_point,
         display=prepared.display,
+        kept=prepared.source.kept,
         progress=lambda done: progress("images", done, len(chosen.names)),
     )
 

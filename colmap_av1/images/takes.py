@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -120,17 +121,46 @@ def count_through(
 
 @dataclass(frozen=True)
 class ShownVideo:
-    """A video whose pictures are looked at.
+    """A video whose pictures are looked at, in the size of its images.
 
     Attributes:
         video: the video.
+        size: (width, height) of the images in pixels; pictures of another size are resized.
+        pixel_aspect: width of a pixel of theirs over its height.
         display: how its pictures are cut and turned; None: as players do.
         kept: keeps those that were decoded; None: they are decoded each time.
     """
 
     video: Video
+    size: tuple[int, int]
+    pixel_aspect: float
     display: Display | None = None
     kept: KeptPictures | None = None
+
+    @staticmethod
+    def as_played(video: Video, kept: KeptPictures | None = None) -> ShownVideo:
+        """The video with its pictures as players show them."""
+        return ShownVideo(video, video.picture_size, video.display.pixel_aspect, None, kept)
+
+    def pictures(
+        self, num_frames: int, options: ReadOptions, *, wanted: Collection[int], use: str
+    ) -> Iterator[tuple[int, Image]]:
+        """The pictures of some frames, see `decodable_frames`."""
+        decoded = decodable_frames(
+            self.video,
+            num_frames,
+            options,
+            self.display,
+            wanted=wanted,
+            use=use,
+            kept=self.kept,
+        )
+        for frame, picture in decoded:
+            if picture.shape[1::-1] == self.size:
+                yield frame, picture
+            else:
+                resized = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA)
+                yield frame, np.asarray(resized, np.uint8)
 
 
 def pictures_of(
@@ -163,14 +193,8 @@ def pictures_of(
                 if first + index in left
             }
             if image_of:
-                decoded = decodable_frames(
-                    shown.video,
-                    max(image_of) + 1,
-                    options,
-                    shown.display,
-                    wanted=image_of,
-                    use="pictures are looked at",
-                    kept=shown.kept,
+                decoded = shown.pictures(
+                    max(image_of) + 1, options, wanted=image_of, use="pictures are looked at"
                 )
                 for frame, picture in decoded:
                     yield image_of[frame], picture

@@ -50,7 +50,7 @@ _NEARBY = 10
 # The camera moves fast where less than this share of a frame's tracks is still seen so many frames
 # later, and less was already seen so many frames before. On a hand-held clip (`log_building`) it is
 # 23 % and more; on a walk with fast turns (`cafe`) the median is 12 %.
-_LASTING_SHARE = 0.2
+_LASTING_SHARE = 0.15
 _LASTING_FRAMES = 10
 # Gaps that a warning names.
 _NUM_NAMED = 3

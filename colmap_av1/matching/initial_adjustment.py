@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
+    INITIAL_LEAST_ANGLE,
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
@@ -35,6 +36,8 @@ _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
 # Matches that show whether to search at all, and the share of the angle that they have to.
 _NUM_GLANCED = 64
 _LEAST = 0.75
+# Share of its triangulation angle that the rotation of a pair may be off by.
+_WRONG = 0.25
 # How far a focal length may be adjusted, as a factor, and a distortion parameter, by addition. The
 # mapper registers no images beside such whose parameters passed 1.
 _FAR, _DISTORTED = 2.0, 0.5
@@ -113,7 +116,65 @@ def triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 
 
-def runaway_starts(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> list[int]:
+@dataclass(frozen=True)
+class KnownPoses:
+    """Poses that those of pairs are compared with.
+
+    Attributes:
+        cam_from_world: float64 [3, 4] of each image; None where it is not known; empty: none is.
+    """
+
+    cam_from_world: Sequence[_Floats | None] = ()
+
+    def rotation(self, pair: Sequence[int]) -> _Floats | None:
+        """The rotation from the first camera of a pair to the second; None: it is not known."""
+        if not self.cam_from_world:
+            return None
+        first, second = (self.cam_from_world[image] for image in pair)
+        if first is None or second is None:
+            return None
+        return np.asarray(second[:, :3] @ first[:, :3].T)
+
+    def contradict(self, pair: Sequence[int], rotation: _Floats, angle: float) -> bool:
+        """Whether a rotation of a pair is wrong by much of the triangulation angle it leads to."""
+        known = self.rotation(pair)
+        if known is None:
+            return False
+        cosine = (np.trace(rotation @ known.T) - 1.0) / 2.0
+        return bool(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) > _WRONG * angle)
+
+    def misleading_pairs(
+        self, matched: MatchedImages, cameras: Sequence[pycolmap.Camera]
+    ) -> list[int]:
+        """Pairs that a mapper may begin with as their own poses, which are wrong, have wide angles.
+
+        Args:
+            matched: the images.
+            cameras: the camera of each image.
+        """
+        found = []
+        for k, (pair, geometry) in enumerate(
+            zip(matched.pairs.tolist(), matched.geometries, strict=True)
+        ):
+            if len(geometry.inlier_matches) < INITIAL_MIN_INLIERS // 2:
+                continue
+            if self.rotation(pair) is None:
+                continue
+            glanced = _glanced(matched, cameras, pair, geometry)
+            pose = _pose(geometry, glanced)
+            if pose is None:
+                continue
+            angle = triangulation_angle(pose[:, :3], glanced.rays)
+            if angle >= _LEAST * INITIAL_LEAST_ANGLE and self.contradict(pair, pose[:, :3], angle):
+                found.append(k)
+        return found
+
+
+def runaway_starts(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    known: KnownPoses = KnownPoses(),
+) -> list[int]:
     """Find pairs that would begin a model with a camera that is adjusted far off.
 
     The mapper adjusts focal length and distortion to its first two images alone. Where a hundred
@@ -124,6 +185,7 @@ def runaway_starts(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -
     Args:
         matched: the images.
         cameras: the camera of each image.
+        known: poses that a pair's own must not contradict.
 
     Returns:
         Indices of pairs. None of them where no pair holds that is looked at: the mapper then fares
@@ -137,13 +199,15 @@ def runaway_starts(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -
         for k in of_image:
             if k not in starts:
                 pair = matched.pairs[k].tolist()
-                starts[k] = _look(matched, cameras, pair, matched.geometries[k])
+                starts[k] = _look(matched, cameras, pair, matched.geometries[k], known)
             start = starts[k]
             if start is not None and start.holds and start.is_certain:
                 num_certain += 1
                 break
     holds = {k: start.holds for k, start in starts.items() if start is not None}
-    return [k for k in sorted(holds) if not holds[k]] if any(holds.values()) else []
+    if not (known.cam_from_world or any(holds.values())):
+        return []
+    return [k for k in sorted(holds) if not holds[k]]
 
 
 def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Iterator[list[int]]:
@@ -178,11 +242,10 @@ def _look(
     cameras: Sequence[pycolmap.Camera],
     pair: Sequence[int],
     geometry: TwoViewGeometry,
+    known: KnownPoses,
 ) -> _Start | None:
     """Begin with a pair as the mapper does; None where it leaves it."""
-    step = max(1, len(geometry.inlier_matches) // _NUM_GLANCED)
-    some = replace(geometry, inlier_matches=geometry.inlier_matches[::step])
-    glanced = inliers_of(matched, cameras, pair, some)
+    glanced = _glanced(matched, cameras, pair, geometry)
     pose = _pose(geometry, glanced)
     if pose is None or not _is_wide(pose, triangulation_angle(pose[:, :3], glanced.rays), _LEAST):
         return None
@@ -191,12 +254,27 @@ def _look(
     for found in _poses(geometry, inliers):
         start = _begun(inliers, *found)
         if start is not None:
+            _, pose, angle = found
+            if known.contradict(pair, pose[:, :3], angle):
+                return replace(start, holds=False)
             begun.append(start)
             if not start.holds:
                 return start
     if not begun:
         return None
     return _Start(True, len(begun) >= _NUM_SEEDS and all(start.is_certain for start in begun))
+
+
+def _glanced(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    pair: Sequence[int],
+    geometry: TwoViewGeometry,
+) -> PairInliers:
+    """Some of the inliers of a pair."""
+    step = max(1, len(geometry.inlier_matches) // _NUM_GLANCED)
+    some = replace(geometry, inlier_matches=geometry.inlier_matches[::step])
+    return inliers_of(matched, cameras, pair, some)
 
 
 def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_adjustment import (
+    KnownPoses,
     PairInliers,
     inliers_of,
     pose_of_essential,
@@ -39,7 +40,10 @@ _SHARE = 0.9
 
 
 def demote_bad_initial_pairs(
-    matched: MatchedImages, cameras: Sequence[pycolmap.Camera], clock: Clock
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    clock: Clock,
+    poses: Sequence[_Floats | None] = (),
 ) -> MatchedImages:
     """Limit the inliers of pairs that would make a bad initial pair.
 
@@ -54,6 +58,8 @@ def demote_bad_initial_pairs(
             tested for the pose of the homography.
         cameras: the camera of each image.
         clock: gets the stage "verification".
+        poses: float64 [3, 4] cam_from_world of each image, of those where it is known; empty: none
+            is. A pair whose matches give another pose is demoted, too.
     """
     geometries = list(matched.geometries)
     with clock.measure("verification"):
@@ -63,7 +69,10 @@ def demote_bad_initial_pairs(
                 few = _thinned(geometry)
                 if _is_contradicted(few, inliers_of(matched, cameras, pair, few)):
                     geometries[k] = few
-        for k in runaway_starts(replace(matched, geometries=geometries), cameras):
+        known = KnownPoses(poses)
+        for k in known.misleading_pairs(replace(matched, geometries=geometries), cameras):
+            geometries[k] = _thinned(geometries[k])
+        for k in runaway_starts(replace(matched, geometries=geometries), cameras, known):
             geometries[k] = _thinned(geometries[k])
     return replace(matched, geometries=geometries)
 

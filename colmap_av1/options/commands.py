@@ -104,7 +104,7 @@ class ReconstructOptions(Options):
 
     match: MatchOptions = part(
         MatchOptions(),
-        unused=("density", "on_existing", "images.first_number"),
+        unused=("density", "on_existing", "images.first_number", "verify.verify"),
     )
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())

@@ -64,11 +64,18 @@ class LinkOptions(Options):
 
 @dataclass(frozen=True)
 class VerifyOptions(Options):
-    """How the two-view geometry of a pair is estimated; the defaults are COLMAP's."""
+    """How matches are verified; the thresholds of two-view geometries are COLMAP's."""
 
     title: ClassVar[str] = "two-view geometry"
     colmap_prefix: ClassVar[str] = "TwoViewGeometry"
 
+    verify: Literal["auto", "joint", "pairs"] = option(
+        "auto",
+        "joint: estimate the poses of all images, as reconstruct does, and match what agrees with "
+        "them; pairs: verify each pair of images by itself, without a look at the pictures; auto: "
+        "joint where images are written or exist, else pairs",
+        common=True,
+    )
     max_error: float = option(
         4.0,
         "largest Sampson error (E, F) or transfer error (H) of an inlier, in pixels",

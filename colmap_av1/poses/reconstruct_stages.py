@@ -190,7 +190,7 @@ def _selected_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> l
             tracks = pose_tracks(run, own.tracks)
             fast = fast_frames(tracks)
             sparse = select_tracks(tracks.keep_frames(takes.of_video(video).frames), density)
-        path = run.sources[video].pictures.path
+        path = run.shown[video].video.path
         selected.append(SelectedTracks(path, sparse, own.inter_share, fast))
     return selected
 
@@ -210,8 +210,9 @@ def _match_images(
     keyed = takes.some(index)
 
     def cameras(paired: PairedImages) -> ImageCameras:
-        opened = [source.pictures for source in run.sources]
-        shapes = [shape_of(v, v.picture_size, v.display.pixel_aspect) for v in opened]
+        if run.cameras is not None:
+            return replace(run.cameras, of_images=[run.cameras.of_images[i] for i in index])
+        shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in run.shown]
         photos = run.inputs.photos
         if options.camera.camera_params is not None or len(index) == len(takes.take):
             return new_cameras(paired, keyed, shapes, photos, options.camera, context=context)

@@ -21,10 +21,11 @@ from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
+from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
-from colmap_av1.options import ReconstructOptions, RefineOptions, TrackingOptions
+from colmap_av1.options import EncodeOptions, ReconstructOptions, RefineOptions, TrackingOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource, count_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
@@ -54,22 +55,26 @@ class Run:
     Attributes:
         inputs: the videos and photos.
         sources: for each video, where its motion and pictures come from.
+        shown: for each video, how its pictures are looked at.
         output: the folder that is made.
         stages: the folder in it that holds what later runs resume from.
         options: options of every stage.
         clock: gets the time of each stage.
         progress: called in each stage.
         positions: where the images were taken; None before these are chosen.
+        cameras: of all images, where a database lists them; None: they are made anew.
     """
 
     inputs: Inputs
     sources: tuple[VideoSource, ...]
+    shown: tuple[ShownVideo, ...]
     output: Path
     stages: Path
     options: ReconstructOptions
     clock: Clock
     progress: Progress
     positions: ImagePositions | None = None
+    cameras: ImageCameras | None = None
 
     @property
     def context(self) -> RunContext:
@@ -89,9 +94,8 @@ class Run:
 
     def pictures(self, takes: Takes) -> Pictures:
         """What gives the pictures of images, see `pictures_of`."""
-        videos = [ShownVideo(own.pictures, kept=own.kept) for own in self.sources]
         photos = [photo.path for photo in self.inputs.photos]
-        return pictures_of(takes, videos, photos, self.options.match.reading)
+        return pictures_of(takes, self.shown, photos, self.options.match.reading)
 
 
 @dataclass(frozen=True)
@@ -131,6 +135,11 @@ class TracksResult:
     num_tracks: int
     read_out: float | None
     warnings: tuple[str, ...]
+
+
+def encoding_for_pictures(encode: EncodeOptions) -> EncodeOptions:
+    """How a video is converted if its pictures correct the poses: quickly by default."""
+    return replace(encode, effort="quick") if encode.effort == "auto" else encode
 
 
 def stage_of_video(run: Run, video: int) -> str:

@@ -24,10 +24,9 @@ from colmap_av1.geometry.posed_model import (
     reprojection_errors,
     write_posed_model,
 )
-from colmap_av1.geometry.track_points import seen_in, to_model_points, tracks_of_points
+from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.takes import Takes
-from colmap_av1.matching.image_matches import PairedImages, verify_images
-from colmap_av1.matching.pairs import covisible_pairs, image_keypoints, pair_matches
+from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.reconstruct_poses import (
@@ -43,6 +42,7 @@ from colmap_av1.poses.reconstruct_poses import (
     triangulate_in,
 )
 from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -88,7 +88,7 @@ def remap_stage(
 
     def make(partial: Path) -> RemappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
-        tracks = _tracks_of_model(known, takes)
+        tracks = tracks_of_model(known, takes)
         with run.clock.measure("poses"):
             found = _map_tracks(run, takes, known, tracks)
         poses = found if found is not None else known
@@ -119,24 +119,12 @@ def remap_stage(
     )
 
 
-def _tracks_of_model(model: PosedModel, takes: Takes) -> Tracks:
-    """The observations of a model's points as tracks through the frames of its images."""
-    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
-    frames = np.array([frame_of[image.name] for image in model.images], np.int32)
-    cameras = model.cameras.values()
-    size = max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
-    return tracks_of_points(model.points, frames, takes.num_frames, size)
-
-
 def _map_tracks(run: Run, takes: Takes, known: PosedModel, tracks: Tracks) -> PosedModel | None:
     """Map the images of a model by its tracks, with COLMAP's global mapper; None: it failed."""
     options = run.options
     cameras = [known.cameras[image.camera_id] for image in known.images]
-    keypoints = image_keypoints(tracks, posed_images_of(known, takes).frames.tolist())
-    pairs = covisible_pairs(keypoints, options.match.pairs.min_matches)
-    paired = PairedImages(
-        keypoints, pairs, [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs.tolist()]
-    )
+    frames = posed_images_of(known, takes).frames
+    paired = pair_by_tracks(tracks, frames, options.match.pairs.min_matches)
     matched = verify_images(paired, cameras, options.match.verify, run.context)
     with tempfile.TemporaryDirectory() as folder:
         database, models = Path(folder) / "database.db", Path(folder) / "models"
@@ -170,7 +158,7 @@ def _costs(
         takes: the images.
         known: the model, with points.
         found: poses of all its images, or of some.
-        tracks: the observations of the model, see `_tracks_of_model`.
+        tracks: the observations of the model, see `tracks_of_model`.
 
     Returns:
         The share of the observations in images of `found` that agree with it, and their mean robust

@@ -19,7 +19,6 @@ from colmap_av1.poses.reconstruct_poses import FROM_PICTURES, PosedImages, trian
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.progress import progress_in
 
 # Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
@@ -63,7 +62,7 @@ def _followed(
     """Corners followed through each video's images, whose pictures are kept."""
     image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
-    for video in range(len(run.sources)):
+    for video in range(len(run.shown)):
         own = np.flatnonzero(placed.take == video)
         if len(own) == 0:
             continue
@@ -72,13 +71,8 @@ def _followed(
         guide = tracks.keep_observations(np.isin(tracks.frame, placed.frames[own]))
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
-        decoded = decodable_frames(
-            run.sources[video].pictures,
-            num_frames,
-            run.options.match.reading,
-            wanted=mask_of,
-            use="corners are followed",
-            kept=run.sources[video].kept,
+        decoded = run.shown[video].pictures(
+            num_frames, run.options.match.reading, wanted=mask_of, use="corners are followed"
         )
         report = progress_in(run.progress, "refinement", len(own))
         density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()

@@ -23,7 +23,6 @@ from colmap_av1.poses.reconstruct_poses import FOR_POSES, PosedImages
 from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.progress import no_progress, progress_in
 
 # Images after the last that sees a point in which it is looked for: from farther away it looks
@@ -63,7 +62,7 @@ def follow_behind(
     """
     masks = placed.masks_with(moving)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
-    for video in range(len(run.sources)):
+    for video in range(len(run.shown)):
         own = np.flatnonzero(placed.take == video)
         frames = placed.frames[own]
         seen, view = seen_in(tracks, frames)
@@ -92,12 +91,12 @@ def _on_pictures(
     """Tracks of a video, of frames that are counted through, corrected on its pictures."""
     frame = tracks.frame - np.int32(first_frame)
     wanted = frozenset(np.unique(frame).tolist())
-    source = run.sources[video]
-    width, height = source.pictures.picture_size
+    shown = run.shown[video]
+    width, height = shown.size
     num_frames = max(wanted) + 1
     own = replace(tracks, frame=frame, num_frames=num_frames, width=width, height=height)
-    decoded = decodable_frames(
-        source.pictures, num_frames, run.options.match.reading, wanted=wanted, kept=source.kept
+    decoded = shown.pictures(
+        num_frames, run.options.match.reading, wanted=wanted, use="tracks are refined"
     )
     report = progress_in(run.progress, "refinement", len(wanted))
     found = refine_tracks(own, decoded, _LK, report, expected=expected)

@@ -1,0 +1,326 @@
+"""Matches that agree with one estimate of the poses of all images, for a COLMAP database.
+
+A pair of images cannot tell a drifted track from a good one: both agree with some epipolar
+geometry. The poses of all images can. So these are estimated as `reconstruct` does it, and what
+agrees with them is matched: the corners that the poses were adjusted on, and a spread selection of
+motion tracks. Few long tracks hold the images together; the others only have to become points, for
+which three observations are enough. This keeps the time of a mapper low.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.database.listed import listed_cameras
+from colmap_av1.database.reading import read_images
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
+from colmap_av1.geometry.track_points import seen_in
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.image_matches import PairedImages, verify_images
+from colmap_av1.matching.match_images import ImageMatches
+from colmap_av1.options import DensityOptions, TriangulateOptions
+from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
+from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
+from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks, pose_tracks
+from colmap_av1.poses.starting_pair import StartingPair, starting_pair
+from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
+from colmap_av1.tracks.selection import select_tracks, spread_observations
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.stages import Kept
+
+# A corner disagrees with the poses if its error is above so many pixels, and above so many times
+# the median error: a rolling shutter, say, moves all corners.
+_LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
+# Motion tracks become points if a mapper would make them: its smallest triangulation angle is the
+# default here, and a point of unknown depth is left out.
+_POINTS = TriangulateOptions(max_reprojection_error=1.0, max_depth_error=0.5, points="survey")
+# Motion tracks that keep all their observations: the longest, so many in each image.
+_WHOLE = DensityOptions(
+    preset="sparse", max_tracks_per_image=300, spacing=8.0, min_images=3, max_sigma=0.0
+)
+# Observations of each of the others.
+_FEW = 3
+# Tracks that the pair is matched by which a mapper begins with.
+_MOST_STARTING = 300
+# Images without a pose that a warning names.
+_NUM_NAMED = 4
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """What the estimate of all poses says.
+
+    Attributes:
+        num_registered: images with a pose.
+        far_views: median distance in pixels of what the pictures of images ten and more apart show
+            in common from where the poses put it; None where no such images see the same.
+        far_views_largest: the 90 % quantile of it over such pairs of images.
+        moving: share of the images' pixels that move by themselves and have no matches.
+    """
+
+    num_registered: int
+    far_views: float | None
+    far_views_largest: float | None
+    moving: float | None
+
+
+@dataclass(frozen=True)
+class JointMatches(ImageMatches):
+    """Matches of all images that agree with an estimate of their poses.
+
+    Attributes:
+        estimate: what the estimate says.
+        poses: float64 [3, 4] cam_from_world of each image; None of one that has no pose.
+    """
+
+    estimate: JointEstimate
+    poses: list[NDArray[np.float64] | None]
+
+
+def match_jointly(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    takes: Takes,
+    tracked: Sequence[Kept[TracksResult]],
+    density: DensityOptions,
+) -> JointMatches:
+    """Estimate the poses of all images, and match what agrees with them.
+
+    Images that the estimate leaves out are matched along all their tracks.
+
+    Args:
+        run: what every stage is given.
+        videos: the tracks and images of each video.
+        takes: all images.
+        tracked: what is kept of each video's tracks.
+        density: which motion tracks are matched.
+
+    Raises:
+        ModelError: the poses cannot be estimated, or pictures far apart contradict them.
+        VideoError: nothing connects any two images.
+    """
+    if density.max_sigma is None:
+        density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
+    posed = mended_poses(run, videos, takes, tracked)
+    far = posed.far_views.result if posed.far_views is not None else None
+    if far is not None and far.apart:
+        raise ModelError("pictures far apart in time contradict the poses")
+    known = read_posed_model(run.stages / posed.last.result.poses)
+    with run.clock.measure("pairs"):
+        agreeing = _agreeing_tracks(run, posed.tracks, known, takes, density)
+        paired = _paired(run, posed, takes, agreeing, density)
+    cameras = _cameras(run, takes, known)
+    matched = verify_images(paired, cameras, run.options.match.verify, run.context)
+    matches = posed.matches.result
+    pose_of = {image.name: image.cam_from_world for image in known.images}
+    left = [name for name in takes.images.names if name not in pose_of]
+    return JointMatches(
+        cameras=cameras,
+        focal_length=_focal_length(run, cameras[0], guessed=matches.guessed),
+        matched=matched,
+        links=matches.links,
+        link_tracks=posed.links,
+        num_tracks=paired.num_tracks,
+        warnings=(*matches.link_warnings, *_warnings(posed, left, len(takes.take))),
+        estimate=JointEstimate(
+            num_registered=len(known.images),
+            far_views=far.far_views if far is not None else None,
+            far_views_largest=far.far_views_largest if far is not None else None,
+            moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
+        ),
+        poses=[pose_of.get(name) for name in takes.images.names],
+    )
+
+
+@dataclass(frozen=True)
+class _Agreeing:
+    """Tracks that agree with the poses, in the images that have one.
+
+    Attributes:
+        placed: these images.
+        tracks: the tracks, with all observations that agree; first the corners, then motion.
+        num_corners: number of the corners.
+        start: the pair of images that a mapper is to begin with, and the tracks to match it by;
+            None: there is no such pair.
+    """
+
+    placed: PosedImages
+    tracks: Tracks
+    num_corners: int
+    start: StartingPair | None
+
+
+def _agreeing_tracks(
+    run: Run, tracks: Tracks, known: PosedModel, takes: Takes, density: DensityOptions
+) -> _Agreeing:
+    """The corners of a model and a selection of motion tracks, without what disagrees with it."""
+    placed = posed_images_of(known, takes)
+    every = pose_tracks(run, tracks).keep_frames(placed.frames)
+    corners, corner_points = _agreeing_corners(known, takes)
+    motion, motion_points = _agreeing_motion(run, select_tracks(every, density), placed)
+    both = Tracks.concatenate(corners, motion)
+    start = _start(both, np.concatenate([corner_points, motion_points]), placed)
+    if start is None:
+        wide, points = _agreeing_motion(run, every, placed)
+        start = _start(wide, points, placed)
+        if start is not None:
+            of_pair = np.zeros(wide.num_tracks, np.bool_)
+            of_pair[start.points] = True
+            first = both.num_tracks
+            both = Tracks.concatenate(both, wide.keep_tracks(of_pair))
+            start = replace(start, points=np.arange(first, both.num_tracks))
+    return _Agreeing(placed, both, corners.num_tracks, start)
+
+
+def _agreeing_corners(known: PosedModel, takes: Takes) -> tuple[Tracks, NDArray[np.float64]]:
+    """The tracks that a model was adjusted on, without what disagrees, and their points."""
+    errors = reprojection_errors(known)
+    adjusted = tracks_of_model(known, takes)
+    agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
+    enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _FEW
+    kept = adjusted.keep_observations(agrees & enough[adjusted.track])
+    return kept, known.points.xyz[enough]
+
+
+def _agreeing_motion(
+    run: Run, tracks: Tracks, placed: PosedImages
+) -> tuple[Tracks, NDArray[np.float64]]:
+    """Motion tracks that have a point, without what disagrees with the poses, and their points."""
+    seen, view = seen_in(tracks, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=_POINTS)
+    own = points.observation
+    agreeing = replace(
+        seen,
+        offsets=points.offsets,
+        frame=seen.frame[own],
+        xy=seen.xy[own],
+        sigma=seen.sigma[own],
+        confirmed=seen.confirmed[own],
+    )
+    return agreeing, points.xyz
+
+
+def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> StartingPair | None:
+    """The pair of images that a mapper is to begin with, see `starting_pair`."""
+    view = np.searchsorted(placed.frames, tracks.frame)
+    start = starting_pair(tracks.track, view, points, placed.images)
+    if start is None:
+        return None
+    step = -(-len(start.points) // _MOST_STARTING)
+    return replace(start, points=start.points[::step])
+
+
+def _kept_observations(agreeing: _Agreeing) -> NDArray[np.bool_]:
+    """Which observations are matched: few of most motion tracks, all of others.
+
+    Returns:
+        bool [num_observations].
+    """
+    tracks, lengths = agreeing.tracks, agreeing.tracks.lengths
+    is_motion = np.arange(tracks.num_tracks) >= agreeing.num_corners
+    kept = np.ones(tracks.num_observations, np.bool_)
+    motion = tracks.keep_tracks(is_motion)
+    if motion.num_tracks:
+        longest = spread_observations(motion, _WHOLE)
+        is_long = np.add.reduceat(longest, motion.offsets[:-1]) > 0
+        # The first, the last and the middle one, at the widest angles.
+        place = np.linspace(0.0, 1.0, _FEW) * (motion.lengths - 1)[:, None]
+        few = np.zeros(motion.num_observations, np.bool_)
+        few[(motion.offsets[:-1, None] + np.round(place).astype(np.int64)).ravel()] = True
+        of_motion = np.where(np.repeat(is_long, motion.lengths), longest, few)
+        kept[np.repeat(is_motion, lengths)] = of_motion
+    if agreeing.start is not None:
+        is_whole = np.zeros(tracks.num_tracks, np.bool_)
+        is_whole[agreeing.start.points] = True
+        kept |= np.repeat(is_whole, lengths)
+    return kept
+
+
+def _paired(
+    run: Run, posed: Posed, takes: Takes, agreeing: _Agreeing, density: DensityOptions
+) -> PairedImages:
+    """Match all images: those with a pose along what agrees with it, the others along all."""
+    frames, start = takes.images.frames, agreeing.start
+    matched = agreeing.tracks.keep_observations(_kept_observations(agreeing))
+    placed = agreeing.placed.frames
+    left = np.setdiff1d(frames, placed)
+    unplaced = [
+        _touching(own, left, frames)
+        for own in (
+            select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density),
+            posed.links,
+        )
+        if len(left)
+    ]
+    pair = list[int]()
+    if start is not None:
+        pair = np.searchsorted(frames, placed[[start.first, start.second]]).tolist()
+    paired = pair_by_tracks(
+        Tracks.concatenate(matched, *unplaced),
+        frames,
+        run.options.match.pairs.min_matches,
+        always=pair,
+    )
+    if start is None:
+        return paired
+    # No track has lost all its observations, so tracks are numbered as before.
+    number = int(np.flatnonzero((paired.pairs == pair).all(axis=1))[0])
+    matches = paired.matches[number]
+    track = paired.keypoints[pair[0]].track[matches[:, 0]]
+    matches_of = list(paired.matches)
+    matches_of[number] = matches[np.isin(track, start.points)]
+    return replace(paired, matches=matches_of)
+
+
+def _touching(tracks: Tracks, left: NDArray[np.int32], frames: NDArray[np.int32]) -> Tracks:
+    """The tracks that are seen in some of the frames, in all frames of images."""
+    if tracks.num_tracks == 0:
+        return tracks
+    seen = np.isin(tracks.frame, left)
+    return tracks.keep_tracks(np.add.reduceat(seen, tracks.offsets[:-1]) > 0).keep_frames(frames)
+
+
+def _cameras(run: Run, takes: Takes, known: PosedModel) -> list[pycolmap.Camera]:
+    """The camera of each image: adjusted, but those of a database that lists the images."""
+    if run.cameras is not None:
+        return run.cameras.of_images
+    database = run.output / "database.db"
+    listed = read_images(database)
+    names = [image.name for image in listed]
+    matched = dict(zip(names, listed_cameras(database, listed, names), strict=True))
+    adjusted = {image.name: known.cameras[image.camera_id] for image in known.images}
+    of_take: dict[int, pycolmap.Camera] = {}
+    for take, name in zip(takes.take.tolist(), takes.images.names, strict=True):
+        if name in matched:
+            # Models do not say whether a focal length was known.
+            is_known = matched[name].has_prior_focal_length
+            of_take[take] = adjusted.get(name, of_take.get(take, matched[name]))
+            of_take[take].has_prior_focal_length = is_known
+    return [of_take[take] for take in takes.take.tolist()]
+
+
+def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:
+    """The estimated focal length of the first video; None: it is given, or a guess."""
+    given = run.cameras is not None or run.options.match.camera.camera_params is not None
+    return None if given or guessed else float(camera.focal_length_y)
+
+
+def _warnings(posed: Posed, left: Sequence[str], num_images: int) -> list[str]:
+    """What the user should know of the estimate."""
+    warnings = []
+    if left:
+        names = ", ".join(f"'{name}'" for name in left[:_NUM_NAMED])
+        more = ", ..." if len(left) > _NUM_NAMED else ""
+        warnings.append(
+            f"{len(left)} of {num_images} images have no pose in the joint estimate and are "
+            f"matched by motion alone: {names}{more}"
+        )
+    if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
+        warnings.append(posed.adjustment.result.seams_warning)
+    return warnings

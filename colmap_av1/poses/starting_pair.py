@@ -1,0 +1,118 @@
+"""The pair of images that COLMAP's incremental mapper is to begin with, by known poses.
+
+The mapper begins with a pair of many inliers and a wide triangulation angle (the median over the
+inliers), and halves these limits where no pair meets them. On a drive, most of what two images
+share is far ahead: no pair has a wide angle, and the mapper may take one whose pose is wrong. The
+points beside the road do have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.matching.mapper_limits import (
+    INITIAL_MAX_FORWARD_MOTION,
+    INITIAL_MIN_ANGLE,
+    INITIAL_MIN_INLIERS,
+)
+from colmap_av1.util.spread import evenly_spread
+
+_Floats = NDArray[np.float64]
+
+# The mapper estimates pose and inliers anew: what only just meets its limits may fail.
+_MARGIN = 1.1
+_ENOUGH = round(1.5 * INITIAL_MIN_INLIERS)
+_FORWARD = INITIAL_MAX_FORWARD_MOTION - 0.02
+# Images that are tried as the first of a pair, and distances to the second, in images.
+_NUM_FIRST = 100
+_SPANS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56)
+
+
+@dataclass(frozen=True)
+class StartingPair:
+    """A pair of images to begin with.
+
+    Attributes:
+        first: index of the first image.
+        second: index of the second one.
+        points: int64 [n] the points to match the pair by, ascending.
+    """
+
+    first: int
+    second: int
+    points: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A pair of images, the points that both see, and the angles there in degrees."""
+
+    pair: tuple[int, int]
+    points: NDArray[np.int64]
+    angles: _Floats
+    is_forward: bool
+
+    def wide(self, angle: float) -> NDArray[np.int64]:
+        """The points to match the pair by, so that the median angle is wide enough."""
+        if np.median(self.angles) >= angle:
+            return self.points
+        return self.points[self.angles >= angle]
+
+
+def starting_pair(
+    point: NDArray[np.int64],
+    view: NDArray[np.int64],
+    xyz: _Floats,
+    images: list[ModelImage],
+) -> StartingPair | None:
+    """Find the pair that sees the most points at a wide angle, sideways if possible.
+
+    Args:
+        point: int64 [num_observations] the point of each observation, ascending.
+        view: int64 [num_observations] the image of each, by index.
+        xyz: float64 [num_points, 3] the points.
+        images: the images with their poses.
+
+    Returns:
+        The pair; None if the mapper would begin with none, whatever is matched.
+    """
+    candidates = list(_candidates(point, view, xyz, images))
+    for angle in (_MARGIN * INITIAL_MIN_ANGLE, _MARGIN * INITIAL_MIN_ANGLE / 2):
+        for forward in (False, True):
+            fit = [c for c in candidates if c.is_forward == forward]
+            counts = [len(c.wide(angle)) for c in fit]
+            if counts and max(counts) >= _ENOUGH:
+                best = fit[int(np.argmax(counts))]
+                return StartingPair(*best.pair, best.wide(angle))
+    return None
+
+
+def _candidates(
+    point: NDArray[np.int64], view: NDArray[np.int64], xyz: _Floats, images: list[ModelImage]
+) -> Iterator[_Candidate]:
+    poses = np.array([image.cam_from_world for image in images])
+    centres = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    by_view = np.argsort(view, kind="stable")
+    bounds = np.searchsorted(view[by_view], np.arange(1, len(images)))
+    seen = np.split(point[by_view], bounds)
+    for first in evenly_spread(len(images), min(len(images), _NUM_FIRST)):
+        for second in (first + span for span in _SPANS if first + span < len(images)):
+            common = np.intersect1d(seen[first], seen[second], assume_unique=True)
+            if len(common) < _ENOUGH:
+                break
+            rays = xyz[common] - centres[[first, second], None]
+            rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+            cosine = np.clip((rays[0] * rays[1]).sum(axis=1), -1.0, 1.0)
+            step = poses[second, 2, :3] @ (centres[second] - centres[first])
+            length = np.linalg.norm(centres[second] - centres[first])
+            yield _Candidate(
+                (first, second),
+                common,
+                np.degrees(np.arccos(cosine)),
+                bool(abs(step) > _FORWARD * length),
+            )

@@ -1,0 +1,43 @@
+"""Verified matches of images that share tracks, however far apart they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.posed_model import PosedModel
+from colmap_av1.geometry.track_points import tracks_of_points
+from colmap_av1.images.takes import Takes
+from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.pairs import covisible_pairs, image_keypoints, pair_matches
+from colmap_av1.tracks.tracks import Tracks
+
+
+def tracks_of_model(model: PosedModel, takes: Takes) -> Tracks:
+    """The observations of a model's points as tracks through the frames of its images."""
+    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    frames = np.array([frame_of[image.name] for image in model.images], np.int32)
+    cameras = model.cameras.values()
+    size = max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
+    return tracks_of_points(model.points, frames, takes.num_frames, size)
+
+
+def pair_by_tracks(
+    tracks: Tracks, frames: NDArray[np.int32], min_matches: int, *, always: Sequence[int] = ()
+) -> PairedImages:
+    """Match images along tracks, see `covisible_pairs`.
+
+    Args:
+        tracks: the tracks.
+        frames: int32 [num_images] the frame of each image, ascending.
+        min_matches: fewest tracks that the images of a pair share.
+        always: a pair (first, second) of images that is matched in any case; empty: none is.
+    """
+    keypoints = image_keypoints(tracks, frames.tolist())
+    pairs = covisible_pairs(keypoints, min_matches)
+    if always:
+        pairs = np.unique(np.vstack([pairs, np.array(always, np.int32)]), axis=0)
+    matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs.tolist()]
+    return PairedImages(keypoints, pairs, matches)
