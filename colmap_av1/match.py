@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
-from colmap_av1.errors import DatabaseError, ModelError, VideoError
+from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
 from colmap_av1.geometry.cameras import check_pixel_aspect
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.inputs import Inputs, read_inputs
@@ -27,7 +27,7 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
-from colmap_av1.matching.image_matches import MatchedImages, PairedImages
+from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.matching.match_images import (
@@ -208,7 +208,7 @@ def match(
         ImageError: images or names do not fit the video, or a photo cannot be read.
         DatabaseError: the database is locked, no COLMAP database, has features of its
             images and must not (`options.on_existing`), or does not fit the video.
-        OptionError: an option does not fit the videos or their images.
+        OptionError: an option does not fit the videos, their images or another option.
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress
@@ -265,7 +265,9 @@ def match(
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
-    if options.on_existing != "append":  # what a database holds already may join the images, too
+    # What a database holds already may join the images, too, and joint matches are fewer where all
+    # others are the same tracks in more images.
+    if options.on_existing != "append" and not isinstance(found, JointMatches):
         notes += matching_warnings(written, images.takes)
     return MatchReport(
         database=database,
@@ -279,8 +281,8 @@ def match(
         num_images=len(written.keypoints),
         num_written_images=num_written,
         masked=images.takes.masked,
-        num_tracks=found.num_tracks,
-        track_lengths=_length_quantiles(written),
+        num_tracks=len(found.track_lengths),
+        track_lengths=_length_quantiles(found.track_lengths),
         num_observations=sum(len(keypoints.xy) for keypoints in written.keypoints),
         focal_length=found.focal_length,
         read_outs=tuple(own.tracked.video.read_out for own in videos),
@@ -350,10 +352,15 @@ class _Images:
 
 
 def _is_joint(folder: Path | None, options: MatchOptions) -> bool:
-    """Whether matches are to agree with a joint estimate."""
+    """Whether matches are to agree with a joint estimate, which has one camera for a video."""
+    each = options.camera.single_camera is False
     if options.verify.verify == "auto":
-        # A camera of its own for each image is adjusted to the image's errors.
-        return folder is not None and options.camera.single_camera is not False
+        return folder is not None and not each
+    if options.verify.verify == "joint" and each:
+        raise OptionError(
+            "verify is 'joint', which estimates one camera for all images of a video: leave out "
+            "--single_camera, or give --verify pairs"
+        )
     return options.verify.verify == "joint"
 
 
@@ -425,13 +432,25 @@ def _match_images(
     """
     if scratch is None:
         return _match_pairs(images, cameras, options, context)
-    try:
-        return _match_jointly(images, cameras, scratch, options, context)
-    except (ModelError, VideoError) as error:
-        reason = f"each pair is verified by itself, as a joint estimate fails: {error}"
+    if cameras is not None and _has_several_cameras(images.takes, cameras):
+        reason = "the database has several cameras for the images of one video"
+    else:
+        try:
+            return _match_jointly(images, cameras, scratch, options, context)
+        except (ModelError, VideoError) as error:
+            reason = str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
-    return replace(found, warnings=(*found.warnings, reason))
+    warning = f"each pair is verified by itself, without a joint estimate: {reason}"
+    return replace(found, warnings=(*found.warnings, warning))
+
+
+def _has_several_cameras(takes: Takes, cameras: ImageCameras) -> bool:
+    of_videos = [
+        [cameras.of_images[image] for image in takes.images_of(video)]
+        for video in range(len(takes.videos))
+    ]
+    return any(camera is not own[0] for own in of_videos for camera in own)
 
 
 def _match_jointly(
@@ -541,10 +560,8 @@ def _with_selected_tracks(
     return replace(prepared, tracked=tracked.with_tracks(tracks))
 
 
-def _length_quantiles(matched: MatchedImages) -> dict[float, int]:
-    """Quantiles of the number of images that see each track; empty without a track."""
-    lengths = np.bincount(np.concatenate([own.track for own in matched.keypoints]))
-    lengths = lengths[lengths > 0]
+def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
+    """Quantiles of the lengths of tracks; empty without a track."""
     if len(lengths) == 0:
         return {}
     found = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")

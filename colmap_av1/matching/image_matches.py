@@ -39,9 +39,10 @@ class PairedImages:
     matches: list[NDArray[np.uint32]]
 
     @property
-    def num_tracks(self) -> int:
-        """Number of tracks that the keypoints belong to."""
-        return len(np.unique(np.concatenate([k.track for k in self.keypoints])))
+    def track_lengths(self) -> NDArray[np.int64]:
+        """Number of images that see each of the tracks that the keypoints belong to."""
+        counts = np.bincount(np.concatenate([k.track for k in self.keypoints]))
+        return counts[counts > 0].astype(np.int64)
 
 
 @dataclass(frozen=True)

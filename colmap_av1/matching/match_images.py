@@ -70,7 +70,8 @@ class ImageMatches:
         matched: keypoints, matches and two-view geometries, those of links included.
         links: what linking found.
         link_tracks: the links as tracks.
-        num_tracks: number of tracks of the videos that the images are matched along.
+        track_lengths: int64 [num_tracks] images that see each of the tracks that images are matched
+            along.
         warnings: warnings about the cameras and the links.
     """
 
@@ -79,7 +80,7 @@ class ImageMatches:
     matched: MatchedImages
     links: LinkReport
     link_tracks: Tracks
-    num_tracks: int
+    track_lengths: NDArray[np.int64]
     warnings: tuple[str, ...]
 
 
@@ -139,7 +140,7 @@ def match_images(
         matched=linked.matched,
         links=linked.report,
         link_tracks=linked.tracks,
-        num_tracks=paired.num_tracks,
+        track_lengths=paired.track_lengths,
         warnings=(*made.warnings, *linked.report.warnings),
     )
 

@@ -16,9 +16,9 @@ from colmap_av1.tracks.tracks import Tracks, order_by_frame
 # image, n growing with the span, so the number of pairs stays linear in the number of
 # images even where tracks live as long as the video.
 _UNTHINNED_SPAN = 64
-# Distance in images up to which all pairs that share tracks are taken, and the mean number of pairs
-# per image that all together may not exceed.
-_NEAR = 10
+# Distances in images at which all pairs that share tracks are taken.
+NEAR = tuple(range(1, 11))
+# Mean number of pairs per image that all together may not exceed by more than these.
 _MOST_PAIRS = 30
 
 
@@ -87,15 +87,23 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     ]
 
 
-def covisible_pairs(keypoints: Sequence[ImageKeypoints], min_matches: int) -> NDArray[np.int32]:
+def covisible_pairs(
+    keypoints: Sequence[ImageKeypoints],
+    min_matches: int,
+    *,
+    near: Sequence[int] = NEAR,
+    most_pairs: int = _MOST_PAIRS,
+) -> NDArray[np.int32]:
     """Choose image pairs that share tracks, at any distance, as where a place is seen again.
 
-    All neighbours up to ten images apart are paired. If the other pairs are too many, only the one
-    that shares the most tracks is kept of each group of similar pairs.
+    If the pairs are too many, only the one that shares the most tracks is kept of each group of
+    similar pairs.
 
     Args:
         keypoints: the keypoints of the images, in display order.
         min_matches: fewest tracks that the images of a pair share.
+        near: distances in images at which all pairs are kept.
+        most_pairs: mean number of pairs per image; more where those of `near` are more.
 
     Returns:
         int32 [m, 2] indices into `keypoints`, first < second, in ascending order.
@@ -109,7 +117,7 @@ def covisible_pairs(keypoints: Sequence[ImageKeypoints], min_matches: int) -> ND
     first, second = shared.coords
     kept = (first < second) & (shared.data >= min_matches)
     first, second, count = first[kept], second[kept], shared.data[kept]
-    near = second - first <= _NEAR
+    always = np.isin(second - first, near)
     step = 1
     while True:
         # The best pair of each square of pairs (first, second).
@@ -117,8 +125,8 @@ def covisible_pairs(keypoints: Sequence[ImageKeypoints], min_matches: int) -> ND
         order = np.lexsort((second, first, -count, square))
         best = np.zeros(len(first), np.bool_)
         best[order[np.unique(square[order], return_index=True)[1]]] = True
-        chosen = near | best
-        if np.count_nonzero(chosen) <= _MOST_PAIRS * len(keypoints):
+        chosen = always | best
+        if np.count_nonzero(chosen) <= most_pairs * len(keypoints) or step > len(keypoints):
             break
         step += 1
     pairs = np.column_stack([first[chosen], second[chosen]])

@@ -24,6 +24,7 @@ from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
+from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
 from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
@@ -42,10 +43,16 @@ _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
 _POINTS = TriangulateOptions(max_reprojection_error=1.0, max_depth_error=0.5, points="survey")
 # Motion tracks that keep all their observations: the longest, so many in each image.
 _WHOLE = DensityOptions(
-    preset="sparse", max_tracks_per_image=300, spacing=8.0, min_images=3, max_sigma=0.0
+    preset="sparse", max_tracks_per_image=150, spacing=8.0, min_images=3, max_sigma=0.0
 )
-# Observations of each of the others.
+# The others keep the first observation and those half and all of one of these distances later, in
+# images: pairs at such distances are matched.
+_SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
+_NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
+_MOST_PAIRS = 16
 _FEW = 3
+# Motion tracks of an image at most, by the preset of density; 0: any number.
+_MOST_MOTION = {"sparse": 450, "default": 900, "dense": 0}
 # Tracks that the pair is matched by which a mapper begins with.
 _MOST_STARTING = 300
 # Images without a pose that a warning names.
@@ -105,8 +112,6 @@ def match_jointly(
         ModelError: the poses cannot be estimated, or pictures far apart contradict them.
         VideoError: nothing connects any two images.
     """
-    if density.max_sigma is None:
-        density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
     posed = mended_poses(run, videos, takes, tracked)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
@@ -126,7 +131,7 @@ def match_jointly(
         matched=matched,
         links=matches.links,
         link_tracks=posed.links,
-        num_tracks=paired.num_tracks,
+        track_lengths=paired.track_lengths,
         warnings=(*matches.link_warnings, *_warnings(posed, left, len(takes.take))),
         estimate=JointEstimate(
             num_registered=len(known.images),
@@ -163,7 +168,9 @@ def _agreeing_tracks(
     placed = posed_images_of(known, takes)
     every = pose_tracks(run, tracks).keep_frames(placed.frames)
     corners, corner_points = _agreeing_corners(known, takes)
-    motion, motion_points = _agreeing_motion(run, select_tracks(every, density), placed)
+    # Which have drifted the poses tell; how many there may be depends on how much of each is kept.
+    some = select_tracks(every, replace(density, max_tracks_per_image=0, max_sigma=0.0))
+    motion, motion_points = _agreeing_motion(run, some, placed)
     both = Tracks.concatenate(corners, motion)
     start = _start(both, np.concatenate([corner_points, motion_points]), placed)
     if start is None:
@@ -216,30 +223,59 @@ def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> 
     return replace(start, points=start.points[::step])
 
 
-def _kept_observations(agreeing: _Agreeing) -> NDArray[np.bool_]:
+def _kept_observations(agreeing: _Agreeing, density: DensityOptions) -> NDArray[np.bool_]:
     """Which observations are matched: few of most motion tracks, all of others.
 
     Returns:
         bool [num_observations].
     """
-    tracks, lengths = agreeing.tracks, agreeing.tracks.lengths
-    is_motion = np.arange(tracks.num_tracks) >= agreeing.num_corners
+    tracks = agreeing.tracks
     kept = np.ones(tracks.num_observations, np.bool_)
-    motion = tracks.keep_tracks(is_motion)
+    is_motion = np.repeat(np.arange(tracks.num_tracks) >= agreeing.num_corners, tracks.lengths)
+    motion = tracks.keep_observations(is_motion)
     if motion.num_tracks:
         longest = spread_observations(motion, _WHOLE)
         is_long = np.add.reduceat(longest, motion.offsets[:-1]) > 0
-        # The first, the last and the middle one, at the widest angles.
-        place = np.linspace(0.0, 1.0, _FEW) * (motion.lengths - 1)[:, None]
-        few = np.zeros(motion.num_observations, np.bool_)
-        few[(motion.offsets[:-1, None] + np.round(place).astype(np.int64)).ravel()] = True
-        of_motion = np.where(np.repeat(is_long, motion.lengths), longest, few)
-        kept[np.repeat(is_motion, lengths)] = of_motion
+        few = _first_middle_last(motion, np.searchsorted(agreeing.placed.frames, motion.frame))
+        few[np.repeat(is_long, motion.lengths)] = False
+        most = density.max_tracks_per_image
+        limits = replace(
+            density,
+            max_tracks_per_image=_MOST_MOTION[density.preset] if most is None else most,
+            max_sigma=0.0,
+        )
+        few[few] = spread_observations(motion.keep_observations(few), limits)
+        kept[is_motion] = longest | few
     if agreeing.start is not None:
         is_whole = np.zeros(tracks.num_tracks, np.bool_)
         is_whole[agreeing.start.points] = True
-        kept |= np.repeat(is_whole, lengths)
+        kept |= np.repeat(is_whole, tracks.lengths)
     return kept
+
+
+def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Three observations of each track, so far apart that pairs of these images are matched.
+
+    Args:
+        tracks: tracks of three and more observations.
+        view: int64 [num_observations] the image of each, by index.
+    """
+    first = tracks.offsets[:-1]
+    begin, end = view[first], view[tracks.offsets[1:] - 1]
+    span = np.array((1, *_SPANS))[np.searchsorted(_SPANS, end - begin, side="right")]
+    # Observations are in the order of tracks, and of images in these.
+    num_views = int(view.max()) + 1
+    place = tracks.track * num_views + view
+    number = np.arange(tracks.num_tracks)[:, None]
+    at = begin[:, None] + np.column_stack([0 * span, span // 2, span])
+    wanted = np.searchsorted(place, number * num_views + at)
+    there = np.take(place, wanted, mode="clip") == number * num_views + at
+    middle = first + (tracks.lengths - 1) // 2
+    ends = np.column_stack([first, middle, tracks.offsets[1:] - 1])
+    index = np.where(there.all(axis=1, keepdims=True) & (span > 1)[:, None], wanted, ends)
+    chosen = np.zeros(tracks.num_observations, np.bool_)
+    chosen[index.ravel()] = True
+    return chosen
 
 
 def _paired(
@@ -247,7 +283,8 @@ def _paired(
 ) -> PairedImages:
     """Match all images: those with a pose along what agrees with it, the others along all."""
     frames, start = takes.images.frames, agreeing.start
-    matched = agreeing.tracks.keep_observations(_kept_observations(agreeing))
+    kept = _kept_observations(agreeing, density)
+    matched = agreeing.tracks.keep_observations(kept)
     placed = agreeing.placed.frames
     left = np.setdiff1d(frames, placed)
     unplaced = [
@@ -261,21 +298,25 @@ def _paired(
     pair = list[int]()
     if start is not None:
         pair = np.searchsorted(frames, placed[[start.first, start.second]]).tolist()
-    paired = pair_by_tracks(
-        Tracks.concatenate(matched, *unplaced),
-        frames,
-        run.options.match.pairs.min_matches,
-        always=pair,
-    )
+
+    def choose(keypoints: list[ImageKeypoints]) -> NDArray[np.int32]:
+        min_matches = run.options.match.pairs.min_matches
+        pairs = covisible_pairs(keypoints, min_matches, near=_NEAR, most_pairs=_MOST_PAIRS)
+        if start is None:
+            return pairs
+        return np.unique(np.vstack([pairs, np.array(pair, np.int32)]), axis=0)
+
+    paired = pair_by_tracks(Tracks.concatenate(matched, *unplaced), frames, choose)
     if start is None:
         return paired
-    # No track has lost all its observations, so tracks are numbered as before.
+    # Tracks are numbered anew where some keep no observation.
+    is_kept = np.add.reduceat(kept, agreeing.tracks.offsets[:-1]) > 0
+    wide = np.cumsum(is_kept)[start.points] - 1
     number = int(np.flatnonzero((paired.pairs == pair).all(axis=1))[0])
-    matches = paired.matches[number]
-    track = paired.keypoints[pair[0]].track[matches[:, 0]]
-    matches_of = list(paired.matches)
-    matches_of[number] = matches[np.isin(track, start.points)]
-    return replace(paired, matches=matches_of)
+    matches = list(paired.matches)
+    track = paired.keypoints[pair[0]].track[matches[number][:, 0]]
+    matches[number] = matches[number][np.isin(track, wide)]
+    return replace(paired, matches=matches)
 
 
 def _touching(tracks: Tracks, left: NDArray[np.int32], frames: NDArray[np.int32]) -> Tracks:

@@ -129,7 +129,7 @@ def match_stage(
             links=found.links,
             link_warnings=found.warnings,
             key_images=tuple(index),
-            num_pose_tracks=found.num_tracks,
+            num_pose_tracks=len(found.track_lengths),
             guessed=not all(camera.has_prior_focal_length for camera in of_videos),
             forward_motion=matched.forward_motion,
             num_pairs=len(configs),

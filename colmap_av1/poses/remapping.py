@@ -27,6 +27,7 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import verify_images
+from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.reconstruct_poses import (
@@ -124,7 +125,8 @@ def _map_tracks(run: Run, takes: Takes, known: PosedModel, tracks: Tracks) -> Po
     options = run.options
     cameras = [known.cameras[image.camera_id] for image in known.images]
     frames = posed_images_of(known, takes).frames
-    paired = pair_by_tracks(tracks, frames, options.match.pairs.min_matches)
+    min_matches = options.match.pairs.min_matches
+    paired = pair_by_tracks(tracks, frames, lambda own: covisible_pairs(own, min_matches))
     matched = verify_images(paired, cameras, options.match.verify, run.context)
     with tempfile.TemporaryDirectory() as folder:
         database, models = Path(folder) / "database.db", Path(folder) / "models"

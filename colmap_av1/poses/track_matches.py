@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import PairedImages
-from colmap_av1.matching.pairs import covisible_pairs, image_keypoints, pair_matches
+from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches
 from colmap_av1.tracks.tracks import Tracks
+
+Pairs = NDArray[np.int32]
 
 
 def tracks_of_model(model: PosedModel, takes: Takes) -> Tracks:
@@ -25,19 +27,16 @@ def tracks_of_model(model: PosedModel, takes: Takes) -> Tracks:
 
 
 def pair_by_tracks(
-    tracks: Tracks, frames: NDArray[np.int32], min_matches: int, *, always: Sequence[int] = ()
+    tracks: Tracks, frames: NDArray[np.int32], choose: Callable[[list[ImageKeypoints]], Pairs]
 ) -> PairedImages:
-    """Match images along tracks, see `covisible_pairs`.
+    """Match images along tracks.
 
     Args:
         tracks: the tracks.
         frames: int32 [num_images] the frame of each image, ascending.
-        min_matches: fewest tracks that the images of a pair share.
-        always: a pair (first, second) of images that is matched in any case; empty: none is.
+        choose: chooses the pairs, int32 [m, 2], by the keypoints, see `covisible_pairs`.
     """
     keypoints = image_keypoints(tracks, frames.tolist())
-    pairs = covisible_pairs(keypoints, min_matches)
-    if always:
-        pairs = np.unique(np.vstack([pairs, np.array(always, np.int32)]), axis=0)
+    pairs = choose(keypoints)
     matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs.tolist()]
     return PairedImages(keypoints, pairs, matches)

@@ -175,7 +175,7 @@ def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixtur
             "on_existing",
             "encoder",
         ),
-        *("refine", "preset", "links", "camera_model", "camera_params", "num_threads"),
+        *("refine", "preset", "links", "verify", "camera_model", "camera_params", "num_threads"),
     }
 
 

@@ -24,13 +24,13 @@ from colmap_av1.images.choosing import (
     skip_blurred,
 )
 from colmap_av1.match import MatchReport, match
-from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions
+from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import frame_times
 
 # Every track is used, so one that an image sees does not depend on the other images.
-DENSE = MatchOptions(density=DensityOptions(preset="dense"))
+DENSE = MatchOptions(density=DensityOptions(preset="dense"), verify=VerifyOptions(verify="pairs"))
 LOSSLESS = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "0", "-crf", "1"]
 
 

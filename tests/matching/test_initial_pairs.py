@@ -147,3 +147,18 @@ def test_camera_adjusted_far_off() -> None:
             demote_bad_initial_pairs(alone, [GUESSED] * 2, Clock()).geometries[0] is geometries[0]
         )
     assert num_demoted > 5
+
+
+def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
+    rng = np.random.default_rng(3)
+    keypoints, matches = turned_views(0.5, 0.3, 300, rng)
+    geometry = verified(keypoints, matches)
+    matched = MatchedImages(keypoints, PAIR, [matches], [geometry], False)
+    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    for angle, is_kept in ((0, True), (10, False)):
+        wrong = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+        poses = [np.eye(3, 4), np.hstack([wrong @ turn, [[0], [0], [1]]])]
+        (found,) = demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock(), poses).geometries
+        count = len(found.inlier_matches)
+        assert (count == len(geometry.inlier_matches)) == is_kept
+        assert count >= 40

@@ -28,6 +28,7 @@ from colmap_av1.geometry.triangulation import (
     triangulate,
 )
 from colmap_av1.images.masks import mask_tracks
+from colmap_av1.images.takes import ShownVideo
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
@@ -327,7 +328,10 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     )
     inputs: Any = None  # for stages before
     folder = tmp_path_factory.mktemp("passed")
-    run = Run(*(inputs, (source,), folder, folder, ReconstructOptions(), Clock(), no_progress))
+    shown = (ShownVideo.as_played(video),)
+    run = Run(
+        *(inputs, (source,), shown, folder, folder, ReconstructOptions()), Clock(), no_progress
+    )
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)
     moving = dict(zip(names, masks, strict=True))

@@ -1,0 +1,196 @@
+"""Matches that agree with an estimate of all poses."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from dense_scene import SCENE, Truth
+
+from colmap_av1.database.reading import read_cameras
+from colmap_av1.errors import OptionError
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.geometry.colmap_model import ModelImage, read_model
+from colmap_av1.match import MatchReport, match
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    LinkOptions,
+    MatchOptions,
+    RunOptions,
+    VerifyOptions,
+)
+from colmap_av1.poses.starting_pair import starting_pair
+from colmap_av1.video.decoding import decode_frames
+
+EVERY = 3
+OPTIONS = MatchOptions(images=ImageOptions(every=EVERY))
+
+
+def by_pairs(options: MatchOptions) -> MatchOptions:
+    return replace(options, verify=VerifyOptions(verify="pairs"))
+
+
+def mapped(database: Path, images: Path) -> pycolmap.Reconstruction:
+    """What COLMAP's incremental mapper writes to folder 0."""
+    output = database.with_suffix(".models")
+    output.mkdir()
+    # pycolmap brings a database to its own layout.
+    copy = shutil.copyfile(database, output / "copy.db")
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
+    pycolmap.incremental_mapping(copy, images, output, options=options)
+    return read_model(output / "0")
+
+
+def num_keypoints(database: Path) -> dict[str, int]:
+    with sqlite3.connect(database) as connection:
+        return dict(
+            connection.execute("SELECT name, rows FROM images JOIN keypoints USING (image_id)")
+        )
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
+    folder = tmp_path_factory.mktemp("joint")
+    return match(folder / "a.db", SCENE, image_path=folder / "images", options=OPTIONS)
+
+
+def test_a_mapper_gets_fewer_keypoints_and_ends_nearer_to_the_truth(
+    joint: MatchReport, truth: Truth, tmp_path: Path
+) -> None:
+    images = joint.image_path
+    assert images is not None
+    assert joint.estimate is not None
+    assert joint.estimate.num_registered == joint.num_images
+    assert joint.warnings == ()
+    other = match(tmp_path / "b.db", SCENE, image_path=images, options=by_pairs(OPTIONS))
+    assert other.estimate is None
+    assert joint.num_observations < 0.6 * other.num_observations
+    errors = []
+    for database in (joint.database, other.database):
+        model = mapped(database, images)
+        assert model.num_reg_images() == joint.num_images
+        found = pose_errors(model_poses(model, len(truth.cam_from_world)), truth.cam_from_world)
+        assert found is not None
+        errors.append(found.ate)
+    assert errors[0] < errors[1]
+
+
+def test_the_camera_is_that_of_the_estimate(joint: MatchReport, truth: Truth) -> None:
+    assert joint.focal_length == pytest.approx(truth.camera.focal_length_x, rel=0.005)
+    (camera,) = read_cameras(joint.database).values()
+    assert camera.has_prior_focal_length
+    assert camera.focal_length_x == pytest.approx(joint.focal_length)
+
+
+def test_the_same_database_again(joint: MatchReport, tmp_path: Path) -> None:
+    one = replace(OPTIONS, run=RunOptions(num_threads=1))
+    match(tmp_path / "a.db", SCENE, image_path=joint.image_path, options=one)
+    dumps = []
+    for path in (joint.database, tmp_path / "a.db"):
+        with sqlite3.connect(path) as connection:
+            dumps.append(list(connection.iterdump()))
+    assert dumps[0] == dumps[1]
+
+
+def test_images_of_half_the_size(joint: MatchReport, truth: Truth, tmp_path: Path) -> None:
+    assert joint.image_path is not None
+    halves = tmp_path / "halves"
+    halves.mkdir()
+    for path in joint.image_path.iterdir():
+        picture = cv2.imread(str(path))
+        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(halves / f"half_{path.name}"), half)
+    report = match(tmp_path / "a.db", SCENE, image_path=halves, options=OPTIONS)
+    assert report.estimate is not None
+    assert report.estimate.num_registered == joint.num_images
+    assert report.focal_length == pytest.approx(truth.camera.focal_length_x / 2, rel=0.01)
+
+
+def test_too_few_images_for_an_estimate(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("0\n4\n")
+    options = MatchOptions(
+        images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
+        density=DensityOptions(min_images=2),
+    )
+    report = match(tmp_path / "a.db", SCENE, image_path=tmp_path / "images", options=options)
+    assert report.estimate is None
+    assert any("joint estimate" in warning for warning in report.warnings)
+    match(tmp_path / "b.db", SCENE, options=by_pairs(options))
+    assert num_keypoints(tmp_path / "a.db") == num_keypoints(tmp_path / "b.db")
+
+
+def test_a_camera_for_each_image(joint: MatchReport, tmp_path: Path) -> None:
+    assert joint.image_path is not None
+    database = tmp_path / "listed.db"
+    with pycolmap.Database.open(database):  # makes the file
+        pass
+    pycolmap.import_images(database, joint.image_path, pycolmap.CameraMode.PER_IMAGE)
+    report = match(database, SCENE, image_path=joint.image_path)
+    assert report.estimate is None
+    assert any("several cameras" in warning for warning in report.warnings)
+    options = replace(OPTIONS, verify=VerifyOptions(verify="joint"))
+    options = replace(options, camera=CameraOptions(single_camera=False))
+    with pytest.raises(OptionError, match="single_camera"):
+        match(tmp_path / "new.db", SCENE, image_path=joint.image_path, options=options)
+
+
+def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
+    assert {path.name for path in joint.database.parent.iterdir()} >= {"a.db", "images"}
+    assert not [p for p in joint.database.parent.iterdir() if p.name.startswith(".")]
+
+
+def test_images_without_a_pose_keep_their_matches(
+    encode: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Of two scenes, an estimate holds the larger one."""
+    pictures = [picture for _, picture in decode_frames(SCENE)]
+    frames = np.stack([*pictures[:26], *(p[:, ::-1] for p in pictures[40:58])])
+    both = encode(frames, tmp_path / "both.mp4")
+    options = MatchOptions(links=LinkOptions(links="none"))
+    report = match(tmp_path / "a.db", both, image_path=tmp_path / "images", options=options)
+    assert report.estimate is not None
+    left = report.num_images - report.estimate.num_registered
+    assert left >= 15
+    assert any(f"{left} of {report.num_images} images" in warning for warning in report.warnings)
+    assert min(num_keypoints(report.database).values()) > 100
+    models = tmp_path / "models"
+    models.mkdir()
+    found = pycolmap.incremental_mapping(report.database, report.image_path, models)
+    registered = sorted(model.num_reg_images() for model in found.values())
+    assert sum(registered) >= report.num_images - 2
+    assert len(registered) == 2
+
+
+def images_ahead(count: int) -> list[ModelImage]:
+    """A camera that moves along its axis."""
+    poses = [np.hstack([np.eye(3), [[0], [0], [-1.0 * i]]]) for i in range(count)]
+    return [ModelImage(i + 1, f"{i}.png", 1, pose) for i, pose in enumerate(poses)]
+
+
+def test_a_drive_begins_by_what_lies_beside_the_road() -> None:
+    rng = np.random.default_rng(0)
+    images = images_ahead(12)
+    far = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.uniform(100, 200, 2000)])
+    near = np.column_stack([rng.uniform(3, 5, (400, 2)), rng.uniform(14, 25, 400)])
+    xyz = np.concatenate([far, near])
+    point = np.repeat(np.arange(len(xyz)), len(images))
+    view = np.tile(np.arange(len(images)), len(xyz))
+    start = starting_pair(point, view, xyz, images)
+    assert start is not None
+    assert len(start.points) >= 150
+    assert (start.points >= len(far)).all()
+    rays = xyz[start.points, None] - np.array([[0, 0, start.first], [0, 0, start.second]])
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    angles = np.degrees(np.arccos((rays[:, 0] * rays[:, 1]).sum(axis=1)))
+    assert np.median(angles) > 8
+    only = point < len(far)
+    assert starting_pair(point[only], view[only], far, images) is None
