@@ -112,6 +112,8 @@ def match_jointly(
         ModelError: the poses cannot be estimated, or pictures far apart contradict them.
         VideoError: nothing connects any two images.
     """
+    if density.max_sigma is None:
+        density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
     posed = mended_poses(run, videos, takes, tracked)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
@@ -168,8 +170,8 @@ def _agreeing_tracks(
     placed = posed_images_of(known, takes)
     every = pose_tracks(run, tracks).keep_frames(placed.frames)
     corners, corner_points = _agreeing_corners(known, takes)
-    # Which have drifted the poses tell; how many there may be depends on how much of each is kept.
-    some = select_tracks(every, replace(density, max_tracks_per_image=0, max_sigma=0.0))
+    # How many there may be depends on how much of each is kept.
+    some = select_tracks(every, replace(density, max_tracks_per_image=0))
     motion, motion_points = _agreeing_motion(run, some, placed)
     both = Tracks.concatenate(corners, motion)
     start = _start(both, np.concatenate([corner_points, motion_points]), placed)
@@ -242,7 +244,6 @@ def _kept_observations(agreeing: _Agreeing, density: DensityOptions) -> NDArray[
         limits = replace(
             density,
             max_tracks_per_image=_MOST_MOTION[density.preset] if most is None else most,
-            max_sigma=0.0,
         )
         few[few] = spread_observations(motion.keep_observations(few), limits)
         kept[is_motion] = longest | few

@@ -80,9 +80,8 @@ def test_a_start_counts_that_explains_nearly_all_observations_better() -> None:
     assert not result(kept=0.5, new_cost=0.1).is_better
 
 
-def tracks_of_lengths(length: int) -> Tracks:
+def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
     """Twenty tracks that begin in each frame and last as long."""
-    num_frames = 60
     first = np.repeat(np.arange(num_frames), 20)
     frames = [np.arange(f, min(num_frames, f + length)) for f in first.tolist()]
     count = sum(map(len, frames))
@@ -106,3 +105,14 @@ def test_frames_are_fast_where_tracks_end_soon() -> None:
 def test_frames_after_the_last_image_are_not_fast() -> None:
     images = np.arange(0, 60, 8, dtype=np.int32)
     assert not fast_frames(tracks_of_lengths(40).keep_frames(images)).any()
+
+
+def test_a_drive_whose_tracks_end_evenly_is_not_fast() -> None:
+    """As on a road at ten frames a second, where a fifth of the tracks lasts."""
+    short, long = tracks_of_lengths(6, 160), tracks_of_lengths(40, 160)
+    middle = np.arange(50, 110, dtype=np.int32)
+    drive = Tracks.concatenate(long, *[short] * 20).subsample_frames(middle)
+    assert not fast_frames(drive).any()
+    # A turn in it makes the whole stretch fast.
+    turn = short.keep_tracks(abs(short.frame[short.offsets[:-1]] - 80) < 10)
+    assert fast_frames(Tracks.concatenate(drive, *[turn.subsample_frames(middle)] * 40)).all()
