@@ -20,7 +20,7 @@ from colmap_av1.images.preparing import check_fit
 from colmap_av1.images.takes import ShownVideo
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
-from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
+from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
     encoding_for_pictures,
@@ -243,7 +243,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
     positions = image_positions(takes, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
-    posed = mended_poses(run, videos, takes, tracked)
+    posed = estimate_poses(run, videos, takes, tracked)
     del videos  # as large as the tracks that the poses agree with
     placed, written = written_model(run, posed, takes)
     further, unplaced = further_models(run, posed, takes)

@@ -26,7 +26,7 @@ from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.reconstruct_posed import Posed, mended_poses
+from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
 from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks, pose_tracks
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
@@ -114,7 +114,7 @@ def match_jointly(
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
-    posed = mended_poses(run, videos, takes, tracked)
+    posed = estimate_poses(run, videos, takes, tracked)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("pictures far apart in time contradict the poses")
@@ -329,7 +329,10 @@ def _touching(tracks: Tracks, left: NDArray[np.int32], frames: NDArray[np.int32]
 
 
 def _cameras(run: Run, takes: Takes, known: PosedModel) -> list[pycolmap.Camera]:
-    """The camera of each image: adjusted, but those of a database that lists the images."""
+    """The camera of each image: adjusted if a focal length is known, else the guess it began with.
+
+    Those of a database that lists the images stay as they are.
+    """
     if run.cameras is not None:
         return run.cameras.of_images
     database = run.output / "database.db"
@@ -339,11 +342,13 @@ def _cameras(run: Run, takes: Takes, known: PosedModel) -> list[pycolmap.Camera]
     adjusted = {image.name: known.cameras[image.camera_id] for image in known.images}
     of_take: dict[int, pycolmap.Camera] = {}
     for take, name in zip(takes.take.tolist(), takes.images.names, strict=True):
-        if name in matched:
-            # Models do not say whether a focal length was known.
-            is_known = matched[name].has_prior_focal_length
-            of_take[take] = adjusted.get(name, of_take.get(take, matched[name]))
-            of_take[take].has_prior_focal_length = is_known
+        if name not in matched:
+            continue
+        if matched[name].has_prior_focal_length and name in adjusted:
+            of_take[take] = adjusted[name]
+            of_take[take].has_prior_focal_length = True  # models do not say so
+        else:
+            of_take.setdefault(take, matched[name])
     return [of_take[take] for take in takes.take.tolist()]
 
 

@@ -93,7 +93,7 @@ class _ToMend:
     apart: bool
 
 
-def mended_poses(
+def estimate_poses(
     run: Run,
     videos: Sequence[VideoTracks],
     takes: Takes,

@@ -18,7 +18,13 @@ from colmap_av1.errors import VideoError
 from colmap_av1.match import match
 from colmap_av1.motion.info import inspect
 from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import CameraOptions, DensityOptions, ImageOptions, MatchOptions
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    MatchOptions,
+    VerifyOptions,
+)
 from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import (
@@ -31,7 +37,8 @@ from colmap_av1.video.display import (
 from colmap_av1.video.facts import read_video
 
 # The presets choose tracks by cells of the picture, which are not those of a cut or scaled one.
-ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"))
+PAIRS = VerifyOptions(verify="pairs")
+ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"), verify=PAIRS)
 TURNS = [
     ((a, 0), (0, d)) if not swapped else ((0, a), (d, 0))
     for swapped in (False, True)
@@ -153,7 +160,9 @@ def test_example_clip_turned(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     plain = PROJECT / "examples" / "scene.mp4"
     turned = ffmpeg("-display_rotation", "270", "-i", plain, "-c", "copy", tmp_path / "t.mp4")
     # Cells that fit both sides of the picture are turned with it.
-    options = MatchOptions(images=ImageOptions(every=15), density=DensityOptions(spacing=8))
+    options = MatchOptions(
+        images=ImageOptions(every=15), density=DensityOptions(spacing=8), verify=PAIRS
+    )
     for name, video in (("plain", plain), ("turned", turned)):
         match(tmp_path / f"{name}.db", video, image_path=tmp_path / name, options=options)
     width, height = 640, 360
