@@ -300,10 +300,12 @@ def link_images(
     else:
         nothing = Tracks.empty(takes.num_frames, _largest_size(cameras))
         linked = LinkedImages(matched, nothing, _with_parts(LinkReport(), matched, takes))
-    if linked.report.frames_of_gaps("few tracks") and not plan.loop:
+    if linked.report.frames_of_gaps("no overlap" if plan.loop else "few tracks"):
         # What lies on either side of a cut may continue anywhere in the videos.
-        plan = replace(plan, loop=_spread_over_videos(takes, matched, images_apart))
-        linked = link(plan)
+        loop = sorted({*plan.loop, *_spread_over_videos(takes, matched, images_apart)})
+        if loop != plan.loop:
+            plan = replace(plan, loop=loop)
+            linked = link(plan)
     few = linked.report.frames_of_gaps("few tracks")
     if plan.effort == "light" and plan.wanted and (few or linked.report.parts):
         linked = link(thorough_plan(plan, takes))
