@@ -238,7 +238,8 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        poses = found.poses if isinstance(found, JointMatches) else ()
+        # Listed cameras may be guesses, which leave the poses of pairs wrong.
+        poses = found.poses if isinstance(found, JointMatches) and not listed else ()
         written = demote_bad_initial_pairs(found.matched, found.cameras, clock, poses)
         num_written, blurred = 0, list[str]()
         if folder is not None:

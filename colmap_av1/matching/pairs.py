@@ -118,6 +118,7 @@ def covisible_pairs(
     kept = (first < second) & (shared.data >= min_matches)
     first, second, count = first[kept], second[kept], shared.data[kept]
     always = np.isin(second - first, near)
+    most = max(most_pairs * len(keypoints), np.count_nonzero(always) + len(keypoints))
     step = 1
     while True:
         # The best pair of each square of pairs (first, second).
@@ -126,7 +127,7 @@ def covisible_pairs(
         best = np.zeros(len(first), np.bool_)
         best[order[np.unique(square[order], return_index=True)[1]]] = True
         chosen = always | best
-        if np.count_nonzero(chosen) <= most_pairs * len(keypoints) or step > len(keypoints):
+        if np.count_nonzero(chosen) <= most or step > len(keypoints):
             break
         step += 1
     pairs = np.column_stack([first[chosen], second[chosen]])

@@ -244,6 +244,7 @@ def _kept_observations(agreeing: _Agreeing, density: DensityOptions) -> NDArray[
         limits = replace(
             density,
             max_tracks_per_image=_MOST_MOTION[density.preset] if most is None else most,
+            min_images=_FEW,
         )
         few[few] = spread_observations(motion.keep_observations(few), limits)
         kept[is_motion] = longest | few
