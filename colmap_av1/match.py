@@ -94,8 +94,8 @@ class MatchReport:
         forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
             with no pair unless its options allow that, and the focal length cannot be found.
         links: what connects images where motion does not.
-        estimate: what the joint estimate says that the matches agree with; None: each pair was
-            verified by itself.
+        estimate: summary of the joint estimate of all poses that matches were verified against;
+            None: they were verified pair by pair.
         seconds: wall time of each stage.
         warnings: what the user should know, such as damage of the stream.
     """
@@ -442,7 +442,7 @@ def _match_images(
             reason = str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
-    warning = f"each pair is verified by itself, without a joint estimate: {reason}"
+    warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
 
 
@@ -500,7 +500,7 @@ def _match_pairs(
     options: MatchOptions,
     context: RunContext,
 ) -> ImageMatches:
-    """Match the images along their tracks, each pair by itself."""
+    """Match the images along their tracks, and verify the matches pair by pair."""
     takes, videos = images.takes, images.videos
     shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in images.shown]
 

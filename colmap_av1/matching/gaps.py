@@ -47,11 +47,11 @@ _RIGID_SHARE = 0.98
 _FEW = 0.4
 # The usual number is that of up to this many gaps before and after.
 _NEARBY = 10
-# The camera moves fast where less than the first share of a frame's tracks is still seen so many
-# frames later, and less was already seen so many frames before, in stretches that come below the
-# second share somewhere. On a walk with fast turns (`cafe`) the median is 12 %, on a drive at 10
-# frames a second, which motion holds together well (`street`), 16 % and more, on a hand-held clip
-# (`log_building`) 23 % and more.
+# A stretch of frames is fast if only a small share of the tracks in each frame lasts for ten more
+# frames, or had lasted for ten: below the first share throughout, and below the second in at least
+# one frame. The median share is 12 % on a walk with fast turns (`cafe`). The smallest is 16 % on a
+# drive at 10 frames a second (`street`), whose tracks still connect the images well, and 23 % on a
+# hand-held clip (`log_building`).
 _LASTING_SHARE, _FEW_LASTING = 0.2, 0.15
 _LASTING_FRAMES = 10
 # Gaps that a warning names.

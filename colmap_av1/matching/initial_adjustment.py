@@ -146,7 +146,7 @@ class KnownPoses:
     def misleading_pairs(
         self, matched: MatchedImages, cameras: Sequence[pycolmap.Camera]
     ) -> list[int]:
-        """Pairs that a mapper may begin with as their own poses, which are wrong, have wide angles.
+        """Find pairs with a wrong two-view pose whose angle is wide enough for an initial pair.
 
         Args:
             matched: the images.
@@ -188,8 +188,8 @@ def runaway_starts(
         known: poses that a pair's own must not contradict.
 
     Returns:
-        Indices of pairs. None of them where no pair holds that is looked at: the mapper then fares
-        no better with another.
+        Indices of pairs. Empty without known poses if no pair that is looked at holds: the mapper
+        then fares no better with another.
     """
     starts: dict[int, _Start | None] = {}
     num_certain = 0

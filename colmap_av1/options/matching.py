@@ -72,8 +72,8 @@ class VerifyOptions(Options):
     verify: Literal["auto", "joint", "pairs"] = option(
         "auto",
         "joint: estimate the poses of all images, as reconstruct does, and match what agrees with "
-        "them; pairs: verify each pair of images by itself, without a look at the pictures; auto: "
-        "joint where images are written or exist, else pairs",
+        "them; pairs: verify each pair of images on its own matches; auto: joint if images are "
+        "written or exist, else pairs",
         common=True,
     )
     max_error: float = option(

@@ -35,13 +35,13 @@ from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept
 
-# A corner disagrees with the poses if its error is above so many pixels, and above so many times
-# the median error: a rolling shutter, say, moves all corners.
+# An observation of the adjusted model disagrees with the poses if its error exceeds both this many
+# pixels and this multiple of the median error, which a rolling shutter, for example, raises.
 _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
-# Motion tracks become points if a mapper would make them: its smallest triangulation angle is the
-# default here, and a point of unknown depth is left out.
+# Points of motion tracks need the mapper's smallest triangulation angle, which is the default here,
+# and a depth error below 50 %.
 _POINTS = TriangulateOptions(max_reprojection_error=1.0, max_depth_error=0.5, points="survey")
-# Motion tracks that keep all their observations: the longest, so many in each image.
+# The longest motion tracks, up to 150 per image, keep all their observations.
 _WHOLE = DensityOptions(
     preset="sparse", max_tracks_per_image=150, spacing=8.0, min_images=3, max_sigma=0.0
 )
@@ -51,9 +51,9 @@ _SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
 _NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
 _MOST_PAIRS = 16
 _FEW = 3
-# Motion tracks of an image at most, by the preset of density; 0: any number.
+# Most keypoints per image of tracks with three observations, by the density preset; 0: no limit.
 _MOST_MOTION = {"sparse": 450, "default": 900, "dense": 0}
-# Tracks that the pair is matched by which a mapper begins with.
+# Most matches of the initial pair.
 _MOST_STARTING = 300
 # Images without a pose that a warning names.
 _NUM_NAMED = 4
@@ -170,7 +170,7 @@ def _agreeing_tracks(
     placed = posed_images_of(known, takes)
     every = pose_tracks(run, tracks).keep_frames(placed.frames)
     corners, corner_points = _agreeing_corners(known, takes)
-    # How many there may be depends on how much of each is kept.
+    # `_kept_observations` applies the limit per image, when it knows what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     motion, motion_points = _agreeing_motion(run, some, placed)
     both = Tracks.concatenate(corners, motion)

@@ -330,7 +330,14 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     folder = tmp_path_factory.mktemp("passed")
     shown = (ShownVideo.as_played(video),)
     run = Run(
-        *(inputs, (source,), shown, folder, folder, ReconstructOptions()), Clock(), no_progress
+        inputs,
+        (source,),
+        shown,
+        folder,
+        folder,
+        ReconstructOptions(),
+        Clock(),
+        no_progress,
     )
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)

@@ -45,7 +45,7 @@ def kill_while_writing(how: str, path: Path) -> None:
 def kill_while_replacing(folder: Path, steps: int) -> None:
     """Let a process die after some steps of replacing a folder's files by new ones, a and c.
 
-    With more steps than there are, it ends by itself.
+    If it is allowed more steps than replacing takes, it exits normally.
     """
     assert _ended(_WHILE_REPLACING, folder, steps) in (-signal.SIGKILL, 0)
 
