@@ -33,10 +33,10 @@ from colmap_av1.geometry.track_points import (
 )
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
 from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
-from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.options import DensifyOptions
 from colmap_av1.splats.gaussians import (
@@ -153,15 +153,15 @@ def densify(
         found = [_track(own, output, options, context) for own in of_videos]
         tracked = [images for images, _ in found]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
-        takes = inputs.takes(
+        image_set = inputs.image_set(
             [own.chosen for own in tracked],
             [own.tracks.num_frames for own in tracked],
             photos_there,
         )
-        images = [posed[name] for name in takes.images.names]
-        views = views_of(images, cameras, takes.masks)
-        row = Tracks.in_sequence([own.tracks for own in tracked], takes.num_frames)
-        seen, view = seen_in(row, takes.images.frames)
+        images = [posed[name] for name in image_set.images.names]
+        views = views_of(images, cameras, image_set.masks)
+        row = Tracks.in_sequence([own.tracks for own in tracked], image_set.num_frames)
+        seen, view = seen_in(row, image_set.images.frames)
         with clock.measure("points"):
             points = _triangulate(seen, view, views, options, progress)
         agreeing = _agreement(model, points)
@@ -170,8 +170,8 @@ def densify(
             cloud = _coloured_cloud(
                 of_tracks,
                 views,
-                takes,
-                _pictures(takes, inputs, photos_there, scratch, options),
+                image_set,
+                _pictures(image_set, inputs, photos_there, scratch, options),
                 options=options,
                 clock=clock,
                 progress=progress,
@@ -185,7 +185,7 @@ def densify(
         model=model,
         conversion=inputs.conversion([words for _, words in found]),
         num_images=len(images),
-        masked=takes.masked,
+        masked=image_set.masked,
         num_tracks=points.num_tracks,
         agreeing=agreeing,
         num_points=len(cloud.xyz),
@@ -258,18 +258,22 @@ def _triangulate(
 
 
 def _pictures(
-    takes: Takes, inputs: Inputs, photos: Sequence[Photo], scratch: Path, options: DensifyOptions
+    image_set: ImageSet,
+    inputs: Inputs,
+    photos: Sequence[Photo],
+    scratch: Path,
+    options: DensifyOptions,
 ) -> Pictures:
     """What gives the pictures of images; a folder keeps those of videos."""
     kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
     shown = list(map(ShownVideo.as_played, inputs.videos, kept))
-    return pictures_of(takes, shown, [photo.path for photo in photos], options.match.reading)
+    return pictures_of(image_set, shown, [photo.path for photo in photos], options.match.reading)
 
 
 def _coloured_cloud(
     tracked: ModelPoints,
     views: Sequence[PosedCamera],
-    takes: Takes,
+    image_set: ImageSet,
     pictures: Pictures,
     *,
     options: DensifyOptions,
@@ -289,7 +293,7 @@ def _coloured_cloud(
         cloud = swept_cloud(
             tracked,
             views,
-            takes.take,
+            image_set.sequence,
             partial(show, "sweep"),
             max_points=options.triangulate.max_points,
             num_threads=options.match.run.num_threads,

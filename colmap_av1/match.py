@@ -19,12 +19,12 @@ from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
 from colmap_av1.geometry.cameras import check_pixel_aspect
 from colmap_av1.images.files import alone_in, files_in
+from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content
-from colmap_av1.images.takes import ShownVideo, Takes, pictures_of
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
@@ -252,10 +252,10 @@ def match(
                 num_written += of_videos
 
     with clock.measure("database"):
-        positions = image_positions(images.takes, inputs.videos, inputs.photos)
+        positions = image_positions(images.image_set, inputs.videos, inputs.photos)
         write_matched_images(
             database,
-            images.takes.images.names,
+            images.image_set.images.names,
             None if listed else found.cameras,
             written,
             on_existing=options.on_existing,
@@ -269,7 +269,7 @@ def match(
     # What a database holds already may join the images, too, and joint matches are fewer where all
     # others are the same tracks in more images.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
-        notes += matching_warnings(written, images.takes)
+        notes += matching_warnings(written, images.image_set)
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),
@@ -277,11 +277,11 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        num_frames=images.takes.num_frames - len(inputs.photos),
+        num_frames=images.image_set.num_frames - len(inputs.photos),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_images=len(written.keypoints),
         num_written_images=num_written,
-        masked=images.takes.masked,
+        masked=images.image_set.masked,
         num_tracks=len(found.track_lengths),
         track_lengths=_length_quantiles(found.track_lengths),
         num_observations=sum(len(keypoints.xy) for keypoints in written.keypoints),
@@ -335,13 +335,13 @@ class _Images:
         inputs: the videos and photos.
         videos: the images of each video, with its tracks in their pixels.
         fast: of each video, where the camera moves fast: bool [num_frames], see `fast_frames`.
-        takes: all images, counted through.
+        image_set: all images, counted through.
     """
 
     inputs: Inputs
     videos: Sequence[PreparedImages]
     fast: Sequence[NDArray[np.bool_]]
-    takes: Takes
+    image_set: ImageSet
 
     @property
     def shown(self) -> tuple[ShownVideo, ...]:
@@ -409,10 +409,10 @@ def _prepare(
             # All tracks of a video are its largest arrays: they make room for the next.
             prepared = _with_selected_tracks(prepared, options, context)
         videos.append(prepared)
-    takes = inputs.takes(
+    image_set = inputs.image_set(
         [own.tracked.chosen for own in videos], [own.tracked.tracks.num_frames for own in videos]
     )
-    return _Images(inputs, videos, fast, takes)
+    return _Images(inputs, videos, fast, image_set)
 
 
 def _match_images(
@@ -433,7 +433,7 @@ def _match_images(
     """
     if scratch is None:
         return _match_pairs(images, cameras, options, context)
-    if cameras is not None and _has_several_cameras(images.takes, cameras):
+    if cameras is not None and _has_several_cameras(images.image_set, cameras):
         reason = "the database has several cameras for the images of one video"
     else:
         try:
@@ -446,10 +446,10 @@ def _match_images(
     return replace(found, warnings=(*found.warnings, warning))
 
 
-def _has_several_cameras(takes: Takes, cameras: ImageCameras) -> bool:
+def _has_several_cameras(image_set: ImageSet, cameras: ImageCameras) -> bool:
     of_videos = [
-        [cameras.of_images[image] for image in takes.images_of(video)]
-        for video in range(len(takes.videos))
+        [cameras.of_images[image] for image in image_set.images_of(video)]
+        for video in range(len(image_set.videos))
     ]
     return any(camera is not own[0] for own in of_videos for camera in own)
 
@@ -481,7 +481,7 @@ def _match_jointly(
     return match_jointly(
         run,
         [VideoTracks(own.tracks, own.chosen, own.video.inter_share) for own in tracked],
-        images.takes,
+        images.image_set,
         [
             Kept(
                 TracksResult(own.tracks.num_frames, own.tracks.num_tracks, own.video.read_out, ()),
@@ -501,18 +501,18 @@ def _match_pairs(
     context: RunContext,
 ) -> ImageMatches:
     """Match the images along their tracks, and verify the matches pair by pair."""
-    takes, videos = images.takes, images.videos
+    image_set, videos = images.image_set, images.videos
     shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in images.shown]
 
     def cameras(paired: PairedImages) -> ImageCameras:
         if listed is not None:
             return listed
         return new_cameras(
-            paired, takes, shapes, images.inputs.photos, options.camera, context=context
+            paired, image_set, shapes, images.inputs.photos, options.camera, context=context
         )
 
     return match_images(
-        takes,
+        image_set,
         [
             SelectedTracks(
                 own.source.pictures.path,
@@ -525,7 +525,7 @@ def _match_pairs(
         images.inputs.no_motion,
         cameras,
         pictures_of(
-            takes, images.shown, [photo.path for photo in images.inputs.photos], options.reading
+            image_set, images.shown, [photo.path for photo in images.inputs.photos], options.reading
         ),
         options=ImageMatchOptions(
             options.pairs, options.verify, options.links, least_length(options.tracks)
@@ -599,11 +599,11 @@ def _listed_cameras(
     database: Path, listed: Sequence[DatabaseImage], images: _Images
 ) -> ImageCameras:
     """The cameras of a database that lists the images."""
-    takes = images.takes
-    of_images = listed_cameras(database, listed, takes.images.names)
+    image_set = images.image_set
+    of_images = listed_cameras(database, listed, image_set.images.names)
     notes: dict[str, None] = {}
     for video, shown in enumerate(images.shown):
-        camera = of_images[takes.images_of(video).start]
+        camera = of_images[image_set.images_of(video).start]
         notes |= dict.fromkeys(
             check_pixel_aspect(camera, shown.pixel_aspect, "import the images with one of these")
         )

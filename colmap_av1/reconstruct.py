@@ -13,11 +13,11 @@ from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.geometry.track_points import LEAST_AGREEING
+from colmap_av1.images.image_set import ShownVideo
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.images.takes import ShownVideo
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
@@ -238,15 +238,15 @@ def _run_stages(run: Run) -> ReconstructReport:
     numbers = range(len(run.sources))
     tracked = [track_stage(run, video) for video in numbers]
     videos = [read_tracks(run, video) for video in numbers]
-    takes = run.inputs.takes(
+    image_set = run.inputs.image_set(
         [own.chosen for own in videos], [own.tracks.num_frames for own in videos]
     )
-    positions = image_positions(takes, run.inputs.videos, run.inputs.photos)
+    positions = image_positions(image_set, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
-    posed = estimate_poses(run, videos, takes, tracked)
+    posed = estimate_poses(run, videos, image_set, tracked)
     del videos  # as large as the tracks that the poses agree with
-    placed, written = written_model(run, posed, takes)
-    further, unplaced = further_models(run, posed, takes)
+    placed, written = written_model(run, posed, image_set)
+    further, unplaced = further_models(run, posed, image_set)
     assert posed.far_views is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
     long_range = posed.far_views.result
@@ -256,8 +256,8 @@ def _run_stages(run: Run) -> ReconstructReport:
         conversion=run.inputs.conversion([source.conversion for source in run.sources]),
         database=run.output / "database.db",
         num_frames=sum(stage.result.num_frames for stage in tracked),
-        num_images=len(takes.take),
-        masked=takes.masked,
+        num_images=len(image_set.sequence),
+        masked=image_set.masked,
         moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
         num_key_images=len(matches.key_images),
         num_registered=poses.num_registered,
@@ -292,7 +292,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *run.inputs.with_names([stage.result.warnings for stage in tracked]),
             *matches.link_warnings,
             *placed.result.place_warnings,
-            *_warnings(posed, model, len(takes.take), further, unplaced),
+            *_warnings(posed, model, len(image_set.sequence), further, unplaced),
         ),
     )
 

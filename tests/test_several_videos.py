@@ -33,8 +33,8 @@ from colmap_av1.errors import (
 from colmap_av1.geometry.colmap_model import no_points, write_model
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.image_set import count_through
 from colmap_av1.images.inputs import labels_of
-from colmap_av1.images.takes import count_through
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
@@ -300,13 +300,13 @@ def test_frames_are_counted_through() -> None:
     assert Tracks.in_sequence([one], 5) is one
     chosen = [ChosenImages(["0.png", "4.png"], np.array([0, 4], np.int32))]
     chosen.append(ChosenImages(["2.png"], np.array([2], np.int32)))
-    takes = count_through(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])
-    assert takes.images.names == ["a/0.png", "a/4.png", "b/2.png", "photos/x.jpg"]
-    assert takes.images.frames.tolist() == [0, 4, 7, 8]
-    assert takes.take.tolist() == [0, 0, 1, 2]
-    assert takes.of_video(1).names == ["b/2.png"]
-    assert takes.of_video(1).frames.tolist() == [2]
-    assert (takes.num_takes, takes.num_frames) == (3, 9)
+    image_set = count_through(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])
+    assert image_set.images.names == ["a/0.png", "a/4.png", "b/2.png", "photos/x.jpg"]
+    assert image_set.images.frames.tolist() == [0, 4, 7, 8]
+    assert image_set.sequence.tolist() == [0, 0, 1, 2]
+    assert image_set.of_video(1).names == ["b/2.png"]
+    assert image_set.of_video(1).frames.tolist() == [2]
+    assert (image_set.num_sequences, image_set.num_frames) == (3, 9)
 
 
 def test_two_videos_and_photos_are_one_model(

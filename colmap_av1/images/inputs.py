@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.image_set import ImageSet, count_through
 from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
-from colmap_av1.images.takes import Takes, count_through
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
@@ -61,12 +61,12 @@ class Inputs:
         """The masks of each video; None where it has none."""
         return [self.masks.of_video(label) if self.masks else None for label in self.labels]
 
-    def takes(
+    def image_set(
         self,
         chosen: Sequence[ChosenImages],
         num_frames: Sequence[int],
         photos: Sequence[Photo] | None = None,
-    ) -> Takes:
+    ) -> ImageSet:
         """The images counted through, with their masks.
 
         Args:

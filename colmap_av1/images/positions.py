@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.photos import Photo
-from colmap_av1.images.takes import Takes
 from colmap_av1.video.facts import Video, picture_times
 from colmap_av1.video.metadata.places import are_places
 from colmap_av1.video.metadata.positions import Positions, interpolate, read_positions
@@ -42,19 +42,19 @@ class ImagePositions:
 
 
 def image_positions(
-    takes: Takes, videos: Sequence[Video], photos: Sequence[Photo]
+    image_set: ImageSet, videos: Sequence[Video], photos: Sequence[Photo]
 ) -> ImagePositions:
     """Find where images were taken: those of videos by time, between positions that are said.
 
     Args:
-        takes: the images.
+        image_set: the images.
         videos: the videos, of any codec.
         photos: the photos.
 
     Raises:
         VideoError: a file cannot be read.
     """
-    places = np.full((len(takes.take), 3), np.nan)
+    places = np.full((len(image_set.sequence), 3), np.nan)
     gravity = np.full_like(places, np.nan)
     one: list[tuple[float, float, float]] = []
     notes: list[str] = []
@@ -66,13 +66,13 @@ def image_positions(
         one += [found.place] if found.place is not None else []
         if not (len(found.times) or len(found.gravity_times)):
             continue
-        images, frames = takes.images_of(number), takes.of_video(number).frames
+        images, frames = image_set.images_of(number), image_set.of_video(number).frames
         times = _times_since_start(video)
         if times is not None and len(frames) and frames[-1] < len(times):
             own = slice(images.start, images.stop)
             places[own] = _places(found, times[frames])
             gravity[own] = _gravity(found, times[frames])
-    first = len(takes.take) - len(photos)
+    first = len(image_set.sequence) - len(photos)
     for index, photo in enumerate(photos, start=first):
         if photo.place is not None and are_places(np.array([photo.place]))[0]:
             places[index] = photo.place

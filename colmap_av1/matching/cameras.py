@@ -16,8 +16,8 @@ from colmap_av1.geometry.cameras import (
     is_nearly_pinhole,
     make_camera,
 )
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.photos import Photo
-from colmap_av1.images.takes import Takes
 from colmap_av1.matching.focal import estimate_focal_length
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.options import CameraOptions
@@ -67,7 +67,7 @@ class ImageCameras:
 
 def new_cameras(
     paired: PairedImages,
-    takes: Takes,
+    image_set: ImageSet,
     shapes: Sequence[Shape],
     photos: Sequence[Photo],
     options: CameraOptions,
@@ -81,7 +81,7 @@ def new_cameras(
 
     Args:
         paired: the images.
-        takes: the video of each image, or its photo.
+        image_set: the video of each image, or its photo.
         shapes: the shape of each video.
         photos: the photos.
         options: camera model, given intrinsics and sharing.
@@ -93,12 +93,12 @@ def new_cameras(
     of_images: dict[int, pycolmap.Camera] = {}
     estimated: list[float | None] = []
     notes: dict[str, None] = {}
-    for shared in _takes_by_camera(len(shapes), photos, options):
+    for shared in _sequences_by_camera(len(shapes), photos, options):
         given, aspect = options, 1.0
         if shared[0] < len(shapes):
             shape = shapes[shared[0]]
             size, aspect = shape.size, shape.pixel_aspect
-            of_videos = [i for t in shared if t < len(shapes) for i in takes.images_of(t)]
+            of_videos = [i for t in shared if t < len(shapes) for i in image_set.images_of(t)]
             own = _some_images(paired, of_videos)
             focal_length = shared_focal_length(own, size, aspect, options, context)
             estimated.append(focal_length)
@@ -113,9 +113,9 @@ def new_cameras(
         notes |= dict.fromkeys(
             check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
         )
-        for image in (image for take in shared for image in takes.images_of(take)):
+        for image in (image for sequence in shared for image in image_set.images_of(sequence)):
             of_images[image] = copy.copy(camera) if given.single_camera is False else camera
-    in_order = [of_images[image] for image in range(len(takes.take))]
+    in_order = [of_images[image] for image in range(len(image_set.sequence))]
     return ImageCameras(in_order, estimated[0], tuple(notes))
 
 
@@ -193,13 +193,13 @@ def _initial_focal_length(
     ]
 
 
-def _takes_by_camera(
+def _sequences_by_camera(
     num_videos: int, photos: Sequence[Photo], options: CameraOptions
 ) -> list[list[int]]:
     """The videos and photos of each camera."""
     if options.single_camera:
         return [list(range(num_videos + len(photos)))]
     of_photos: dict[object, list[int]] = {}
-    for take, photo in enumerate(photos, start=num_videos):
-        of_photos.setdefault((photo.size, photo.camera, photo.focal_length), []).append(take)
+    for sequence, photo in enumerate(photos, start=num_videos):
+        of_photos.setdefault((photo.size, photo.camera, photo.focal_length), []).append(sequence)
     return [*([video] for video in range(num_videos)), *of_photos.values()]

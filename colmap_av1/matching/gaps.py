@@ -15,8 +15,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.names import natural_order
-from colmap_av1.images.takes import Takes
 from colmap_av1.matching.image_matches import MatchedImages, used_pairs
 from colmap_av1.options import LinkOptions
 from colmap_av1.tracks.tracks import Tracks
@@ -214,14 +214,17 @@ class SuspectGaps:
 
 
 def suspect_gaps(
-    takes: Takes, matched: MatchedImages, inter_share: NDArray[np.float32], options: LinkOptions
+    image_set: ImageSet,
+    matched: MatchedImages,
+    inter_share: NDArray[np.float32],
+    options: LinkOptions,
 ) -> SuspectGaps:
     """Find the gaps whose motion may be wrong. No motion crosses from one video to another."""
-    certain = np.zeros(max(len(takes.take) - 1, 0), dtype=np.bool_)
+    certain = np.zeros(max(len(image_set.sequence) - 1, 0), dtype=np.bool_)
     maybe, probes = np.zeros_like(certain), list[int]()
-    for video in range(len(takes.videos)):
-        share = inter_share[takes.first_frame[video] : takes.first_frame[video + 1]]
-        images, frames = takes.images_of(video), takes.of_video(video).frames
+    for video in range(len(image_set.videos)):
+        share = inter_share[image_set.first_frame[video] : image_set.first_frame[video + 1]]
+        images, frames = image_set.images_of(video), image_set.of_video(video).frames
         low, own = low_inter_gaps(share, frames), slice(images.start, images.stop - 1)
         certain[own] = low_inter_gaps(share, frames, certain=True)
         maybe[own] = low & ~certain[own]
@@ -321,11 +324,11 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
     )
 
 
-def matching_warnings(matched: MatchedImages, takes: Takes) -> list[str]:
+def matching_warnings(matched: MatchedImages, image_set: ImageSet) -> list[str]:
     """Warnings about gaps between images of a video that few matches cross."""
     used, counts = used_pairs(matched)
     gaps = few_match_gaps(
-        matched.pairs[used], counts[used], takes.images.names, takes.take.tolist()
+        matched.pairs[used], counts[used], image_set.images.names, image_set.sequence.tolist()
     )
     warning = few_matches_warning(gaps)
     return [warning] if warning is not None else []

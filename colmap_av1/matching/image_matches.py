@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION, MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewGeometry
@@ -108,20 +108,20 @@ def nothing_to_match(video: Path | str, options: PairOptions) -> VideoError:
     )
 
 
-def join_videos(videos: Sequence[PairedImages], takes: Takes) -> PairedImages:
+def join_videos(videos: Sequence[PairedImages], image_set: ImageSet) -> PairedImages:
     """All images, those of each video paired among themselves.
 
     Args:
         videos: the images of each video. A single one without photos is returned as it is.
-        takes: all images.
+        image_set: all images.
     """
-    if takes.num_takes == 1:
+    if image_set.num_sequences == 1:
         return videos[0]
     keypoints: list[ImageKeypoints] = []
     pairs, matches = [np.empty((0, 2), np.int32)], []
     first_track = 0
     for video, own in enumerate(videos):
-        first_frame = int(takes.first_frame[video])
+        first_frame = int(image_set.first_frame[video])
         pairs.append((own.pairs + len(keypoints)).astype(np.int32))
         matches += own.matches
         keypoints += [
@@ -132,7 +132,7 @@ def join_videos(videos: Sequence[PairedImages], takes: Takes) -> PairedImages:
             (int(k.track.max()) + 1 for k in own.keypoints if k.track.size), default=0
         )
     no_xy, no_track = np.empty((0, 2), np.float32), np.empty(0, np.int64)
-    photos = takes.images.frames[len(keypoints) :]
+    photos = image_set.images.frames[len(keypoints) :]
     keypoints += [ImageKeypoints(int(frame), no_xy, no_track) for frame in photos]
     return PairedImages(keypoints, np.concatenate(pairs), matches)
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.images.takes import Pictures, Takes
+from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import (
@@ -224,7 +224,7 @@ class LinkedImages:
 
 
 def link_images(
-    takes: Takes,
+    image_set: ImageSet,
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     inter_share: NDArray[np.float32],
@@ -243,7 +243,7 @@ def link_images(
     If motion connects all images, which is possible for a single video only, no picture is decoded.
 
     Args:
-        takes: the images of videos and photos.
+        image_set: the images of videos and photos.
         matched: the images, matched along tracks.
         cameras: the camera of each image; images share a camera if it is the same object.
         inter_share: float32 [num_frames], see `TrackedVideo`; any numbers for photos.
@@ -266,7 +266,7 @@ def link_images(
         missing = sorted(set(wanted) - known.keys())
         with context.clock.measure("links"):
             known |= features_of_images(
-                missing, pictures, cameras, takes.masks, links, effort=effort, context=context
+                missing, pictures, cameras, image_set.masks, links, effort=effort, context=context
             )
         return {image: known[image] for image in wanted if image in known}
 
@@ -276,7 +276,7 @@ def link_images(
             features = without_overlays(features, cameras)
             return _link(
                 plan,
-                takes,
+                image_set,
                 matched,
                 cameras,
                 features,
@@ -286,32 +286,32 @@ def link_images(
                 context=context,
             )
 
-    suspect = suspect_gaps(takes, matched, inter_share, links)
+    suspect = suspect_gaps(image_set, matched, inter_share, links)
     gaps = suspect.certain
-    plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
+    plan = plan_links(image_set, matched, gaps, images_apart, links, fast=fast)
     if links.links != "none" and (suspect.maybe.any() or suspect.probes):
-        first = _first_look(suspect, takes)
+        first = _first_look(suspect, image_set)
         also = plan.wanted if plan.effort == "light" else []
         features_of([*first.wanted, *also], "light")  # decode the videos once
-        gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, takes)
-        plan = plan_links(takes, matched, gaps, images_apart, links, fast=fast)
+        gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, image_set)
+        plan = plan_links(image_set, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
         linked = link(plan)
     else:
-        nothing = Tracks.empty(takes.num_frames, _largest_size(cameras))
-        linked = LinkedImages(matched, nothing, _with_parts(LinkReport(), matched, takes))
+        nothing = Tracks.empty(image_set.num_frames, _largest_size(cameras))
+        linked = LinkedImages(matched, nothing, _with_parts(LinkReport(), matched, image_set))
     if linked.report.frames_of_gaps("no overlap" if plan.loop else "few tracks"):
         # What lies on either side of a cut may continue anywhere in the videos.
-        loop = sorted({*plan.loop, *_spread_over_videos(takes, matched, images_apart)})
+        loop = sorted({*plan.loop, *_spread_over_videos(image_set, matched, images_apart)})
         if loop != plan.loop:
             plan = replace(plan, loop=loop)
             linked = link(plan)
     few = linked.report.frames_of_gaps("few tracks")
     if plan.effort == "light" and plan.wanted and (few or linked.report.parts):
-        linked = link(thorough_plan(plan, takes))
+        linked = link(thorough_plan(plan, image_set))
     if len(linked.matched.pairs) == 0:
         if links.links != "none" and not found["light"]:
-            features_of(evenly_spread(len(takes.take), _NUM_GLANCED, rounded=True), "light")
+            features_of(evenly_spread(len(image_set.sequence), _NUM_GLANCED, rounded=True), "light")
         sizes = [len(features.xy) for features in found["light"].values()]
         if sizes and np.median(sizes) < _FEW_FEATURES:
             raise VideoError(
@@ -390,10 +390,10 @@ def _images_around(gap: int, images: range, distances: Sequence[int] = _AROUND_G
     return sorted(found & set(images))
 
 
-def _first_look(suspect: SuspectGaps, takes: Takes) -> Plan:
+def _first_look(suspect: SuspectGaps, image_set: ImageSet) -> Plan:
     """A look at few images on either side of suspect gaps: do they confirm the motion?"""
     around = {
-        gap: _images_around(gap, takes.images_of(int(takes.take[gap])), _FIRST_LOOK)
+        gap: _images_around(gap, image_set.images_of(int(image_set.sequence[gap])), _FIRST_LOOK)
         for gap in np.flatnonzero(suspect.maybe).tolist()
     }
     around |= {gap: [gap, gap + 1] for gap in suspect.probes if gap not in around}
@@ -402,7 +402,7 @@ def _first_look(suspect: SuspectGaps, takes: Takes) -> Plan:
 
 
 def _confirmed_gaps(
-    report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, takes: Takes
+    report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
 ) -> NDArray[np.bool_]:
     """Suspect gaps whose motion the first look contradicts, or that few tracks cross.
 
@@ -412,29 +412,31 @@ def _confirmed_gaps(
         report: of the first look.
         suspect: the gaps that were examined.
         matched: the images, matched along tracks.
-        takes: the images.
+        image_set: the images.
 
     Returns:
         bool [num_images - 1].
     """
     wrong = sorted({frame for frame, _ in report.frames_of_gaps("contradicted")})
-    is_wrong = np.isin(takes.images.frames[:-1], wrong)
+    is_wrong = np.isin(image_set.images.frames[:-1], wrong)
     across = np.zeros(len(suspect.maybe))
     for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
         if j == i + 1:
             across[i] = len(geometry.inlier_matches)
     enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * float(np.median(across)))
     confirmed = suspect.maybe & (is_wrong | (across < enough))
-    wrong_probes = [int(takes.take[gap]) for gap in suspect.probes if is_wrong[gap]]
-    for take, count in enumerate(np.bincount(wrong_probes, minlength=takes.num_takes).tolist()):
+    wrong_probes = [int(image_set.sequence[gap]) for gap in suspect.probes if is_wrong[gap]]
+    for sequence, count in enumerate(
+        np.bincount(wrong_probes, minlength=image_set.num_sequences).tolist()
+    ):
         if count >= _NUM_WRONG_PROBES:
-            images = takes.images_of(take)
+            images = image_set.images_of(sequence)
             confirmed[images.start : images.stop - 1] = True
     return confirmed
 
 
 def plan_links(
-    takes: Takes,
+    image_set: ImageSet,
     matched: MatchedImages,
     gaps: NDArray[np.bool_],
     images_apart: float,
@@ -445,7 +447,7 @@ def plan_links(
     """Choose the pictures at gaps, for loops in long videos, and between videos.
 
     Args:
-        takes: the images.
+        image_set: the images.
         matched: the images, matched along tracks.
         gaps: bool [num_images - 1] gaps that motion does not bridge.
         images_apart: see `link_images`.
@@ -455,20 +457,23 @@ def plan_links(
     if options.links == "none":
         return Plan(np.empty(0, np.int64), [], [], [])
     chosen = np.flatnonzero(gaps)
-    around = [_images_around(gap, takes.images_of(int(takes.take[gap]))) for gap in chosen.tolist()]
-    stretches = _stretches(fast, takes)
+    around = [
+        _images_around(gap, image_set.images_of(int(image_set.sequence[gap])))
+        for gap in chosen.tolist()
+    ]
+    stretches = _stretches(fast, image_set)
     loop: list[int] = []
-    for video in range(len(takes.videos)):
-        images = takes.images_of(video)
+    for video in range(len(image_set.videos)):
+        images = image_set.images_of(video)
         least = max(_LONG * _reach(matched, images), _LEAST_IMAGES / images_apart)
         if options.links != "auto" or len(images) >= least:
-            loop += _spread_images(takes, matched, video, images_apart)
+            loop += _spread_images(image_set, matched, video, images_apart)
     if stretches:
         loop = sorted({*loop, *(i for own in stretches for i in own[::_LOOP_STEP])})
     between: list[int] = []
-    if takes.num_takes > 1:
-        between = _spread_over_videos(takes, matched, images_apart)
-        between += range(takes.images_of(len(takes.videos)).start, len(takes.take))
+    if image_set.num_sequences > 1:
+        between = _spread_over_videos(image_set, matched, images_apart)
+        between += range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence))
     return Plan(
         chosen,
         around,
@@ -479,44 +484,46 @@ def plan_links(
     )
 
 
-def _stretches(chosen: NDArray[np.bool_], takes: Takes) -> tuple[range, ...]:
+def _stretches(chosen: NDArray[np.bool_], image_set: ImageSet) -> tuple[range, ...]:
     """Ranges of consecutive images of one video that are chosen: bool [num_images]."""
     found: list[range] = []
-    for video in range(len(takes.videos)):
-        images = takes.images_of(video)
+    for video in range(len(image_set.videos)):
+        images = image_set.images_of(video)
         edges = np.diff(chosen[images.start : images.stop].astype(np.int8), prepend=0, append=0)
         starts, stops = (np.flatnonzero(edges == k) + images.start for k in (1, -1))
         found += map(range, starts.tolist(), stops.tolist())
     return tuple(found)
 
 
-def thorough_plan(plan: Plan, takes: Takes) -> Plan:
+def thorough_plan(plan: Plan, image_set: ImageSet) -> Plan:
     """The plan with all of SIFT's features in fewer images, for what few links connect."""
-    firsts = [takes.images_of(video).start for video in range(len(takes.videos) + 1)]
+    firsts = [image_set.images_of(video).start for video in range(len(image_set.videos) + 1)]
     between: list[int] = []
-    for first, last in pairwise([*firsts, len(takes.take)]):
+    for first, last in pairwise([*firsts, len(image_set.sequence)]):
         own = [image for image in plan.between if first <= image < last]
         between += own[:: max(1, -(-len(own) // _MOST_THOROUGH))]
     return replace(plan, between=between, effort="full")
 
 
-def _spread_over_videos(takes: Takes, matched: MatchedImages, images_apart: float) -> list[int]:
+def _spread_over_videos(
+    image_set: ImageSet, matched: MatchedImages, images_apart: float
+) -> list[int]:
     """`_spread_images` of every video."""
     return [
         image
-        for video in range(len(takes.videos))
-        for image in _spread_images(takes, matched, video, images_apart)
+        for video in range(len(image_set.videos))
+        for image in _spread_images(image_set, matched, video, images_apart)
     ]
 
 
 def _spread_images(
-    takes: Takes, matched: MatchedImages, video: int, images_apart: float
+    image_set: ImageSet, matched: MatchedImages, video: int, images_apart: float
 ) -> list[int]:
     """Images of a video at such a distance that tracks reach over several of them."""
-    images = takes.images_of(video)
+    images = image_set.images_of(video)
     least = round(_LEAST_STEP / images_apart)
     step = max(1, least, round(_LOOP_SHARE * _reach(matched, images)))
-    if takes.num_takes > 1:
+    if image_set.num_sequences > 1:
         step = min(step, max(1, len(images) // _LEAST_LOOP_IMAGES))
     return list(images[step // 2 :: step])
 
@@ -556,7 +563,7 @@ class Links:
 
 def _link(
     plan: Plan,
-    takes: Takes,
+    image_set: ImageSet,
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     features: dict[int, Features],
@@ -582,14 +589,16 @@ def _link(
         for offset in offsets
         for i in images[: -min(offset, len(images))]
     }
-    loops = _loop_pairs(takes, matched, plan.loop, features, options, seed=context.seed) - across
-    between = _pairs_between(plan.between, features, takes, options, seed=context.seed)
+    loops = (
+        _loop_pairs(image_set, matched, plan.loop, features, options, seed=context.seed) - across
+    )
+    between = _pairs_between(plan.between, features, image_set, options, seed=context.seed)
     tried = across | loops | between
     links = _supported(
-        matched_pairs(tried), loops | between, sorted({*plan.loop, *plan.between}), takes
+        matched_pairs(tried), loops | between, sorted({*plan.loop, *plan.between}), image_set
     )
     found = {tuple(pair) for pair in links.pairs.tolist()}
-    beside = _pairs_beside(links, plan.between, takes) - tried
+    beside = _pairs_beside(links, plan.between, image_set) - tried
     if beside:
         links = links.joined(matched_pairs(beside))
     contradicted = contradicted_gaps(plan.gaps, links, matched, cameras)
@@ -607,17 +616,17 @@ def _link(
         num_links=len(links.pairs),
         num_revisits=len(loops & found),
         num_between=len(between & found),
-        gaps=_gaps_after_linking(plan.gaps, contradicted, merged, takes),
+        gaps=_gaps_after_linking(plan.gaps, contradicted, merged, image_set),
         fast=tuple(
-            (int(takes.images.frames[own[0]]), int(takes.images.frames[own[-1]]))
+            (int(image_set.images.frames[own[0]]), int(image_set.images.frames[own[-1]]))
             for own in plan.fast
         ),
-        same_videos=_same_videos(links, features, cameras, takes),
+        same_videos=_same_videos(links, features, cameras, image_set),
     )
     tracks = links_as_tracks(
-        links, features, takes.images.frames, takes.num_frames, _largest_size(cameras)
+        links, features, image_set.images.frames, image_set.num_frames, _largest_size(cameras)
     )
-    return LinkedImages(merged, tracks, _with_parts(report, merged, takes))
+    return LinkedImages(merged, tracks, _with_parts(report, merged, image_set))
 
 
 def features_of_images(
@@ -643,7 +652,7 @@ def features_of_images(
 
 
 def _loop_pairs(
-    takes: Takes,
+    image_set: ImageSet,
     matched: MatchedImages,
     loop: list[int],
     features: dict[int, Features],
@@ -653,8 +662,8 @@ def _loop_pairs(
 ) -> set[tuple[int, int]]:
     """Pairs of images of one video that look alike and that tracks do not connect."""
     pairs: set[tuple[int, int]] = set()
-    for video in range(len(takes.videos)):
-        images = takes.images_of(video)
+    for video in range(len(image_set.videos)):
+        images = image_set.images_of(video)
         present = [image for image in loop if image in images and image in features]
         if len(present) < 2:
             continue
@@ -672,7 +681,7 @@ def _loop_pairs(
 def _pairs_between(
     images: Sequence[int],
     features: dict[int, Features],
-    takes: Takes,
+    image_set: ImageSet,
     options: LinkOptions,
     *,
     seed: int,
@@ -681,8 +690,8 @@ def _pairs_between(
     present = np.array([image for image in images if image in features], dtype=np.int64)
     if len(present) < 2:
         return set()
-    take = takes.take[present]
-    allowed = take[:, None] != take
+    sequence = image_set.sequence[present]
+    allowed = sequence[:, None] != sequence
     pairs = np.argwhere(np.triu(allowed)).tolist()
     if len(pairs) > _MOST_OF_ALL:
         pairs = similar_images(
@@ -691,20 +700,20 @@ def _pairs_between(
     return {(int(present[a]), int(present[b])) for a, b in pairs}
 
 
-def _pairs_beside(links: Links, images: Sequence[int], takes: Takes) -> set[tuple[int, int]]:
+def _pairs_beside(links: Links, images: Sequence[int], image_set: ImageSet) -> set[tuple[int, int]]:
     """Pairs of neighbours in a video that are both linked to other videos.
 
     A feature that is linked to a single image of another video would have no depth there.
     """
-    take = takes.take
-    between = [pair for pair in links.pairs.tolist() if take[pair[0]] != take[pair[1]]]
+    sequence = image_set.sequence
+    between = [pair for pair in links.pairs.tolist() if sequence[pair[0]] != sequence[pair[1]]]
     linked = {image for pair in between for image in pair}
     there = [image for image in images if image in linked]
     return {
         (a, b)
         for index, a in enumerate(there)
         for b in there[index + 1 : index + 1 + _NEIGHBOURS]
-        if take[a] == take[b]
+        if sequence[a] == sequence[b]
     }
 
 
@@ -745,7 +754,7 @@ def match_pairs(
 
 
 def _supported(
-    links: Links, loops: set[tuple[int, int]], images: Sequence[int], takes: Takes
+    links: Links, loops: set[tuple[int, int]], images: Sequence[int], image_set: ImageSet
 ) -> Links:
     """The links without loops that no neighbouring loop confirms.
 
@@ -754,11 +763,11 @@ def _supported(
         loops: pairs of images that close a loop or connect videos.
         images: the images of these, ascending; those near each other in the list see nearly the
             same.
-        takes: the video of each image. Photos have no neighbours: a third image that is linked to
+        image_set: the images. Photos have no neighbours: a third image that is linked to
             both confirms theirs.
     """
-    place = {image: k + _APART * int(takes.take[image]) for k, image in enumerate(images)}
-    photos = set(range(takes.images_of(len(takes.videos)).start, len(takes.take)))
+    place = {image: k + _APART * int(image_set.sequence[image]) for k, image in enumerate(images)}
+    photos = set(range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence)))
     pairs = [(i, j) for i, j in links.pairs.tolist()]
     sure = {
         (i, j)
@@ -817,16 +826,16 @@ def contradicted_gaps(
 
 
 def _gaps_after_linking(
-    gaps: NDArray[np.int64], contradicted: Sequence[int], merged: MatchedImages, takes: Takes
+    gaps: NDArray[np.int64], contradicted: Sequence[int], merged: MatchedImages, image_set: ImageSet
 ) -> tuple[Gap, ...]:
     """The gaps of a plan with their reasons."""
     group = connected_images(merged)
-    take = takes.take[merged.pairs]
+    sequence = image_set.sequence[merged.pairs]
     found = []
     for gap in gaps.tolist():
         reasons: list[GapReason] = ["low inter share"]
         crossing = (merged.pairs[:, 0] <= gap) & (merged.pairs[:, 1] > gap)
-        crossing &= take[:, 0] == take[:, 1]
+        crossing &= sequence[:, 0] == sequence[:, 1]
         inliers = [len(merged.geometries[k].inlier_matches) for k in np.flatnonzero(crossing)]
         if max(inliers, default=0) < _SURE_INLIERS:
             reasons.append("few tracks")
@@ -834,7 +843,7 @@ def _gaps_after_linking(
             reasons.append("contradicted")
         if group[gap] != group[gap + 1]:
             reasons.append("no overlap")
-        names, frames = takes.images.names, takes.images.frames
+        names, frames = image_set.images.names, image_set.images.frames
         between = int(frames[gap]), int(frames[gap + 1])
         found.append(Gap(names[gap], names[gap + 1], tuple(reasons), between))
     return tuple(found)
@@ -844,55 +853,63 @@ def _same_videos(
     links: Links,
     features: dict[int, Features],
     cameras: Sequence[pycolmap.Camera],
-    takes: Takes,
+    image_set: ImageSet,
 ) -> tuple[tuple[str, str], ...]:
     """Pairs of videos that show the same pictures, as encodings of one video do."""
     alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
-        pair = int(takes.take[i]), int(takes.take[j])
-        if pair[0] == pair[1] or max(pair) >= len(takes.videos):
+        pair = int(image_set.sequence[i]), int(image_set.sequence[j])
+        if pair[0] == pair[1] or max(pair) >= len(image_set.videos):
             continue
         a, b = geometry.inlier_matches.T
         scale = cameras[i].width / cameras[j].width
         apart = np.hypot(*(features[i].xy[a] - features[j].xy[b] * scale).T)
         if np.median(apart) <= _SAME_PLACE:
             alike.setdefault(pair, []).append((i, j))
-    num_examined = np.bincount(takes.take[sorted(features)], minlength=takes.num_takes)
+    num_examined = np.bincount(
+        image_set.sequence[sorted(features)], minlength=image_set.num_sequences
+    )
     found = []
     for pair, images in sorted(alike.items()):
         num_same = [len(set(own)) for own in zip(*images, strict=True)]
-        share = max(same / num_examined[take] for same, take in zip(num_same, pair, strict=True))
+        share = max(
+            same / num_examined[sequence] for same, sequence in zip(num_same, pair, strict=True)
+        )
         if min(num_same) >= _FEWEST_SAME and share >= _SAME_SHARE:
-            found.append((takes.videos[pair[0]], takes.videos[pair[1]]))
+            found.append((image_set.videos[pair[0]], image_set.videos[pair[1]]))
     return tuple(found)
 
 
-def _with_parts(report: LinkReport, merged: MatchedImages, takes: Takes) -> LinkReport:
+def _with_parts(report: LinkReport, merged: MatchedImages, image_set: ImageSet) -> LinkReport:
     """The report with what is connected of several videos and photos."""
-    if takes.num_takes == 1:
+    if image_set.num_sequences == 1:
         return report
-    num_videos = len(takes.videos)
-    groups = _connected_takes(merged, takes)
-    parts = [tuple(takes.videos[take] for take in g if take < num_videos) for g in groups]
+    num_videos = len(image_set.videos)
+    groups = _connected_sequences(merged, image_set)
+    parts = [
+        tuple(image_set.videos[sequence] for sequence in g if sequence < num_videos) for g in groups
+    ]
     parts = [part for part in parts if part]
-    alone = sorted(take for g in groups if min(g) >= num_videos for take in g)
-    first = takes.first_frame.tolist()
+    alone = sorted(sequence for g in groups if min(g) >= num_videos for sequence in g)
+    first = image_set.first_frame.tolist()
     return replace(
         report,
-        videos=tuple(zip(takes.videos, first, strict=False)) if num_videos > 1 else (),
+        videos=tuple(zip(image_set.videos, first, strict=False)) if num_videos > 1 else (),
         parts=tuple(parts) if len(parts) > 1 else (),
-        unlinked_photos=tuple(takes.images.names[takes.images_of(take).start] for take in alone),
+        unlinked_photos=tuple(
+            image_set.images.names[image_set.images_of(sequence).start] for sequence in alone
+        ),
     )
 
 
-def _connected_takes(matched: MatchedImages, takes: Takes) -> list[list[int]]:
+def _connected_sequences(matched: MatchedImages, image_set: ImageSet) -> list[list[int]]:
     """The videos and photos that pairs of images connect, largest group of images first."""
-    count = takes.num_takes
-    # A take and a component of images are connected if they have an image in common.
-    edges = np.column_stack([takes.take, count + connected_images(matched)])
-    label = connected_components(count + len(takes.take), edges)[:count]
+    count = image_set.num_sequences
+    # A sequence and a component of images are connected if they have an image in common.
+    edges = np.column_stack([image_set.sequence, count + connected_images(matched)])
+    label = connected_components(count + len(image_set.sequence), edges)[:count]
     parts = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
-    size = np.bincount(takes.take, minlength=count)
+    size = np.bincount(image_set.sequence, minlength=count)
     return sorted(parts, key=lambda part: (-int(size[part].sum()), part))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.images.takes import Pictures, Takes
+from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.gaps import may_link
 from colmap_av1.matching.image_matches import (
@@ -85,7 +85,7 @@ class ImageMatches:
 
 
 def match_images(
-    takes: Takes,
+    image_set: ImageSet,
     videos: Sequence[SelectedTracks],
     no_motion: NDArray[np.float32],
     cameras: Callable[[PairedImages], ImageCameras],
@@ -99,7 +99,7 @@ def match_images(
     """Match images along their tracks, verify the matches, and link what motion does not connect.
 
     Args:
-        takes: the images.
+        image_set: the images.
         videos: the tracks of each video.
         no_motion: float32 [num_photos] the inter shares of the photos.
         cameras: returns the cameras of the images, that may depend on their matches.
@@ -112,18 +112,18 @@ def match_images(
     Raises:
         VideoError: nothing connects any two images.
     """
-    paired = pair_videos(takes, videos, options, context)
+    paired = pair_videos(image_set, videos, options, context)
     made = cameras(paired)
     matched = verify_images(paired, made.of_images, options.verify, context)
     linked = link_images(
-        takes,
+        image_set,
         matched,
         made.of_images,
         np.concatenate([*(video.inter_share for video in videos), no_motion]),
         pictures,
         fast=np.concatenate(
             [
-                *(own.fast[takes.of_video(k).frames] for k, own in enumerate(videos)),
+                *(own.fast[image_set.of_video(k).frames] for k, own in enumerate(videos)),
                 np.zeros(len(no_motion), np.bool_),
             ]
         ),
@@ -146,7 +146,7 @@ def match_images(
 
 
 def pair_videos(
-    takes: Takes,
+    image_set: ImageSet,
     videos: Sequence[SelectedTracks],
     options: ImageMatchOptions,
     context: RunContext,
@@ -154,7 +154,7 @@ def pair_videos(
     """Match the images of each video along its tracks, see `match_images`."""
     paired = []
     for number, video in enumerate(videos):
-        chosen = takes.of_video(number)
+        chosen = image_set.of_video(number)
         linked_anyway = may_link(
             video.inter_share, chosen.frames, video.tracks, options.links, options.min_length
         )
@@ -166,7 +166,7 @@ def pair_videos(
                 options.pairs,
                 min_length=options.min_length,
                 context=context,
-                needed=takes.num_takes == 1 and not linked_anyway,
+                needed=image_set.num_sequences == 1 and not linked_anyway,
             )
         )
-    return join_videos(paired, takes)
+    return join_videos(paired, image_set)

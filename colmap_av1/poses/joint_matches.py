@@ -21,7 +21,7 @@ from colmap_av1.database.reading import read_images
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
 from colmap_av1.geometry.track_points import seen_in
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
@@ -93,7 +93,7 @@ class JointMatches(ImageMatches):
 def match_jointly(
     run: Run,
     videos: Sequence[VideoTracks],
-    takes: Takes,
+    image_set: ImageSet,
     tracked: Sequence[Kept[TracksResult]],
     density: DensityOptions,
 ) -> JointMatches:
@@ -104,7 +104,7 @@ def match_jointly(
     Args:
         run: what every stage is given.
         videos: the tracks and images of each video.
-        takes: all images.
+        image_set: all images.
         tracked: what is kept of each video's tracks.
         density: which motion tracks are matched.
 
@@ -114,19 +114,19 @@ def match_jointly(
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
-    posed = estimate_poses(run, videos, takes, tracked)
+    posed = estimate_poses(run, videos, image_set, tracked)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("pictures far apart in time contradict the poses")
     known = read_posed_model(run.stages / posed.last.result.poses)
     with run.clock.measure("pairs"):
-        agreeing = _agreeing_tracks(run, posed.tracks, known, takes, density)
-        paired = _paired(run, posed, takes, agreeing, density)
-    cameras = _cameras(run, takes, known)
+        agreeing = _agreeing_tracks(run, posed.tracks, known, image_set, density)
+        paired = _paired(run, posed, image_set, agreeing, density)
+    cameras = _cameras(run, image_set, known)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     matches = posed.matches.result
     pose_of = {image.name: image.cam_from_world for image in known.images}
-    left = [name for name in takes.images.names if name not in pose_of]
+    left = [name for name in image_set.images.names if name not in pose_of]
     return JointMatches(
         cameras=cameras,
         focal_length=_focal_length(run, cameras[0], guessed=matches.guessed),
@@ -134,14 +134,14 @@ def match_jointly(
         links=matches.links,
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
-        warnings=(*matches.link_warnings, *_warnings(posed, left, len(takes.take))),
+        warnings=(*matches.link_warnings, *_warnings(posed, left, len(image_set.sequence))),
         estimate=JointEstimate(
             num_registered=len(known.images),
             far_views=far.far_views if far is not None else None,
             far_views_largest=far.far_views_largest if far is not None else None,
             moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
         ),
-        poses=[pose_of.get(name) for name in takes.images.names],
+        poses=[pose_of.get(name) for name in image_set.images.names],
     )
 
 
@@ -164,12 +164,12 @@ class _Agreeing:
 
 
 def _agreeing_tracks(
-    run: Run, tracks: Tracks, known: PosedModel, takes: Takes, density: DensityOptions
+    run: Run, tracks: Tracks, known: PosedModel, image_set: ImageSet, density: DensityOptions
 ) -> _Agreeing:
     """The corners of a model and a selection of motion tracks, without what disagrees with it."""
-    placed = posed_images_of(known, takes)
+    placed = posed_images_of(known, image_set)
     every = pose_tracks(run, tracks).keep_frames(placed.frames)
-    corners, corner_points = _agreeing_corners(known, takes)
+    corners, corner_points = _agreeing_corners(known, image_set)
     # `_kept_observations` applies the limit per image, when it knows what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     motion, motion_points = _agreeing_motion(run, some, placed)
@@ -187,10 +187,10 @@ def _agreeing_tracks(
     return _Agreeing(placed, both, corners.num_tracks, start)
 
 
-def _agreeing_corners(known: PosedModel, takes: Takes) -> tuple[Tracks, NDArray[np.float64]]:
+def _agreeing_corners(known: PosedModel, image_set: ImageSet) -> tuple[Tracks, NDArray[np.float64]]:
     """The tracks that a model was adjusted on, without what disagrees, and their points."""
     errors = reprojection_errors(known)
-    adjusted = tracks_of_model(known, takes)
+    adjusted = tracks_of_model(known, image_set)
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _FEW
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
@@ -281,10 +281,10 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
 
 
 def _paired(
-    run: Run, posed: Posed, takes: Takes, agreeing: _Agreeing, density: DensityOptions
+    run: Run, posed: Posed, image_set: ImageSet, agreeing: _Agreeing, density: DensityOptions
 ) -> PairedImages:
     """Match all images: those with a pose along what agrees with it, the others along all."""
-    frames, start = takes.images.frames, agreeing.start
+    frames, start = image_set.images.frames, agreeing.start
     kept = _kept_observations(agreeing, density)
     matched = agreeing.tracks.keep_observations(kept)
     placed = agreeing.placed.frames
@@ -329,7 +329,7 @@ def _touching(tracks: Tracks, left: NDArray[np.int32], frames: NDArray[np.int32]
     return tracks.keep_tracks(np.add.reduceat(seen, tracks.offsets[:-1]) > 0).keep_frames(frames)
 
 
-def _cameras(run: Run, takes: Takes, known: PosedModel) -> list[pycolmap.Camera]:
+def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
     """The camera of each image: adjusted if a focal length is known, else the guess it began with.
 
     Those of a database that lists the images stay as they are.
@@ -341,16 +341,16 @@ def _cameras(run: Run, takes: Takes, known: PosedModel) -> list[pycolmap.Camera]
     names = [image.name for image in listed]
     matched = dict(zip(names, listed_cameras(database, listed, names), strict=True))
     adjusted = {image.name: known.cameras[image.camera_id] for image in known.images}
-    of_take: dict[int, pycolmap.Camera] = {}
-    for take, name in zip(takes.take.tolist(), takes.images.names, strict=True):
+    of_sequence: dict[int, pycolmap.Camera] = {}
+    for sequence, name in zip(image_set.sequence.tolist(), image_set.images.names, strict=True):
         if name not in matched:
             continue
         if matched[name].has_prior_focal_length and name in adjusted:
-            of_take[take] = adjusted[name]
-            of_take[take].has_prior_focal_length = True  # models do not say so
+            of_sequence[sequence] = adjusted[name]
+            of_sequence[sequence].has_prior_focal_length = True  # models do not say so
         else:
-            of_take.setdefault(take, matched[name])
-    return [of_take[take] for take in takes.take.tolist()]
+            of_sequence.setdefault(sequence, matched[name])
+    return [of_sequence[sequence] for sequence in image_set.sequence.tolist()]
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:

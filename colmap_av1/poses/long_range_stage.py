@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import seen_in
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.long_range import FarViewCheck, FarViews
 from colmap_av1.poses.reconstruct_poses import (
     FOR_POSES,
@@ -49,7 +49,7 @@ class LongRangeResult:
 def far_view_stage(
     run: Run,
     tracks: Tracks,
-    takes: Takes,
+    image_set: ImageSet,
     moving: Mapping[str, Mask],
     posed: Kept[PosesResult],
     *,
@@ -59,16 +59,16 @@ def far_view_stage(
 
     Args:
         run: what every stage is given.
-        tracks: the tracks of all takes.
-        takes: the images.
+        tracks: the tracks of all sequences.
+        image_set: the images.
         moving: by the names of images, masks that leave out what moves.
         posed: the stage that holds the poses.
         linked: pictures of places seen again have been matched.
     """
 
     def make(_: Path) -> LongRangeResult:
-        placed = read_posed_images(run, posed, takes)
-        far = _compared(run, tracks, takes, moving, placed)
+        placed = read_posed_images(run, posed, image_set)
+        far = _compared(run, tracks, image_set, moving, placed)
         return LongRangeResult(
             far_views=far.median,
             far_views_largest=far.largest,
@@ -88,15 +88,15 @@ def far_view_stage(
 
 
 def _compared(
-    run: Run, tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], placed: PosedImages
+    run: Run, tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], placed: PosedImages
 ) -> FarViews:
     with run.clock.measure("far views"):
         points_of = _points_by_image(run, tracks, placed)
         check = FarViewCheck(placed.images, placed.cameras, points_of.__getitem__)
         masks = placed.masks_with(moving)
-        places = np.searchsorted(takes.images.frames, placed.frames[check.wanted]).tolist()
+        places = np.searchsorted(image_set.images.frames, placed.frames[check.wanted]).tolist()
         index_of = dict(zip(places, check.wanted, strict=True))
-        for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
+        for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
             index = index_of[place]
             check.add(index, picture, masks[index])
             run.progress("far views", done, len(places))

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
 from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
@@ -96,7 +96,7 @@ class _ToMend:
 def estimate_poses(
     run: Run,
     videos: Sequence[VideoTracks],
-    takes: Takes,
+    image_set: ImageSet,
     tracked: Sequence[Kept[TracksResult]],
 ) -> Posed:
     """Estimate poses; where they do not hold together, again with links.
@@ -107,10 +107,10 @@ def estimate_poses(
     first: list[Posed] = []
 
     def make(_: Path) -> _ToMend:
-        posed = _pose_stages(run, videos, takes, tracked, doubted=())
+        posed = _pose_stages(run, videos, image_set, tracked, doubted=())
         first.append(posed)
         return _ToMend(
-            doubted=tuple(_unlinked_seams(run, takes, posed)),
+            doubted=tuple(_unlinked_seams(run, image_set, posed)),
             apart=_are_unlinked_and_apart(run, posed),
         )
 
@@ -120,7 +120,7 @@ def estimate_poses(
         "joints",
         [
             [t.digest for t in tracked],
-            takes.videos,
+            image_set.videos,
             run.photo_digests,
             options.match,
             options.mapping,
@@ -133,7 +133,7 @@ def estimate_poses(
     if first and not found.doubted and not found.apart:
         return first[0]
     again = _with_all_links(run) if found.apart else run
-    return _pose_stages(again, videos, takes, tracked, doubted=found.doubted)
+    return _pose_stages(again, videos, image_set, tracked, doubted=found.doubted)
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
@@ -150,11 +150,11 @@ def _with_all_links(run: Run) -> Run:
     return replace(run, options=replace(run.options, match=match))
 
 
-def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
+def _unlinked_seams(run: Run, image_set: ImageSet, posed: Posed) -> list[int]:
     """Frames after seams that few points join, and that no pictures have been matched across."""
     if posed.adjustment is None or run.options.match.links.links == "none":
         return []
-    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
     links = posed.matches.result.links
     looked_at = [*links.frames_of_gaps(), *links.fast]
     seams = [
@@ -171,38 +171,40 @@ def _unlinked_seams(run: Run, takes: Takes, posed: Posed) -> list[int]:
 def _pose_stages(
     run: Run,
     videos: Sequence[VideoTracks],
-    takes: Takes,
+    image_set: ImageSet,
     tracked: Sequence[Kept[TracksResult]],
     *,
     doubted: Sequence[int],
 ) -> Posed:
     """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
-    matched = match_stage(run, videos, takes, tracked, doubted)
-    keyed = takes.some(matched.result.key_images)
-    mapped = pose_stage(run, matched, takes, keyed)
+    matched = match_stage(run, videos, image_set, tracked, doubted)
+    keyed = image_set.some(matched.result.key_images)
+    mapped = pose_stage(run, matched, image_set, keyed)
     # Where no read-out is found nothing has been moved, whether one was looked for or not.
     in_place = not any(stage.result.read_out for stage in tracked)
-    believed = believed_tracks(run, videos, takes)
+    believed = believed_tracks(run, videos, image_set)
     posed = refined_poses(
-        run, matched, mapped, believed=believed, takes=takes, keyed=keyed, in_place=in_place
+        run, matched, mapped, believed=believed, image_set=image_set, keyed=keyed, in_place=in_place
     )
     links = matched.result.links
     if links.gaps or links.fast:
-        posed = remapped_poses(run, posed, takes)
+        posed = remapped_poses(run, posed, image_set)
     far_views = far_view_stage(
-        run, posed.tracks, takes, posed.moving, posed.last, linked=links.looked_again
+        run, posed.tracks, image_set, posed.moving, posed.last, linked=links.looked_again
     )
     return replace(posed, far_views=far_views)
 
 
-def believed_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> tuple[Tracks, Tracks]:
+def believed_tracks(
+    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet
+) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut where motion is not believed, and the links."""
     links, broken = read_links(run.stages)
-    tracks = Tracks.in_sequence([own.tracks for own in videos], takes.num_frames)
+    tracks = Tracks.in_sequence([own.tracks for own in videos], image_set.num_frames)
     return tracks.split_after_frames(broken.tolist()), links
 
 
-def remapped_poses(run: Run, posed: Posed, takes: Takes) -> Posed:
+def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     """Map the adjusted observations again, and adjust, as long as that lowers the cost.
 
     See `remapping` for why. Poses that no adjustment by corners has left stay as they are.
@@ -211,14 +213,14 @@ def remapped_poses(run: Run, posed: Posed, takes: Takes) -> Posed:
     if adjustment is None or not posed.in_place:
         return posed
     for number in range(2, _MOST_MAPPINGS + 1):
-        again = remap_stage(run, takes, adjustment, number=number)
+        again = remap_stage(run, image_set, adjustment, number=number)
         if not again.result.is_better:
             break
         adjustment = adjustment_stage(
             run,
             posed.tracks,
             posed.links,
-            takes,
+            image_set,
             again,
             corners=partial(corners_in_images, run, posed.moving),
             number=number,
@@ -232,8 +234,8 @@ def refined_poses(
     mapped: Kept[MappedResult],
     *,
     believed: tuple[Tracks, Tracks],
-    takes: Takes,
-    keyed: Takes,
+    image_set: ImageSet,
+    keyed: ImageSet,
     in_place: bool,
 ) -> Posed:
     """Place what lies between the key images that a mapper placed, and adjust.
@@ -243,27 +245,27 @@ def refined_poses(
         matched: the database that was mapped.
         mapped: the poses that the mapper found.
         believed: the tracks and links, see `believed_tracks`.
-        takes: the images.
+        image_set: the images.
         keyed: those of them that were mapped.
         in_place: see `Posed`.
     """
     tracks, links = believed
     resection = dynamic = adjustment = None
     posed: Kept[PosesResult] = mapped
-    if len(keyed.take) < len(takes.take):
-        posed = resection = resection_stage(run, tracks, takes, keyed, mapped)
+    if len(keyed.sequence) < len(image_set.sequence):
+        posed = resection = resection_stage(run, tracks, image_set, keyed, mapped)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        dynamic = moving_stage(run, tracks, takes, posed)
+        dynamic = moving_stage(run, tracks, image_set, posed)
         moving = read_moving(run.stages)
-    tracks, links = (without_moving(own, takes, moving, run) for own in (tracks, links))
+    tracks, links = (without_moving(own, image_set, moving, run) for own in (tracks, links))
     if run.options.mapping.adjust:
-        follows = in_place and (bool(moving) or has_moving_masks(takes))
+        follows = in_place and (bool(moving) or has_moving_masks(image_set))
         adjustment = adjustment_stage(
             run,
             tracks,
             links,
-            takes,
+            image_set,
             posed,
             moved=dynamic.digest if dynamic is not None and moving else None,
             follow=partial(follow_behind, run, moving) if follows else None,

@@ -31,7 +31,7 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in, to_model_points, triangulate_tracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
 from colmap_av1.poses.reconstruct_stages import MatchesResult
@@ -117,7 +117,7 @@ class AdjustedResult(PosesResult):
 
 
 def pose_stage(
-    run: Run, matched: Kept[MatchesResult], takes: Takes, keyed: Takes
+    run: Run, matched: Kept[MatchesResult], image_set: ImageSet, keyed: ImageSet
 ) -> Kept[MappedResult]:
     """Estimate the poses of the key images, some of all, by COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
@@ -164,7 +164,7 @@ def pose_stage(
                 ]
         if not found:
             raise ModelError(_why_no_start(found_before, mapper))
-        found = _largest_first(found, takes, keyed)
+        found = _largest_first(found, image_set, keyed)
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
@@ -188,12 +188,14 @@ def pose_stage(
     )
 
 
-def _largest_first(models: list[PosedModel], takes: Takes, keyed: Takes) -> list[PosedModel]:
+def _largest_first(
+    models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
+) -> list[PosedModel]:
     """The models by how many images, key images or between these, they stand for."""
     if len(models) < 2:
         return models
     key = keyed.images.frames
-    nearest = np.searchsorted((key[1:] + key[:-1]) / 2, takes.images.frames)
+    nearest = np.searchsorted((key[1:] + key[:-1]) / 2, image_set.images.frames)
     stands_for = np.bincount(nearest, minlength=len(key))
     size = [
         sum(
@@ -206,14 +208,14 @@ def _largest_first(models: list[PosedModel], takes: Takes, keyed: Takes) -> list
     return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
 
 
-def _registered(model: PosedModel, takes: Takes) -> dict[str, int]:
+def _registered(model: PosedModel, image_set: ImageSet) -> dict[str, int]:
     """Images with a pose of each of several videos, by its name."""
-    if len(takes.videos) == 1:
+    if len(image_set.videos) == 1:
         return {}
     posed = model.by_name
     return {
-        name: sum(image in posed for image in takes.of_video(video).names)
-        for video, name in enumerate(takes.videos)
+        name: sum(image in posed for image in image_set.of_video(video).names)
+        for video, name in enumerate(image_set.videos)
     }
 
 
@@ -254,17 +256,17 @@ def _why_no_start(found: MatchesResult, mapper: str) -> str:
 
 
 def resection_stage(
-    run: Run, tracks: Tracks, takes: Takes, keyed: Takes, posed: Kept[PosesResult]
+    run: Run, tracks: Tracks, image_set: ImageSet, keyed: ImageSet, posed: Kept[PosesResult]
 ) -> Kept[PosesResult]:
     """Place the images between the key images by the points of tracks that they see."""
 
     def make(partial: Path) -> PosesResult:
         known = read_posed_images(run, posed, keyed)
         with run.clock.measure("resection"):
-            placed = _resect(run, tracks, takes, known)
+            placed = _resect(run, tracks, image_set, known)
         model = PosedModel(known.cameras, placed)
         write_posed_model(partial / "placed.npz", model)
-        return PosesResult("placed.npz", len(placed), _registered(model, takes))
+        return PosesResult("placed.npz", len(placed), _registered(model, image_set))
 
     return run_stage(
         run.stages,
@@ -277,11 +279,11 @@ def resection_stage(
     )
 
 
-def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[ModelImage]:
+def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -> list[ModelImage]:
     """The images that have a pose, and those between them that get one; see `resection_stage`."""
     run_options = run.options.match.run
     seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
-    spread = select_tracks(seen_thrice.keep_frames(takes.images.frames), _RESECTED)
+    spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
     seen, view = seen_in(spread, known.frames)
     points = triangulate_in(run, known, seen, view, options=FOR_POSES)
     check_agreement(len(points.xyz), points.num_tracks)
@@ -289,11 +291,13 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
         frame: (image.camera_id, image.cam_from_world)
         for frame, image in zip(known.frames.tolist(), known.images, strict=True)
     }
-    for video in sorted({int(take) for take in known.take if take < len(takes.videos)}):
-        own = np.flatnonzero(known.take == video)
+    for video in sorted(
+        {int(sequence) for sequence in known.sequence if sequence < len(image_set.videos)}
+    ):
+        own = np.flatnonzero(known.sequence == video)
         frames = known.frames[own]
-        images = takes.images_of(video)
-        left = np.setdiff1d(takes.images.frames[images.start : images.stop], frames)
+        images = image_set.images_of(video)
+        left = np.setdiff1d(image_set.images.frames[images.start : images.stop], frames)
         if len(left) == 0:
             continue
         camera_id = known.images[own[0]].camera_id
@@ -317,7 +321,7 @@ def _resect(run: Run, tracks: Tracks, takes: Takes, known: PosedImages) -> list[
     return [
         ModelImage(i + 1, name, *pose_of[frame])
         for i, (name, frame) in enumerate(
-            zip(takes.images.names, takes.images.frames.tolist(), strict=True)
+            zip(image_set.images.names, image_set.images.frames.tolist(), strict=True)
         )
         if frame in pose_of
     ]
@@ -327,7 +331,7 @@ def adjustment_stage(
     run: Run,
     tracks: Tracks,
     links: Tracks,
-    takes: Takes,
+    image_set: ImageSet,
     posed: Kept[PosesResult],
     *,
     moved: str | None = None,
@@ -344,9 +348,9 @@ def adjustment_stage(
 
     Args:
         run: what every stage is given.
-        tracks: the tracks of all takes.
+        tracks: the tracks of all sequences.
         links: links as tracks.
-        takes: the images.
+        image_set: the images.
         posed: the stage that left the poses.
         moved: digest of the stage that found what moves, where tracks and links are without it.
         follow: corrects the chosen tracks in the images that have a pose.
@@ -359,7 +363,7 @@ def adjustment_stage(
     refine = refines_intrinsics(options)
 
     def make(partial: Path) -> AdjustedResult:
-        placed = read_posed_images(run, posed, takes)
+        placed = read_posed_images(run, posed, image_set)
         # The long tracks of all images are several times as large as those chosen: they go at once.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
         if follow is not None:
@@ -386,7 +390,7 @@ def adjustment_stage(
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
-            registered=_registered(result, takes),
+            registered=_registered(result, image_set),
             doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
             seams_warning=joints.warning,
         )
@@ -444,16 +448,16 @@ class PosedImages:
 
     Attributes:
         images: the images, in the order of their frames.
-        frames: int32 [n] their frames, counted through all takes.
-        take: int32 [n] their takes.
-        first_frame: frame at which each take begins, see `Takes`.
+        frames: int32 [n] their frames, counted through all sequences.
+        sequence: int32 [n] their sequences.
+        first_frame: first frame of each sequence, see `ImageSet`.
         cameras: their pycolmap.Cameras, by id.
         masks: of each, which of its pixels count; None: all.
     """
 
     images: list[ModelImage]
     frames: NDArray[np.int32]
-    take: NDArray[np.int32]
+    sequence: NDArray[np.int32]
     first_frame: NDArray[np.int64]
     cameras: dict[int, Any]
     masks: tuple[Mask | None, ...]
@@ -471,21 +475,21 @@ class PosedImages:
         ]
 
 
-def read_posed_images(run: Run, posed: Kept[PosesResult], takes: Takes) -> PosedImages:
+def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
     """The images with the poses that a stage left."""
-    return posed_images_of(read_posed_model(run.stages / posed.result.poses), takes)
+    return posed_images_of(read_posed_model(run.stages / posed.result.poses), image_set)
 
 
-def posed_images_of(poses: PosedModel, takes: Takes) -> PosedImages:
+def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
     """The images that have a pose in a model."""
     posed_by_name = poses.by_name
-    names = takes.images.names
+    names = image_set.images.names
     index = [i for i, name in enumerate(names) if name in posed_by_name]
     found = [posed_by_name[names[i]] for i in index]
     cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
     images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
-    own = takes.some(index)
-    return PosedImages(images, own.images.frames, own.take, own.first_frame, cameras, own.masks)
+    own = image_set.some(index)
+    return PosedImages(images, own.images.frames, own.sequence, own.first_frame, cameras, own.masks)
 
 
 def triangulate_in(

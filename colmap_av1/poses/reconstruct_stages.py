@@ -13,7 +13,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
@@ -89,7 +89,7 @@ def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
 def match_stage(
     run: Run,
     videos: Sequence[VideoTracks],
-    takes: Takes,
+    image_set: ImageSet,
     tracked: Sequence[Kept[TracksResult]],
     doubted: Sequence[int],
 ) -> Kept[MatchesResult]:
@@ -98,7 +98,7 @@ def match_stage(
     Args:
         run: what every stage is given.
         videos: the tracks of each video.
-        takes: the images.
+        image_set: the images.
         tracked: what `track_stage` kept of each video.
         doubted: frames, counted through the videos, whose motion is not to be trusted.
     """
@@ -106,15 +106,15 @@ def match_stage(
     mapping = options.mapping
     videos = [
         own.doubted_at([f - first for f in doubted if 0 <= f - first < own.tracks.num_frames])
-        for own, first in zip(videos, takes.first_frame.tolist(), strict=False)
+        for own, first in zip(videos, image_set.first_frame.tolist(), strict=False)
     ]
     density = _pose_density(run)
 
     def make(partial: Path) -> MatchesResult:
         with clock.measure("pairs"):
-            index = _key_images(run, videos, takes)
-        keyed = takes.some(index)
-        found = _match_images(run, videos, takes, index)
+            index = _key_images(run, videos, image_set)
+        keyed = image_set.some(index)
+        found = _match_images(run, videos, image_set, index)
         cameras, matched = found.cameras, found.matched
         with clock.measure("database"):
             write_matched_images(
@@ -145,7 +145,7 @@ def match_stage(
         "matches",
         [
             [t.digest for t in tracked],
-            *(takes.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
+            *(image_set.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
             run.positions.digest if run.positions is not None else None,
         ],
         MatchesResult,
@@ -155,20 +155,20 @@ def match_stage(
     )
 
 
-def _key_images(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[int]:
+def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[int]:
     """The images that are mapped, by their index: all, where key images are not wanted.
 
     Photos are key images: no track says where they are.
     """
     if not run.options.mapping.key_images:
-        return list(range(len(takes.take)))
+        return list(range(len(image_set.sequence)))
     index: list[int] = []
     for video, own in enumerate(videos):
         frames = own.chosen.frames
         tracks = pose_tracks(run, own.tracks).keep_frames(frames)
         found = key_images_of_video(run, tracks, own.chosen, own.inter_share)
-        index += (found + takes.images_of(video).start).tolist()
-    return index + list(range(takes.images_of(len(videos)).start, len(takes.take)))
+        index += (found + image_set.images_of(video).start).tolist()
+    return index + list(range(image_set.images_of(len(videos)).start, len(image_set.sequence)))
 
 
 def _pose_density(run: Run) -> DensityOptions:
@@ -181,7 +181,9 @@ def _pose_density(run: Run) -> DensityOptions:
     )
 
 
-def _selected_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> list[SelectedTracks]:
+def _selected_tracks(
+    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet
+) -> list[SelectedTracks]:
     """A spread selection of the tracks of each video, for poses."""
     density = _pose_density(run)
     selected = []
@@ -189,14 +191,14 @@ def _selected_tracks(run: Run, videos: Sequence[VideoTracks], takes: Takes) -> l
         with run.clock.measure("pairs"):
             tracks = pose_tracks(run, own.tracks)
             fast = fast_frames(tracks)
-            sparse = select_tracks(tracks.keep_frames(takes.of_video(video).frames), density)
+            sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
         path = run.shown[video].video.path
         selected.append(SelectedTracks(path, sparse, own.inter_share, fast))
     return selected
 
 
 def _match_images(
-    run: Run, videos: Sequence[VideoTracks], takes: Takes, index: Sequence[int]
+    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, index: Sequence[int]
 ) -> ImageMatches:
     """Match the key images, that are some of all images.
 
@@ -207,17 +209,17 @@ def _match_images(
     groups = ImageMatchOptions(
         options.pairs, options.verify, options.links, least_length(options.tracks)
     )
-    keyed = takes.some(index)
+    keyed = image_set.some(index)
 
     def cameras(paired: PairedImages) -> ImageCameras:
         if run.cameras is not None:
             return replace(run.cameras, of_images=[run.cameras.of_images[i] for i in index])
         shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in run.shown]
         photos = run.inputs.photos
-        if options.camera.camera_params is not None or len(index) == len(takes.take):
+        if options.camera.camera_params is not None or len(index) == len(image_set.sequence):
             return new_cameras(paired, keyed, shapes, photos, options.camera, context=context)
-        every = pair_videos(takes, _selected_tracks(run, videos, takes), groups, context)
-        made = new_cameras(every, takes, shapes, photos, options.camera, context=context)
+        every = pair_videos(image_set, _selected_tracks(run, videos, image_set), groups, context)
+        made = new_cameras(every, image_set, shapes, photos, options.camera, context=context)
         return replace(made, of_images=[made.of_images[i] for i in index])
 
     return match_images(
@@ -229,5 +231,5 @@ def _match_images(
         options=groups,
         context=context,
         name=run.inputs.name,
-        images_apart=len(takes.take) / len(keyed.take),
+        images_apart=len(image_set.sequence) / len(keyed.sequence),
     )

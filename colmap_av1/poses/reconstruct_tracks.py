@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.positions import ImagePositions
-from colmap_av1.images.takes import Pictures, ShownVideo, Takes, pictures_of
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.gaps import fast_frames
@@ -92,10 +92,10 @@ class Run:
         """Name and digest of each photo, which stages depend on."""
         return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
 
-    def pictures(self, takes: Takes) -> Pictures:
+    def pictures(self, image_set: ImageSet) -> Pictures:
         """What gives the pictures of images, see `pictures_of`."""
         photos = [photo.path for photo in self.inputs.photos]
-        return pictures_of(takes, self.shown, photos, self.options.match.reading)
+        return pictures_of(image_set, self.shown, photos, self.options.match.reading)
 
 
 @dataclass(frozen=True)

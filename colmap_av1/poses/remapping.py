@@ -25,7 +25,7 @@ from colmap_av1.geometry.posed_model import (
     write_posed_model,
 )
 from colmap_av1.geometry.track_points import seen_in, to_model_points
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
@@ -75,13 +75,13 @@ class RemappedResult(PosesResult):
 
 
 def remap_stage(
-    run: Run, takes: Takes, adjusted: Kept[AdjustedResult], *, number: int
+    run: Run, image_set: ImageSet, adjusted: Kept[AdjustedResult], *, number: int
 ) -> Kept[RemappedResult]:
     """Map the images again, by the observations that their poses were adjusted on.
 
     Args:
         run: what every stage is given.
-        takes: the images.
+        image_set: the images.
         adjusted: the stage that adjusted them.
         number: of the mapping, 2 or more.
     """
@@ -89,15 +89,15 @@ def remap_stage(
 
     def make(partial: Path) -> RemappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
-        tracks = tracks_of_model(known, takes)
+        tracks = tracks_of_model(known, image_set)
         with run.clock.measure("poses"):
-            found = _map_tracks(run, takes, known, tracks)
+            found = _map_tracks(run, image_set, known, tracks)
         poses = found if found is not None else known
         write_posed_model(partial / f"{name}.npz", PosedModel(poses.cameras, poses.images))
         kept = cost = new_cost = 0.0
         if found is not None:
             with run.clock.measure("adjustment"):
-                kept, cost, new_cost = _costs(run, takes, known, found, tracks)
+                kept, cost, new_cost = _costs(run, image_set, known, found, tracks)
         return RemappedResult(
             f"{name}.npz", len(poses.images), {}, kept=kept, cost=cost, new_cost=new_cost
         )
@@ -120,11 +120,13 @@ def remap_stage(
     )
 
 
-def _map_tracks(run: Run, takes: Takes, known: PosedModel, tracks: Tracks) -> PosedModel | None:
+def _map_tracks(
+    run: Run, image_set: ImageSet, known: PosedModel, tracks: Tracks
+) -> PosedModel | None:
     """Map the images of a model by its tracks, with COLMAP's global mapper; None: it failed."""
     options = run.options
     cameras = [known.cameras[image.camera_id] for image in known.images]
-    frames = posed_images_of(known, takes).frames
+    frames = posed_images_of(known, image_set).frames
     min_matches = options.match.pairs.min_matches
     paired = pair_by_tracks(tracks, frames, lambda own: covisible_pairs(own, min_matches))
     matched = verify_images(paired, cameras, options.match.verify, run.context)
@@ -151,13 +153,13 @@ def _map_tracks(run: Run, takes: Takes, known: PosedModel, tracks: Tracks) -> Po
 
 
 def _costs(
-    run: Run, takes: Takes, known: PosedModel, found: PosedModel, tracks: Tracks
+    run: Run, image_set: ImageSet, known: PosedModel, found: PosedModel, tracks: Tracks
 ) -> tuple[float, float, float]:
     """Compare a model with another start, adjusted on the observations of the model's points.
 
     Args:
         run: what every stage is given.
-        takes: the images.
+        image_set: the images.
         known: the model, with points.
         found: poses of all its images, or of some.
         tracks: the observations of the model, see `tracks_of_model`.
@@ -166,7 +168,7 @@ def _costs(
         The share of the observations in images of `found` that agree with it, and their mean robust
         costs by both.
     """
-    placed = posed_images_of(found, takes)
+    placed = posed_images_of(found, image_set)
     in_both = np.isin(tracks.frame, placed.frames)
     seen, view = seen_in(tracks, placed.frames)
     agreeing = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import tracks_of_points
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches
 from colmap_av1.tracks.tracks import Tracks
@@ -17,13 +17,13 @@ from colmap_av1.tracks.tracks import Tracks
 Pairs = NDArray[np.int32]
 
 
-def tracks_of_model(model: PosedModel, takes: Takes) -> Tracks:
+def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
     """The observations of a model's points as tracks through the frames of its images."""
-    frame_of = dict(zip(takes.images.names, takes.images.frames.tolist(), strict=True))
+    frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
     frames = np.array([frame_of[image.name] for image in model.images], np.int32)
     cameras = model.cameras.values()
     size = max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
-    return tracks_of_points(model.points, frames, takes.num_frames, size)
+    return tracks_of_points(model.points, frames, image_set.num_frames, size)
 
 
 def pair_by_tracks(

@@ -30,7 +30,7 @@ from colmap_av1.geometry.undistortion import (
     undistortion,
 )
 from colmap_av1.images.files import read_image, write_image, write_images
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.dynamic.short_tracks import surely_still
 from colmap_av1.poses.reconstruct_poses import (
     PosedImages,
@@ -118,23 +118,23 @@ def _written_images(
     def report(count: int) -> None:
         progress("images", done + count, len(names))
 
-    for take in np.unique(placed.take).tolist():
-        own = np.flatnonzero(placed.take == take)
-        first = int(placed.first_frame[take])
-        if take < len(run.sources):
+    for sequence in np.unique(placed.sequence).tolist():
+        own = np.flatnonzero(placed.sequence == sequence)
+        first = int(placed.first_frame[sequence])
+        if sequence < len(run.sources):
             write_images(
-                run.sources[take].pictures,
+                run.sources[sequence].pictures,
                 folder,
                 [names[i] for i in own],
                 (placed.frames[own] - first).tolist(),
                 num_threads=options.match.run.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=partial(change, first),
-                kept=run.sources[take].kept,
+                kept=run.sources[sequence].kept,
                 progress=report,
             )
         else:
-            photo = run.inputs.photos[take - len(run.sources)]
+            photo = run.inputs.photos[sequence - len(run.sources)]
             (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
             shown = _undistorted(read_image(photo.path), undistort[int(own[0])])
             write_image(folder / photo.name, shown)
@@ -164,7 +164,7 @@ def _written_cloud(
     return swept_cloud(
         tracked,
         views,
-        placed.take,
+        placed.sequence,
         show,
         max_points=options.max_points,
         num_threads=run.options.match.run.num_threads,
@@ -174,7 +174,7 @@ def _written_cloud(
 
 def _coloured(
     run: Run,
-    takes: Takes,
+    image_set: ImageSet,
     placed: PosedImages,
     views: Sequence[PosedCamera],
     cloud: ModelPoints,
@@ -186,10 +186,10 @@ def _coloured(
     The images themselves are not read: decompressing them takes several times as long.
     """
     colours = Colours(cloud, [view.size for view in views])
-    places = np.searchsorted(takes.images.frames, placed.frames).tolist()
+    places = np.searchsorted(image_set.images.frames, placed.frames).tolist()
     index_of = {place: index for index, place in enumerate(places)}
     with run.clock.measure("colours"):
-        for done, (place, picture) in enumerate(run.pictures(takes)(places), start=1):
+        for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
             index = index_of[place]
             colours.add(index, picture, undistort[index])
             run.progress("colours", done, len(views))
@@ -240,7 +240,7 @@ class ModelResult:
 def model_stage(
     run: Run,
     tracks: Tracks,
-    takes: Takes,
+    image_set: ImageSet,
     moving: Mapping[str, Mask],
     posed: Kept[PosesResult],
 ) -> Kept[ModelResult]:
@@ -248,8 +248,8 @@ def model_stage(
 
     Args:
         run: what every stage is given.
-        tracks: the tracks of all takes, without those of what moves by itself.
-        takes: all images.
+        tracks: the tracks of all sequences, without those of what moves by itself.
+        image_set: all images.
         moving: by the names of images, masks that leave out what moves.
         posed: the stage that holds the poses.
     """
@@ -257,7 +257,7 @@ def model_stage(
     masked = run.inputs.masks is not None or options.moving == "mask"
 
     def make(partial: Path) -> ModelResult:
-        placed = read_posed_images(run, posed, takes)
+        placed = read_posed_images(run, posed, image_set)
         cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
         images = placed.images
         given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
@@ -274,7 +274,7 @@ def model_stage(
         check_unchanged(*run.files)
         with clock.measure("coverage"):
             covered = coverage(views, cloud.xyz)
-        cloud = _coloured(run, takes, placed, views, cloud, undistort=undistort)
+        cloud = _coloured(run, image_set, placed, views, cloud, undistort=undistort)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import read_posed_model
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
 from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_poses
 from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
@@ -50,17 +50,17 @@ class FurtherModel:
 
 
 def written_model(
-    run: Run, posed: Posed, takes: Takes
+    run: Run, posed: Posed, image_set: ImageSet
 ) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
     """Place the model in the world, and write it with all points."""
     assert run.positions is not None
-    placed = place_stage(run, takes, posed.last, run.positions)
+    placed = place_stage(run, image_set, posed.last, run.positions)
     tracks = Tracks.concatenate(posed.tracks, posed.links)
-    return placed, model_stage(run, tracks, takes, posed.moving, placed)
+    return placed, model_stage(run, tracks, image_set, posed.moving, placed)
 
 
 def further_models(
-    run: Run, first: Posed, takes: Takes
+    run: Run, first: Posed, image_set: ImageSet
 ) -> tuple[tuple[FurtherModel, ...], list[str]]:
     """Write the models of images that nothing connects with those of the first, in a folder each.
 
@@ -71,10 +71,10 @@ def further_models(
     Returns:
         The models, and the names of the images that are in none, in the order of their frames.
     """
-    placed = read_posed_images(run, first.last, takes).images
-    left = set(takes.images.names) - {image.name for image in placed}
+    placed = read_posed_images(run, first.last, image_set).images
+    left = set(image_set.images.names) - {image.name for image in placed}
     mapped = first.mapped
-    keyed = takes.some(first.matches.result.key_images)
+    keyed = image_set.some(first.matches.result.key_images)
     found: list[FurtherModel] = []
     for poses in mapped.result.other_models:
         known = set(read_posed_model(run.stages / poses).by_name)
@@ -82,19 +82,19 @@ def further_models(
             continue
         own = _run_of_model(run, len(found) + 1)
         own_poses = _poses_of_model(run, own, mapped, poses)
-        some, key = _named(takes, known | left), _named(keyed, known)
+        some, key = _named(image_set, known | left), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
-        believed = believed_tracks(run, videos, takes)
+        believed = believed_tracks(run, videos, image_set)
         posed = refined_poses(
             own,
             first.matches,
             own_poses,
             believed=believed,
-            takes=some,
+            image_set=some,
             keyed=key,
             in_place=first.in_place,
         )
-        new = _named(takes, left)
+        new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
         if len(images) < LEAST_IMAGES:
             continue
@@ -111,12 +111,12 @@ def further_models(
             )
         )
     _remove_further_models(run, len(found) + 1)
-    return tuple(found), [name for name in takes.images.names if name in left]
+    return tuple(found), [name for name in image_set.images.names if name in left]
 
 
-def _named(takes: Takes, names: AbstractSet[str]) -> Takes:
+def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:
     """The images of some names."""
-    return takes.some([i for i, name in enumerate(takes.images.names) if name in names])
+    return image_set.some([i for i, name in enumerate(image_set.images.names) if name in names])
 
 
 def _run_of_model(run: Run, number: int) -> Run:

@@ -73,7 +73,7 @@ class Sweep:
     Args:
         points: points of tracks.
         views: the images, by the index that observations have.
-        takes: int32 [num_images] the video of each image; pictures of one are compared.
+        sequence: int32 [num_images] sequence of each image; pictures of one are compared.
         num_threads: threads that compare; they are there as long as the context.
     """
 
@@ -81,16 +81,16 @@ class Sweep:
         self,
         points: ModelPoints,
         views: Sequence[PosedCamera],
-        takes: NDArray[np.int32],
+        sequence: NDArray[np.int32],
         *,
         num_threads: int,
     ) -> None:
-        self._views, self._takes = views, takes
+        self._views, self._sequence = views, sequence
         self._observed = _nearest_observed(points, views)
         keys = evenly_spread(len(views), min(-(-len(views) // _EVERY), _MOST_IMAGES))
         some = points.xyz[evenly_spread(len(points.xyz), _MOST_POINTS)]
         self._near = {key: _near_depth(views[key], some) for key in keys}
-        self._others = {key: _others(key, self._near[key], views, takes) for key in keys}
+        self._others = {key: _others(key, self._near[key], views, sequence) for key in keys}
         self._needed = {image for key in keys for image in (key, *self._others[key])}
         self._left = sorted(keys)
         self._greys: dict[int, Grey] = {}
@@ -133,7 +133,7 @@ class Sweep:
         nearest = self._near[key] * _NEARER
         swept = sweep_image(views, key, greys, xy, nearest, threads=self._threads)
         swept = swept.take(_is_supported(swept.xy, swept.depth))
-        swept = swept.take(~_hides(swept, views, self._takes, self._observed))
+        swept = swept.take(~_hides(swept, views, self._sequence, self._observed))
         own = _as_points(swept, views)
         exact = own.error <= _MOST_ERROR * greys[key].factor
         self._found.append(take_points(own, np.flatnonzero(exact)))
@@ -161,12 +161,12 @@ def _near_depth(view: PosedCamera, xyz: _Floats) -> float:
 
 
 def _others(
-    key: int, near: float, views: Sequence[PosedCamera], takes: NDArray[np.int32]
+    key: int, near: float, views: Sequence[PosedCamera], sequence: NDArray[np.int32]
 ) -> list[int]:
     """The images that one is compared with: of its video, and apart enough to tell depths."""
 
     def there(steps: int) -> bool:
-        return 0 <= key + steps < len(views) and takes[key + steps] == takes[key]
+        return 0 <= key + steps < len(views) and sequence[key + steps] == sequence[key]
 
     def motion(image: int) -> float:
         focal = views[key].camera.mean_focal_length() / shrinking(views[key].size)
@@ -218,7 +218,7 @@ def _is_supported(xy: _Floats, depth: _Floats) -> NDArray[np.bool_]:
 def _hides(
     swept: Swept,
     views: Sequence[PosedCamera],
-    takes: NDArray[np.int32],
+    sequence: NDArray[np.int32],
     observed: Sequence[_Floats],
 ) -> NDArray[np.bool_]:
     """Whether points would hide what tracks show in the images before and after."""
@@ -226,7 +226,7 @@ def _hides(
     hides, seen = np.zeros(len(xyz)), np.zeros(len(xyz))
     first, last = swept.image - _HIDES_IN, swept.image + _HIDES_IN
     for image in range(max(first, 0), min(last, len(views) - 1) + 1):
-        if image == swept.image or takes[image] != takes[swept.image]:
+        if image == swept.image or sequence[image] != sequence[swept.image]:
             continue
         index, xy, depth = views[image].project(xyz)
         column, row = (xy // CELL).astype(np.int64).T

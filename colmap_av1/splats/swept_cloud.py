@@ -21,7 +21,7 @@ Look = Callable[[int, NDArray[np.uint8]], None]
 def swept_cloud(
     tracked: ModelPoints,
     views: Sequence[PosedCamera],
-    takes: NDArray[np.int32],
+    sequence: NDArray[np.int32],
     show: Callable[[Look], None],
     *,
     max_points: int | None,
@@ -33,13 +33,13 @@ def swept_cloud(
     Args:
         tracked: points of tracks.
         views: the images, by the index that observations have.
-        takes: int32 [num_images] the video of each.
+        sequence: int32 [num_images] the video of each.
         show: gives the pictures of videos to what looks at them, in their order.
         max_points: points at most; None: any number.
         num_threads: see `RunOptions`.
         clock: measures the stages "sweep", but for what `show` measures itself, and "cloud".
     """
-    with Sweep(tracked, views, takes, num_threads=threads_or_cpus(num_threads)) as sweep:
+    with Sweep(tracked, views, sequence, num_threads=threads_or_cpus(num_threads)) as sweep:
         show(sweep.add)
         with clock.measure("sweep"):
             swept = sweep.result()

@@ -162,7 +162,7 @@ def test_nothing_is_decoded_where_motion_connects_all(
     def refuse(*_: object, **__: object) -> Iterator[None]:
         raise AssertionError("a picture is decoded")
 
-    monkeypatch.setattr("colmap_av1.images.takes.decodable_frames", refuse)
+    monkeypatch.setattr("colmap_av1.images.image_set.decodable_frames", refuse)
     report = match(tmp_path / "a.db", SCENE)
     assert report.links.num_images == 0
 

@@ -18,7 +18,7 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import MapperOptions
 from colmap_av1.poses.corners.in_images import place_anew
 from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, adjustment_stage
@@ -118,10 +118,10 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
     run = SimpleNamespace(
         options=options, stages=tmp_path, clock=Clock(), progress=no_progress, positions=None
     )
-    takes = Takes(
+    image_set = ImageSet(
         ("",),
         ChosenImages([image.name for image in images], placed.frames),
-        placed.take,
+        placed.sequence,
         placed.first_frame,
         placed.masks,
     )
@@ -130,7 +130,7 @@ def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
             cast(Any, run),
             tracks,
             links,
-            takes,
+            image_set,
             Kept(PosesResult("placed.npz", NUM_IMAGES, {}), "", resumed=False),
         ),
         corners=lambda _, known: (tracks, known),

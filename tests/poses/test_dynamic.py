@@ -27,8 +27,8 @@ from colmap_av1.geometry.triangulation import (
     Views,
     triangulate,
 )
+from colmap_av1.images.image_set import ShownVideo
 from colmap_av1.images.masks import mask_tracks
-from colmap_av1.images.takes import ShownVideo
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
@@ -321,7 +321,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
             for frame, name in enumerate(names)
         ],
         frames=frames,
-        take=np.zeros(NUM_FRAMES, np.int32),
+        sequence=np.zeros(NUM_FRAMES, np.int32),
         first_frame=np.array([0, every.num_frames]),
         cameras={7: truth.camera},
         masks=(None,) * NUM_FRAMES,

@@ -80,9 +80,9 @@ def on_wall(*, through: bool = False) -> ModelPoints:
 
 
 def sweep(
-    points: ModelPoints, pictures=None, views=VIEWS, takes=ONE_VIDEO, num_threads=2
+    points: ModelPoints, pictures=None, views=VIEWS, image_set=ONE_VIDEO, num_threads=2
 ) -> ModelPoints:
-    with Sweep(points, views, takes, num_threads=num_threads) as found:
+    with Sweep(points, views, image_set, num_threads=num_threads) as found:
         for image, picture in enumerate(PICTURES) if pictures is None else pictures:
             found.add(image, picture)
         return found.result()
@@ -132,7 +132,7 @@ def test_nothing_hides_what_tracks_show() -> None:
 
 
 def test_only_pictures_of_one_video_are_compared() -> None:
-    assert len(sweep(on_wall(), takes=np.arange(NUM_VIEWS, dtype=np.int32)).xyz) == 0
+    assert len(sweep(on_wall(), image_set=np.arange(NUM_VIEWS, dtype=np.int32)).xyz) == 0
 
 
 def test_what_masks_leave_out_is_not_looked_for() -> None:

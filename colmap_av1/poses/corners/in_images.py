@@ -63,7 +63,7 @@ def _followed(
     image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(placed.take == video)
+        own = np.flatnonzero(placed.sequence == video)
         if len(own) == 0:
             continue
         first = int(placed.first_frame[video])

@@ -17,7 +17,7 @@ from colmap_av1.geometry.coverage import PosedCamera, views_of
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.images.takes import Takes
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import RefineOptions
 from colmap_av1.poses.reconstruct_poses import FOR_POSES, PosedImages
 from colmap_av1.poses.reconstruct_tracks import Run
@@ -35,10 +35,10 @@ _PREDICTED_SIGMA = 1.0
 _LK = RefineOptions(refine="lk")
 
 
-def has_moving_masks(takes: Takes) -> bool:
+def has_moving_masks(image_set: ImageSet) -> bool:
     """Whether what masks leave out of a video changes from image to image."""
-    videos = (takes.images_of(video) for video in range(len(takes.videos)))
-    return any(len({takes.masks[image] for image in images}) > 1 for images in videos)
+    videos = (image_set.images_of(video) for video in range(len(image_set.videos)))
+    return any(len({image_set.masks[image] for image in images}) > 1 for images in videos)
 
 
 def follow_behind(
@@ -63,7 +63,7 @@ def follow_behind(
     masks = placed.masks_with(moving)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(placed.take == video)
+        own = np.flatnonzero(placed.sequence == video)
         frames = placed.frames[own]
         seen, view = seen_in(tracks, frames)
         if len(view) == 0:

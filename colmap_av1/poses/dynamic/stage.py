@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import chaining_for_points, seen_in, triangulate_tracks
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
-from colmap_av1.images.takes import Takes
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
 from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
@@ -44,19 +44,19 @@ class DynamicResult:
 
 
 def moving_stage(
-    run: Run, tracks: Tracks, takes: Takes, posed: Kept[PosesResult]
+    run: Run, tracks: Tracks, image_set: ImageSet, posed: Kept[PosesResult]
 ) -> Kept[DynamicResult]:
     """Find the regions of each image that move by themselves."""
 
     def make(partial: Path) -> DynamicResult:
-        placed = read_posed_images(run, posed, takes)
+        placed = read_posed_images(run, posed, image_set)
         found: dict[str, Mask] = {}
         with run.clock.measure("moving"):
-            for video in range(len(takes.videos)):
-                own = np.flatnonzero(placed.take == video)
+            for video in range(len(image_set.videos)):
+                own = np.flatnonzero(placed.sequence == video)
                 if len(own) >= _FEWEST_IMAGES:
                     found |= _moving_in_video(run, tracks, placed, own)
-                run.progress("moving", video + 1, len(takes.videos))
+                run.progress("moving", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
         left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
         return DynamicResult(left_out)
@@ -84,9 +84,11 @@ def read_moving(stages: Path) -> dict[str, Mask]:
         }
 
 
-def without_moving(tracks: Tracks, takes: Takes, moving: Mapping[str, Mask], run: Run) -> Tracks:
-    """The tracks of all takes where nothing moves by itself, see `mask_tracks`."""
-    images = takes.images
+def without_moving(
+    tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], run: Run
+) -> Tracks:
+    """The tracks of all sequences where nothing moves by itself, see `mask_tracks`."""
+    images = image_set.images
     by_frame = {
         frame: moving[name]
         for frame, name in zip(images.frames.tolist(), images.names, strict=True)

@@ -14,8 +14,8 @@ from colmap_av1.database.reading import PosePrior
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.undistortion import pinhole_camera
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.positions import ImagePositions
-from colmap_av1.images.takes import Takes
 from colmap_av1.poses.placing.placement import (
     PLACE_FILE,
     Surroundings,
@@ -42,25 +42,25 @@ class PlaceResult(PosesResult):
 
 
 def place_stage(
-    run: Run, takes: Takes, posed: Kept[PosesResult], positions: ImagePositions
+    run: Run, image_set: ImageSet, posed: Kept[PosesResult], positions: ImagePositions
 ) -> Kept[PlaceResult]:
     """Place the posed images where positions, gravity and a known distance say.
 
     Args:
         run: the run.
-        takes: the images.
+        image_set: the images.
         posed: the stage with the poses.
-        positions: what is known of where the images of `takes` were taken.
+        positions: what is known of where the images of `image_set` were taken.
     """
     options, seed = run.options.place, run.options.match.run.seed
     file = f"{run.stages.name}/in_place.npz"
 
     def make(partial: Path) -> PlaceResult:
-        placed = read_posed_images(run, posed, takes)
+        placed = read_posed_images(run, posed, image_set)
         with run.clock.measure("place"):
             # Marks are in pictures as the model's folder holds them.
             pinholes = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
-            known = _surroundings(run, takes, placed, positions)
+            known = _surroundings(run, image_set, placed, positions)
             found = find_placement(placed.images, pinholes, known, options, seed)
         write_place(partial, found)
         images = placed.images
@@ -94,13 +94,13 @@ def _moved_images(images: Sequence[ModelImage], move: Any) -> list[ModelImage]:
 
 
 def _surroundings(
-    run: Run, takes: Takes, placed: PosedImages, positions: ImagePositions
+    run: Run, image_set: ImageSet, placed: PosedImages, positions: ImagePositions
 ) -> Surroundings:
-    index = {name: i for i, name in enumerate(takes.images.names)}
+    index = {name: i for i, name in enumerate(image_set.images.names)}
     own = [index[image.name] for image in placed.images]
     places = positions.places
     priors = {
-        takes.images.names[i]: PosePrior(places[i], is_cartesian=False)
+        image_set.images.names[i]: PosePrior(places[i], is_cartesian=False)
         for i in own
         if np.isfinite(places[i]).all()
     }
@@ -114,7 +114,7 @@ def _surroundings(
                 images[i].cam_from_world,
                 up,
             )
-            for i, picture in run.pictures(takes)(sorted(images))
+            for i, picture in run.pictures(image_set)(sorted(images))
         ]
 
     gravity = positions.gravity[own]

@@ -25,32 +25,33 @@ Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
 
 
 @dataclass(frozen=True)
-class Takes:
-    """Images that were taken together: those of each video, and every photo by itself.
+class ImageSet:
+    """The frames of videos and the photos that become images.
 
-    Frames are counted through all takes in a row: a photo is a take of one frame.
+    Every video is a sequence of frames, and every photo is a sequence of one frame. Frames are
+    numbered through all sequences, in the order of the sequences.
 
     Attributes:
-        videos: what messages call the videos, which are the first takes; '' of a lone one.
-        images: the images, with their names among all images and frames counted through.
-        take: int32 [num_images] the take of each image, ascending.
-        first_frame: int64 [num_takes + 1] frame at which each take begins, and their number.
-        masks: of each image, which of its pixels count; None: all.
+        videos: what messages call the videos, which are the first sequences; '' of a lone one.
+        images: their names among all images, and frames numbered through all sequences.
+        sequence: int32 [num_images] the sequence of each image, ascending.
+        first_frame: int64 [num_sequences + 1] first frame of each sequence, and `num_frames`.
+        masks: the pixels of each image that count; None: all.
     """
 
     videos: tuple[str, ...]
     images: ChosenImages
-    take: NDArray[np.int32]
+    sequence: NDArray[np.int32]
     first_frame: NDArray[np.int64]
     masks: tuple[Mask | None, ...]
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of all takes."""
+        """Number of frames of all sequences."""
         return int(self.first_frame[-1])
 
     @property
-    def num_takes(self) -> int:
+    def num_sequences(self) -> int:
         """Number of videos and photos."""
         return len(self.first_frame) - 1
 
@@ -61,17 +62,17 @@ class Takes:
             return None
         return 1.0 - sum(m.share if m is not None else 1.0 for m in self.masks) / len(self.masks)
 
-    def images_of(self, take: int) -> range:
-        """The images of a take."""
-        first, last = np.searchsorted(self.take, [take, take + 1])
+    def images_of(self, sequence: int) -> range:
+        """The images of a sequence."""
+        first, last = np.searchsorted(self.sequence, [sequence, sequence + 1])
         return range(int(first), int(last))
 
-    def some(self, index: Sequence[int] | NDArray[np.int64]) -> Takes:
+    def some(self, index: Sequence[int] | NDArray[np.int64]) -> ImageSet:
         """Some of the images, by their index, ascending."""
         chosen = np.asarray(index, dtype=np.int64)
         masks = tuple(self.masks[i] for i in chosen)
-        taken = self.take[chosen]
-        return replace(self, images=self.images.some(index), take=taken, masks=masks)
+        taken = self.sequence[chosen]
+        return replace(self, images=self.images.some(index), sequence=taken, masks=masks)
 
     def of_video(self, video: int) -> ChosenImages:
         """The images of a video, at the frames of its own."""
@@ -88,7 +89,7 @@ def count_through(
     photos: Sequence[str] = (),
     *,
     masks: Sequence[Sequence[Mask | None]] = (),
-) -> Takes:
+) -> ImageSet:
     """Count the images of videos and photos through.
 
     Args:
@@ -107,7 +108,7 @@ def count_through(
     frames = [own.frames + first[video] for video, own in enumerate(chosen)]
     counts = [*(len(own.names) for own in chosen), *(1 for _ in photos)]
     found = [mask for own in masks for mask in own]
-    return Takes(
+    return ImageSet(
         tuple(videos),
         ChosenImages(
             [*names, *photos],
@@ -164,7 +165,7 @@ class ShownVideo:
 
 
 def pictures_of(
-    takes: Takes,
+    image_set: ImageSet,
     videos: Sequence[ShownVideo],
     photos: Sequence[Path],
     options: ReadOptions,
@@ -172,7 +173,7 @@ def pictures_of(
     """What gives the pictures of images.
 
     Args:
-        takes: the images.
+        image_set: the images.
         videos: the videos.
         photos: the files of the photos.
         options: how videos are decoded.
@@ -185,8 +186,8 @@ def pictures_of(
     def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
         left = set(wanted)
         for number, shown in enumerate(videos):
-            own = takes.of_video(number)
-            first = takes.images_of(number).start
+            own = image_set.of_video(number)
+            first = image_set.images_of(number).start
             image_of = {
                 int(frame): first + index
                 for index, frame in enumerate(own.frames)
@@ -198,7 +199,7 @@ def pictures_of(
                 )
                 for frame, picture in decoded:
                     yield image_of[frame], picture
-        first_photo = len(takes.take) - len(photos)
+        first_photo = len(image_set.sequence) - len(photos)
         for index, photo in enumerate(photos, start=first_photo):
             if index in left:
                 yield index, read_image(photo)
