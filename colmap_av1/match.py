@@ -37,7 +37,7 @@ from colmap_av1.matching.match_images import (
     match_images,
 )
 from colmap_av1.matching.shutter.correct import without_shutter
-from colmap_av1.options import ImageOptions, MatchOptions, ReconstructOptions
+from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
@@ -238,8 +238,9 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        # Listed cameras may be guesses, which leave the poses of pairs wrong.
-        poses = found.poses if isinstance(found, JointMatches) and not listed else ()
+        # With a guessed focal length the poses of pairs are wrong, and say nothing.
+        known = all(camera.has_prior_focal_length for camera in found.cameras)
+        poses = found.poses if isinstance(found, JointMatches) and known else ()
         written = demote_bad_initial_pairs(found.matched, found.cameras, clock, poses)
         num_written, blurred = 0, list[str]()
         if folder is not None:
@@ -354,15 +355,21 @@ class _Images:
 
 def _is_joint(folder: Path | None, options: MatchOptions) -> bool:
     """Whether matches are to agree with a joint estimate, which has one camera for a video."""
+    verify, pairs = options.verify.verify, PairOptions(min_matches=options.pairs.min_matches)
     each = options.camera.single_camera is False
-    if options.verify.verify == "auto":
-        return folder is not None and not each
-    if options.verify.verify == "joint" and each:
+    if verify == "joint" and each:
         raise OptionError(
             "verify is 'joint', which estimates one camera for all images of a video: leave out "
             "--single_camera, or give --verify pairs"
         )
-    return options.verify.verify == "joint"
+    if verify == "joint" and options.pairs != pairs:
+        raise OptionError(
+            "verify is 'joint', which chooses the pairs itself: leave out --offsets, --growth and "
+            "--max_span, or give --verify pairs"
+        )
+    if verify == "auto":
+        return folder is not None and not each and options.pairs == pairs
+    return verify == "joint"
 
 
 def _prepare(
@@ -430,16 +437,21 @@ def _match_images(
         scratch: the folder.
         options: all options.
         context: gets the stages.
+
+    Raises:
+        ModelError: the joint estimate fails, and `options.verify` asks for one.
+        VideoError: nothing connects any two images.
     """
     if scratch is None:
         return _match_pairs(images, cameras, options, context)
-    if cameras is not None and _has_several_cameras(images.image_set, cameras):
-        reason = "the database has several cameras for the images of one video"
-    else:
-        try:
-            return _match_jointly(images, cameras, scratch, options, context)
-        except (ModelError, VideoError) as error:
-            reason = str(error)
+    try:
+        if cameras is not None and _has_several_cameras(images.image_set, cameras):
+            raise ModelError("the database has several cameras for the images of one video")
+        return _match_jointly(images, cameras, scratch, options, context)
+    except (ModelError, VideoError) as error:
+        if options.verify.verify == "joint":
+            raise
+        reason = str(error).rpartition(": ")[0] or str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"

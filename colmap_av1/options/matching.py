@@ -73,7 +73,7 @@ class VerifyOptions(Options):
         "auto",
         "joint: estimate the poses of all images, as reconstruct does, and match what agrees with "
         "them; pairs: verify each pair of images on its own matches; auto: joint if images are "
-        "written or exist, else pairs",
+        "written or exist and neither pairs nor a camera per image are asked for, else pairs",
         common=True,
     )
     max_error: float = option(

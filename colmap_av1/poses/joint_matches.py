@@ -30,7 +30,7 @@ from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
 from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks, pose_tracks
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
-from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
+from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept
@@ -53,6 +53,10 @@ _MOST_PAIRS = 16
 _FEW = 3
 # Most keypoints per image of tracks with three observations, by the density preset; 0: no limit.
 _MOST_MOTION = {"sparse": 450, "default": 900, "dense": 0}
+# A motion track this close to a corner, in pixels, sees the same point, less exactly.
+_SAME_POINT = 1.0
+# Two tracks of one video this close to each other are the same.
+_SAME_TRACK = 0.01
 # Most matches of the initial pair.
 _MOST_STARTING = 300
 # Images without a pose that a warning names.
@@ -120,8 +124,8 @@ def match_jointly(
         raise ModelError("pictures far apart in time contradict the poses")
     known = read_posed_model(run.stages / posed.last.result.poses)
     with run.clock.measure("pairs"):
-        agreeing = _agreeing_tracks(run, posed.tracks, known, image_set, density)
-        paired = _paired(run, posed, image_set, agreeing, density)
+        agreeing = _agreeing_tracks(run, posed, image_set, known, density)
+        paired = _paired(run, image_set, agreeing, density)
     cameras = _cameras(run, image_set, known)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     matches = posed.matches.result
@@ -153,6 +157,7 @@ class _Agreeing:
         placed: these images.
         tracks: the tracks, with all observations that agree; first the corners, then motion.
         num_corners: number of the corners.
+        others: tracks that images without a pose see.
         start: the pair of images that a mapper is to begin with, and the tracks to match it by;
             None: there is no such pair.
     """
@@ -160,18 +165,26 @@ class _Agreeing:
     placed: PosedImages
     tracks: Tracks
     num_corners: int
+    others: Tracks
     start: StartingPair | None
 
 
 def _agreeing_tracks(
-    run: Run, tracks: Tracks, known: PosedModel, image_set: ImageSet, density: DensityOptions
+    run: Run, posed: Posed, image_set: ImageSet, known: PosedModel, density: DensityOptions
 ) -> _Agreeing:
     """The corners of a model and a selection of motion tracks, without what disagrees with it."""
+    assert posed.adjustment is not None  # `match` always adjusts
     placed = posed_images_of(known, image_set)
-    every = pose_tracks(run, tracks).keep_frames(placed.frames)
-    corners, corner_points = _agreeing_corners(known, image_set)
+    others = _tracks_of_unregistered(run, posed, image_set, placed, density)
+    num_motion = posed.adjustment.result.num_motion_points
+    corners, corner_points = _agreeing_corners(known, num_motion, image_set)
+    repeated = at_same_place(corners, others, _SAME_TRACK)
+    corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
+    every = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
+    every = every.keep_tracks(~at_same_place(every, others, _SAME_TRACK))
     # `_kept_observations` applies the limit per image, when it knows what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
+    some = some.keep_tracks(~at_same_place(some, corners, _SAME_POINT))
     motion, motion_points = _agreeing_motion(run, some, placed)
     both = Tracks.concatenate(corners, motion)
     start = _start(both, np.concatenate([corner_points, motion_points]), placed)
@@ -181,17 +194,28 @@ def _agreeing_tracks(
         if start is not None:
             of_pair = np.zeros(wide.num_tracks, np.bool_)
             of_pair[start.points] = True
-            first = both.num_tracks
-            both = Tracks.concatenate(both, wide.keep_tracks(of_pair))
-            start = replace(start, points=np.arange(first, both.num_tracks))
-    return _Agreeing(placed, both, corners.num_tracks, start)
+            first = wide.keep_tracks(of_pair)
+            corners = corners.keep_tracks(~at_same_place(corners, first, _SAME_POINT))
+            motion = motion.keep_tracks(~at_same_place(motion, first, _SAME_TRACK))
+            both = Tracks.concatenate(corners, motion, first)
+            start = replace(start, points=np.arange(both.num_tracks)[-first.num_tracks :])
+    return _Agreeing(placed, both, corners.num_tracks, others, start)
 
 
-def _agreeing_corners(known: PosedModel, image_set: ImageSet) -> tuple[Tracks, NDArray[np.float64]]:
-    """The tracks that a model was adjusted on, without what disagrees, and their points."""
+def _agreeing_corners(
+    known: PosedModel, num_motion: int, image_set: ImageSet
+) -> tuple[Tracks, NDArray[np.float64]]:
+    """The corners and links that a model was adjusted on, without what disagrees, and their points.
+
+    Args:
+        known: the model.
+        num_motion: number of its points that motion tracks see, which come first.
+        image_set: all images.
+    """
     errors = reprojection_errors(known)
     adjusted = tracks_of_model(known, image_set)
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
+    agrees &= adjusted.track >= num_motion
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _FEW
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
@@ -225,8 +249,15 @@ def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> 
     return replace(start, points=start.points[::step])
 
 
-def _kept_observations(agreeing: _Agreeing, density: DensityOptions) -> NDArray[np.bool_]:
+def _kept_observations(
+    agreeing: _Agreeing, frames: NDArray[np.int32], density: DensityOptions
+) -> NDArray[np.bool_]:
     """Which observations are matched: few of most motion tracks, all of others.
+
+    Args:
+        agreeing: the tracks.
+        frames: int32 [num_images] the frames of all images.
+        density: which motion tracks are matched.
 
     Returns:
         bool [num_observations].
@@ -238,7 +269,7 @@ def _kept_observations(agreeing: _Agreeing, density: DensityOptions) -> NDArray[
     if motion.num_tracks:
         longest = spread_observations(motion, _WHOLE)
         is_long = np.add.reduceat(longest, motion.offsets[:-1]) > 0
-        few = _first_middle_last(motion, np.searchsorted(agreeing.placed.frames, motion.frame))
+        few = _first_middle_last(motion, np.searchsorted(frames, motion.frame))
         few[np.repeat(is_long, motion.lengths)] = False
         most = density.max_tracks_per_image
         limits = replace(
@@ -281,22 +312,13 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
 
 
 def _paired(
-    run: Run, posed: Posed, image_set: ImageSet, agreeing: _Agreeing, density: DensityOptions
+    run: Run, image_set: ImageSet, agreeing: _Agreeing, density: DensityOptions
 ) -> PairedImages:
     """Match all images: those with a pose along what agrees with it, the others along all."""
     frames, start = image_set.images.frames, agreeing.start
-    kept = _kept_observations(agreeing, density)
-    matched = agreeing.tracks.keep_observations(kept)
+    kept = _kept_observations(agreeing, frames, density)
+    matched = Tracks.concatenate(agreeing.tracks.keep_observations(kept), agreeing.others)
     placed = agreeing.placed.frames
-    left = np.setdiff1d(frames, placed)
-    unplaced = [
-        _touching(own, left, frames)
-        for own in (
-            select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density),
-            posed.links,
-        )
-        if len(left)
-    ]
     pair = list[int]()
     if start is not None:
         pair = np.searchsorted(frames, placed[[start.first, start.second]]).tolist()
@@ -308,7 +330,7 @@ def _paired(
             return pairs
         return np.unique(np.vstack([pairs, np.array(pair, np.int32)]), axis=0)
 
-    paired = pair_by_tracks(Tracks.concatenate(matched, *unplaced), frames, choose)
+    paired = pair_by_tracks(matched, frames, choose)
     if start is None:
         return paired
     # Tracks are numbered anew where some keep no observation.
@@ -321,12 +343,18 @@ def _paired(
     return replace(paired, matches=matches)
 
 
-def _touching(tracks: Tracks, left: NDArray[np.int32], frames: NDArray[np.int32]) -> Tracks:
-    """The tracks that are seen in some of the frames, in all frames of images."""
-    if tracks.num_tracks == 0:
-        return tracks
-    seen = np.isin(tracks.frame, left)
-    return tracks.keep_tracks(np.add.reduceat(seen, tracks.offsets[:-1]) > 0).keep_frames(frames)
+def _tracks_of_unregistered(
+    run: Run, posed: Posed, image_set: ImageSet, placed: PosedImages, density: DensityOptions
+) -> Tracks:
+    """The motion tracks and links that images without a pose see, in all images."""
+    frames = image_set.images.frames
+    left = np.setdiff1d(frames, placed.frames)
+    if len(left) == 0:
+        return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
+    motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
+    seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
+    touching = np.add.reduceat(np.isin(seen.frame, left), seen.offsets[:-1]) > 0
+    return seen.keep_tracks(touching)
 
 
 def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
@@ -340,17 +368,17 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
     listed = read_images(database)
     names = [image.name for image in listed]
     matched = dict(zip(names, listed_cameras(database, listed, names), strict=True))
-    adjusted = {image.name: known.cameras[image.camera_id] for image in known.images}
-    of_sequence: dict[int, pycolmap.Camera] = {}
-    for sequence, name in zip(image_set.sequence.tolist(), image_set.images.names, strict=True):
-        if name not in matched:
-            continue
-        if matched[name].has_prior_focal_length and name in adjusted:
-            of_sequence[sequence] = adjusted[name]
-            of_sequence[sequence].has_prior_focal_length = True  # models do not say so
-        else:
-            of_sequence.setdefault(sequence, matched[name])
-    return [of_sequence[sequence] for sequence in image_set.sequence.tolist()]
+    named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
+    first = {sequence: matched[name] for sequence, name in named if name in matched}
+    adjusted = dict[int, pycolmap.Camera]()
+    for image in known.images:
+        camera = matched.get(image.name)
+        if camera is not None and camera.has_prior_focal_length:
+            adjusted[id(camera)] = known.cameras[image.camera_id]
+            adjusted[id(camera)].has_prior_focal_length = True  # models do not hold it
+    # Images share a camera if it is the same object, see `ImageMatches`.
+    cameras = [first[sequence] for sequence, _ in named]
+    return [adjusted.get(id(camera), camera) for camera in cameras]
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:

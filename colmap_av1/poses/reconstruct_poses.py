@@ -108,10 +108,13 @@ class AdjustedResult(PosesResult):
     """What `adjustment_stage` found.
 
     Attributes:
+        num_motion_points: points of motion tracks, which come first; those of corners and links
+            follow.
         doubtful_seams: names of neighbouring images that few points join.
         seams_warning: what the user should know of them.
     """
 
+    num_motion_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
     seams_warning: str | None
 
@@ -370,7 +373,7 @@ def adjustment_stage(
             with run.clock.measure("refinement"):
                 spread = follow(spread, placed)
         linked = links.keep_frames(placed.frames)
-        sets = [(Tracks.concatenate(spread, linked), FOR_POSES)]
+        sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
         if corners is not None:
             with run.clock.measure("refinement"):
                 followed, placed = corners(Tracks.concatenate(spread, linked), placed)
@@ -378,19 +381,23 @@ def adjustment_stage(
             sets = [(few, _BESIDE_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as model:
             folder = Path(model)
-            num_points = _write_black_points(run, folder, placed, sets)
-            check_agreement(num_points, spread.num_tracks)
+            points = [_black_points(run, placed, *own) for own in sets]
+            check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
+            write_model(folder, placed.cameras, placed.images, joined_points(points))
             run.progress("adjustment", 0, 1)
             adjust_in(run, folder)
             run.progress("adjustment", 1, 1)
             adjusted = without_unseen_images(folder)
         joints = model_joints(adjusted)
         result = posed_model(adjusted, with_points=True)
+        # Point ids count from 1, in the order of the points.
+        is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
             registered=_registered(result, image_set),
+            num_motion_points=int(is_motion.sum()),
             doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
             seams_warning=joints.warning,
         )
@@ -419,18 +426,6 @@ def adjust_in(run: Run, folder: Path) -> None:
         num_threads=run.options.mapping.mapper_threads,
         log=run.stages / "adjustment.log",
     )
-
-
-def _write_black_points(
-    run: Run,
-    folder: Path,
-    placed: PosedImages,
-    sets: Sequence[tuple[Tracks, TriangulateOptions]],
-) -> int:
-    """Write a model of the images and of points of sets of tracks; returns how many points."""
-    points = joined_points([_black_points(run, placed, *own) for own in sets])
-    write_model(folder, placed.cameras, placed.images, points)
-    return len(points.xyz)
 
 
 def _black_points(

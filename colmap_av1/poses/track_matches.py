@@ -26,6 +26,32 @@ def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
     return tracks_of_points(model.points, frames, image_set.num_frames, size)
 
 
+def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np.bool_]:
+    """Which tracks some image shows at the place of another track.
+
+    Args:
+        tracks: the tracks.
+        others: tracks through the same frames, in the same pixels.
+        distance: pixels. Observations up to this far apart are at the same place, and some that
+            are up to three times as far apart, as cells of this size are compared.
+
+    Returns:
+        bool [num_tracks].
+    """
+    if tracks.num_tracks == 0 or others.num_tracks == 0:
+        return np.zeros(tracks.num_tracks, np.bool_)
+    columns = int(max(tracks.width, others.width) / distance) + 3
+    rows = int(max(tracks.height, others.height) / distance) + 3
+
+    def cells(own: Tracks) -> NDArray[np.int64]:
+        column, row = (own.xy / distance).astype(np.int64).T + 1
+        return (own.frame.astype(np.int64) * rows + row) * columns + column
+
+    around = np.array([dy * columns + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    is_there = np.isin(cells(tracks), (cells(others)[:, None] + around).ravel())
+    return np.add.reduceat(is_there, tracks.offsets[:-1]) > 0
+
+
 def pair_by_tracks(
     tracks: Tracks, frames: NDArray[np.int32], choose: Callable[[list[ImageKeypoints]], Pairs]
 ) -> PairedImages:

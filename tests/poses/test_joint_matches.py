@@ -13,9 +13,10 @@ import numpy as np
 import pycolmap
 import pytest
 from dense_scene import SCENE, Truth
+from scipy.spatial import cKDTree
 
 from colmap_av1.database.reading import read_cameras
-from colmap_av1.errors import OptionError
+from colmap_av1.errors import ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.match import MatchReport, match
@@ -25,6 +26,7 @@ from colmap_av1.options import (
     ImageOptions,
     LinkOptions,
     MatchOptions,
+    PairOptions,
     RunOptions,
     VerifyOptions,
 )
@@ -91,6 +93,39 @@ def test_the_camera_is_that_of_the_estimate(joint: MatchReport, truth: Truth) ->
     assert camera.focal_length_x == pytest.approx(joint.focal_length)
 
 
+def test_no_track_has_two_keypoints_in_an_image(joint: MatchReport) -> None:
+    with sqlite3.connect(joint.database) as connection:
+        for rows, data in connection.execute("SELECT rows, data FROM keypoints"):
+            xy = np.frombuffer(data, np.float32).reshape(rows, -1)[:, :2]
+            near, _ = cKDTree(xy).query(xy, k=2)
+            assert near[:, 1].min() > 0.01
+
+
+def test_pairs_that_are_asked_for(joint: MatchReport, tmp_path: Path) -> None:
+    """A joint estimate chooses the pairs itself."""
+    images, asked = joint.image_path, PairOptions(offsets=(1, 2), growth=1)
+    report = match(
+        tmp_path / "a.db", SCENE, image_path=images, options=replace(OPTIONS, pairs=asked)
+    )
+    assert report.estimate is None
+    assert report.num_pairs == 2 * joint.num_images - 3
+    options = replace(OPTIONS, pairs=asked, verify=VerifyOptions(verify="joint"))
+    with pytest.raises(OptionError, match="offsets"):
+        match(tmp_path / "b.db", SCENE, image_path=images, options=options)
+
+
+def test_a_failed_estimate_that_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("0\n4\n")
+    options = MatchOptions(
+        images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
+        density=DensityOptions(min_images=2),
+        verify=VerifyOptions(verify="joint"),
+    )
+    with pytest.raises((ModelError, VideoError)):
+        match(tmp_path / "a.db", SCENE, options=options)
+    assert not (tmp_path / "a.db").exists()
+
+
 def test_the_same_database_again(joint: MatchReport, tmp_path: Path) -> None:
     one = replace(OPTIONS, run=RunOptions(num_threads=1))
     match(tmp_path / "a.db", SCENE, image_path=joint.image_path, options=one)
@@ -151,12 +186,17 @@ def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
 def test_images_without_a_pose_keep_their_matches(
     encode: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """Of two scenes, an estimate holds the larger one."""
+    """Of two scenes, an estimate holds the larger one; both have its camera."""
     pictures = [picture for _, picture in decode_frames(SCENE)]
-    frames = np.stack([*pictures[:26], *(p[:, ::-1] for p in pictures[40:58])])
-    both = encode(frames, tmp_path / "both.mp4")
-    options = MatchOptions(links=LinkOptions(links="none"))
-    report = match(tmp_path / "a.db", both, image_path=tmp_path / "images", options=options)
+    videos = [
+        encode(np.stack(pictures[:26]), tmp_path / "one.mp4"),
+        encode(np.stack([p[:, ::-1] for p in pictures[40:58]]), tmp_path / "two.mp4"),
+    ]
+    options = MatchOptions(
+        links=LinkOptions(links="none"), camera=CameraOptions(single_camera=True)
+    )
+    report = match(tmp_path / "a.db", videos, image_path=tmp_path / "images", options=options)
+    assert len(read_cameras(report.database)) == 1
     assert report.estimate is not None
     left = report.num_images - report.estimate.num_registered
     assert left >= 15
