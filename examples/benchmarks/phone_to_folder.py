@@ -1,11 +1,15 @@
-"""Measure the way from a video as it was shot to the folder that trainers open, beside SIFT.
+"""Measure the way from the original video to a model, compared with SIFT.
 
 python examples/benchmarks/phone_to_folder.py --cache benchmark_phone
 
-For each clip `reconstruct` makes the folder from the file: conversion, and all that follows on
-the AV1 stream. Then ffmpeg writes the same images of the same file, and pycolmap extracts SIFT
-features, matches them sequentially and maps them, with its defaults. Every step has a process of
-its own. What is measured stays in the cache, so a run that was stopped is resumed.
+For each clip `reconstruct` makes a folder for trainers from the file: conversion, and all that
+follows on the AV1 stream. `match` makes a database from the same file with its defaults, which is
+mapped by the command that `match` prints, which is `colmap mapper` of the COLMAP that is installed,
+and by pycolmap's incremental mapper with the same options. Folder 0 counts: it is what users open,
+whether it is the largest model or not. Then ffmpeg writes the same images of the same file, and
+pycolmap extracts SIFT features, matches them sequentially and maps them, with its defaults.
+Intrinsics are given where they are known. Every step runs in a process of its own. What is measured
+stays in the cache, so a run that was stopped is resumed.
 """
 
 from __future__ import annotations
@@ -13,6 +17,8 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shutil
+import subprocess
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,6 +41,7 @@ from colmap_av1 import (
     MatchOptions,
     ReconstructOptions,
     encode,
+    match,
     reconstruct,
 )
 from colmap_av1.evaluate import (
@@ -99,7 +106,7 @@ class Row:
 
 
 # Which frames become images, where that is not left to `reconstruct`.
-IMAGES = {"kitchen": ImageOptions(every=2)}
+IMAGES = {"kitchen": ImageOptions(every=2), "kitchen_long": ImageOptions(num_images=322)}
 
 
 def main() -> int:
@@ -116,7 +123,7 @@ def main() -> int:
         help="sequences of ../shared, or phone_10s for a rendered clip of 10 seconds",
     )
     parser.add_argument(
-        "--ours", action="store_true", help="measure `reconstruct` alone; rows of SIFT stay"
+        "--ours", action="store_true", help="measure this package alone; rows of SIFT stay"
     )
     parser.add_argument(
         "--without_mapper",
@@ -132,6 +139,8 @@ def main() -> int:
             clip = clip_of(name, folder)
             console.print(f"{name}: reconstruct", markup=False)
             rows, names = measure_ours(clip, folder / "reconstruct")
+            console.print(f"{name}: match", markup=False)
+            rows += measure_match(clip, folder / "match")
             if not arguments.ours:
                 console.print(f"{name}: SIFT on {len(names)} images", markup=False)
                 mapped = not arguments.without_mapper
@@ -180,6 +189,73 @@ def measure_ours(clip: Clip, folder: Path) -> tuple[list[Row], list[str]]:
     return rows, sorted(path.name for path in (output / "images").iterdir())
 
 
+def measure_match(clip: Clip, folder: Path) -> list[Row]:
+    """Rows of `match`, of the mappers on its database, and of both together."""
+    database = folder / "database" / "a.db"
+    images = database.parent / "images"
+    log = folder / "log"
+
+    def fill() -> dict[str, Any]:
+        options = MatchOptions(images=clip.images, camera=clip.camera)
+        run = run_measured(run_match, clip.video, database, images, options, log=log)
+        num_images, command = run.result
+        return {"taken": taken(run), "num_images": num_images, "command": command}
+
+    given = [file_digest(clip.video), clip.images, clip.camera, pycolmap.__version__]
+    made = run_stage_in(database.parent, given, fill, products=[database, images], timed=True)
+    command = str(made.result["command"])
+    num_images = int(made.result["num_images"])
+    matched = row_of(clip, "match", made.result["taken"])
+    rows = [matched]
+    printed = database.with_name("a_model")
+    shutil.rmtree(printed, ignore_errors=True)
+    # `colmap mapper` is run as printed; pycolmap would bring the database to its own layout.
+    copy, output = folder / "copy.db", folder / "pycolmap"
+    shutil.copyfile(database, copy)
+    shutil.rmtree(output, ignore_errors=True)
+    forward = "--Mapper.init_max_forward_motion" in command
+    runs = {
+        render.MATCH_PYCOLMAP: (
+            run_measured(map_incrementally, copy, images, output, forward, log=log),
+            output / "0",
+        )
+    }
+    if shutil.which("colmap") is not None:
+        runs[render.MATCH_COLMAP] = (run_measured(run_command, command, log=log), printed / "0")
+    for way, (run, model) in runs.items():
+        mapper = row_of(clip, f"{way}: mapper", taken(run))
+        total = replace(sum_of(way, [matched, mapper]), images=num_images)
+        if model.is_dir():
+            straight = undistorted(model, images, folder / "undistorted")
+            figures = figures_of(clip, model, None, num_images) | ruler.far_views(*straight)
+            total = replace(total, **figures)
+        rows += [mapper, total]
+    return rows
+
+
+def run_match(video: Path, database: Path, images: Path, options: MatchOptions) -> tuple[int, str]:
+    """The number of images of a new database, and the command for COLMAP that `match` prints."""
+    report = match(database, video, image_path=images, options=options)
+    return report.num_images, report.next_commands[0]
+
+
+def run_command(words: str) -> None:
+    """Run a command line in a shell."""
+    subprocess.run(words, shell=True, check=True)
+
+
+def map_incrementally(database: Path, images: Path, output: Path, forward: bool) -> None:
+    """Map with pycolmap's incremental mapper; `forward`: with the options for forward motion."""
+    output.mkdir()
+    pycolmap.set_random_seed(0)
+    how = pycolmap.IncrementalPipelineOptions(random_seed=0)
+    if forward:
+        how.mapper.init_max_forward_motion = 1.0
+        how.ba_refine_focal_length = False
+        how.ba_refine_extra_params = False
+    pycolmap.incremental_mapping(database, images, output, options=how)
+
+
 def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) -> list[Row]:
     """Rows of the steps of SIFT on the same images, and of all of them."""
     steps, model, images = sift_of(clip, folder, names, mapped=mapped)
@@ -209,8 +285,9 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
         kept = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True)
         converted = kept.result
     keep_stream = None if is_av1 else stream
-    match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
-    options = ReconstructOptions(match=match)
+    options = ReconstructOptions(
+        match=MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
+    )
 
     def make() -> dict[str, Any]:
         log = output.parent / "log"
@@ -255,7 +332,7 @@ def sift_of(
         log = images.parent / "log"
         return taken(run_measured(run_ffmpeg, clip.video, images, names, frames, log=log))
 
-    def match() -> dict[str, Any]:
+    def extract_and_match() -> dict[str, Any]:
         log = database.parent / "log"
         extracted = run_measured(run_extraction, footage, database, log=log)
         matched = run_measured(run_matching, database, log=log)
@@ -264,7 +341,9 @@ def sift_of(
     given = [file_digest(clip.video), names]
     written = run_stage_in(images.parent, given, write, products=[images], timed=True).result
     given = [*given, clip.camera, pycolmap.__version__]
-    matching = run_stage_in(database.parent, given, match, products=[database], timed=True).result
+    matching = run_stage_in(
+        database.parent, given, extract_and_match, products=[database], timed=True
+    ).result
     steps = {"frames": written, **matching}
     if not mapped:
         return steps, None, images
@@ -350,6 +429,7 @@ def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) ->
 
 def undistorted(model: Path, images: Path, folder: Path) -> tuple[Path, Path]:
     """A model with straight lines and its images, to be measured; none of the time counts."""
+    shutil.rmtree(folder, ignore_errors=True)
     pycolmap.undistort_images(folder, model, images)
     return folder / "sparse", folder / "images"
 

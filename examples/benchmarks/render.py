@@ -244,12 +244,18 @@ COMPARED_WITH = {
 
 # Ways of `phone_to_folder.py`: as a whole, from the stream, and what both are compared with.
 FROM_FILE, FROM_STREAM, SIFT_FROM_FILE = "reconstruct", "reconstruct from AV1", "SIFT sequential"
+MATCH_PYCOLMAP, MATCH_COLMAP = "match, pycolmap", "match, COLMAP"
 
 
 def phone_to_folder(rows: list[Row]) -> str:
-    """Both ways from a file to a model, as wholes; SIFT's is less than that if not mapped."""
+    """Every way from a file to a model, as a whole; SIFT's is less than that if not mapped."""
     by_way = {(row["clip"], row["way"]): row for row in rows}
-    ways = {SIFT_FROM_FILE: "SIFT", FROM_FILE: "`reconstruct`"}
+    ways = {
+        SIFT_FROM_FILE: "SIFT, pycolmap",
+        MATCH_PYCOLMAP: "`match`, pycolmap",
+        MATCH_COLMAP: "`match`, COLMAP 3.8",
+        FROM_FILE: "`reconstruct`",
+    }
 
     def is_matched_only(row: Row) -> bool:
         return row["way"] == SIFT_FROM_FILE and not row["registered"]
@@ -264,7 +270,7 @@ def phone_to_folder(rows: list[Row]) -> str:
     def less(heading: str, name: str, spelling: str) -> Column:
         def cell(row: Row) -> str:
             sift = by_way.get((row["clip"], SIFT_FROM_FILE))
-            if row["way"] != FROM_FILE or sift is None or not row.get(name):
+            if row["way"] == SIFT_FROM_FILE or sift is None or not row.get(name):
                 return number(row, name, spelling)
             return compared(row, sift, name, spelling)
 
@@ -299,7 +305,7 @@ def phone_to_folder(rows: list[Row]) -> str:
         (row for row in rows if row["way"] in ways),
         key=lambda row: (
             [r["clip"] for r in rows].index(row["clip"]),
-            row["way"] != SIFT_FROM_FILE,
+            list(ways).index(row["way"]),
         ),
     )
     return f"{markdown(columns, shown, left=2)}\n{measured_at(shown, 'clip')}"
@@ -319,7 +325,7 @@ def phone_to_folder_steps(rows: list[Row]) -> str:
     return f"{markdown(columns, [{'clip': clip} for clip in clips])}\n{measured_at(rows, 'clip')}"
 
 
-_WHOLE = (FROM_FILE, SIFT_FROM_FILE)
+_WHOLE = (FROM_FILE, SIFT_FROM_FILE, MATCH_PYCOLMAP, MATCH_COLMAP)
 # What the ways that are stages of `reconstruct` begin with.
 STAGE = "stage: "
 _NOTABLE = 0.05  # CPU seconds of a stage
@@ -576,25 +582,6 @@ def loops(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
-def stock_mappers(rows: list[Row]) -> str:
-    """Folder 0 of each mapper as it is."""
-
-    def images(row: Row) -> str:
-        return f"{row['registered']} of {row['images']}"
-
-    columns = [
-        words("sequence, way", "sequence", "way"),
-        Column("images in folder 0", images),
-        words("models", "models"),
-        figure("points", "points", ",.0f"),
-        figure("error px", "error_px", ".3f"),
-        figure("centres off, of extent", "ate_of_extent", ".2%"),
-        figure("database CPU s", "database_cpu_s", ".1f"),
-        figure("mapper CPU s", "mapper_cpu_s", ".1f"),
-    ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
-
-
 def one_model(rows: list[Row]) -> str:
     """Models of what is cut, in several videos, fast, or seen again."""
 
@@ -704,7 +691,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "read_memory": plain,
     "rolling_shutter": rolling_shutter,
     "splats": splats,
-    "stock_mappers": stock_mappers,
     "one_model": one_model,
     "long_video": plain,
     "batch": plain,
