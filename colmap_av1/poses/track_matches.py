@@ -45,7 +45,7 @@ def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np
 
     def cells(own: Tracks) -> NDArray[np.int64]:
         at: NDArray[np.int64] = (own.xy / distance).astype(np.int64) + 1
-        return (own.frame * np.int64(rows) + at[:, 1]) * columns + at[:, 0]
+        return np.asarray((own.frame.astype(np.int64) * rows + at[:, 1]) * columns + at[:, 0])
 
     around = np.array([dy * columns + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     is_there = np.isin(cells(tracks), (cells(others)[:, None] + around).ravel())

@@ -430,6 +430,7 @@ def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) ->
 def undistorted(model: Path, images: Path, folder: Path) -> tuple[Path, Path]:
     """A model with straight lines and its images, to be measured; none of the time counts."""
     shutil.rmtree(folder, ignore_errors=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     pycolmap.undistort_images(folder, model, images)
     return folder / "sparse", folder / "images"
 
