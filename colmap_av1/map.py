@@ -151,7 +151,7 @@ def map_database(
         *placement.warnings,
         _missing(num_images, num_registered),
         # What the model itself shows says more than the matches it is made of.
-        *(found.joint_warnings or (few_matches_warning(thin_gaps),)),
+        *(found.seam_warnings or (few_matches_warning(thin_gaps),)),
         found.far_views.warning() if found.far_views else unreadable,
     )
     return MapReport(

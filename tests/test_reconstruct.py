@@ -308,10 +308,10 @@ def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path)
     shutil.copytree(made.output, output)
     before = contents(output)
     records = sorted((output / ".stages").glob("*.json"))
-    assert {record.stem for record in records} == {*STAGES, "joints"}
+    assert {record.stem for record in records} == {*STAGES, "seams"}
     part = records[5].read_text()[:-40]
     texts = ["", "[]", "7", "{", "null", '{"key": 3, "facts": null}', part]
-    texts += ['{"key": "", "facts": {}}', "[1]", '"joints"']
+    texts += ['{"key": "", "facts": {}}', "[1]", '"seams"']
     for record, text in zip(records, texts, strict=True):
         record.write_text(text)
     assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()

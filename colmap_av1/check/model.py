@@ -10,7 +10,7 @@ import pycolmap
 from colmap_av1.check.crossings import Crossings, model_crossings
 from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.poses.long_range import FarViews, model_far_views
-from colmap_av1.poses.seams import Joints, model_joints
+from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
 
 
@@ -20,27 +20,27 @@ class ModelCheck:
 
     Attributes:
         figures: its images, points, errors and focal length.
-        joints: the points that join neighbouring images.
+        seams: the points that join neighbouring images.
         crossings: the matches across neighbouring images; None without a database.
         far_views: the long-range check; None without an image folder.
     """
 
     figures: ModelFigures
-    joints: Joints
+    seams: Seams
     crossings: Crossings | None
     far_views: FarViews | None
 
     @property
-    def joint_warnings(self) -> tuple[str, ...]:
+    def seam_warnings(self) -> tuple[str, ...]:
         """Warnings about neighbouring images that are joined weakly or wrongly."""
-        found = (self.joints.warning, self.crossings.warning if self.crossings else None)
+        found = (self.seams.warning, self.crossings.warning if self.crossings else None)
         return tuple(warning for warning in found if warning is not None)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """All warnings; none if the model holds together."""
         far_warning = self.far_views.warning() if self.far_views else None
-        return (*((far_warning,) if far_warning is not None else ()), *self.joint_warnings)
+        return (*((far_warning,) if far_warning is not None else ()), *self.seam_warnings)
 
 
 def check_model(
@@ -66,7 +66,7 @@ def check_model(
     far_views = None if image_path is None else model_far_views(model, image_path, progress)
     return ModelCheck(
         figures=model_figures(model),
-        joints=model_joints(model),
+        seams=model_seams(model),
         crossings=None if database is None else model_crossings(model, database),
         far_views=far_views,
     )

@@ -13,6 +13,7 @@ from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
 from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
 from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.parts import split_stage
 from colmap_av1.poses.reconstruct_poses import (
     AdjustedResult,
     MappedResult,
@@ -29,6 +30,8 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Mappings of a run at most: the second one finds nearly all that a third one does.
 _MOST_MAPPINGS = 3
+# Times that what is left of a model is split at most.
+_MOST_SPLITS = 4
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,8 @@ def estimate_poses(
     """Estimate poses; where they do not hold together, again with links.
 
     These take the place of motion where few points join what lies on either side of two images, and
-    connect places seen again where pictures far apart in time contradict the poses.
+    connect places seen again where pictures far apart in time contradict the poses. Where nothing
+    holds the model together even so, it is split, see `parts`.
     """
     first: list[Posed] = []
 
@@ -117,7 +121,7 @@ def estimate_poses(
     options = run.options
     found = run_stage(
         run.stages,
-        "joints",
+        "seams",
         [
             [t.digest for t in tracked],
             image_set.videos,
@@ -131,9 +135,48 @@ def estimate_poses(
         make=make,
     ).result
     if first and not found.doubted and not found.apart:
-        return first[0]
+        return _split(run, first[0], image_set)
     again = _with_all_links(run) if found.apart else run
-    return _pose_stages(again, videos, image_set, tracked, doubted=found.doubted)
+    posed = _pose_stages(again, videos, image_set, tracked, doubted=found.doubted)
+    return _split(again, posed, image_set)
+
+
+def _split(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
+    """Split the poses at seams that nothing holds, and adjust the largest part on its own.
+
+    What held two sides together before may not agree once the largest part is adjusted on its own,
+    so its seams are looked at again.
+    """
+    for number in range(_MOST_MAPPINGS + 1, _MOST_MAPPINGS + _MOST_SPLITS + 1):
+        if posed.adjustment is None:
+            break
+        adjusted = posed.adjustment.result
+        seams = _seams_to_split(posed)
+        if not seams:
+            break
+        parts = split_stage(run, image_set, posed.mapped, posed.adjustment, seams, number=number)
+        if parts.result.num_registered == adjusted.num_registered:
+            break
+        frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
+        frames = [frame_of[first] for first, _ in seams]
+        posed = replace(
+            posed,
+            mapped=parts,
+            tracks=posed.tracks.split_after_frames(frames),
+            links=posed.links.split_after_frames(frames),
+        )
+        posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
+        posed = replace(posed, far_views=_far_views(run, posed, image_set))
+    return posed
+
+
+def _seams_to_split(posed: Posed) -> Sequence[tuple[str, str]]:
+    """Seams that do not hold: doubtful ones, too, if pictures far apart contradict the poses."""
+    assert posed.adjustment is not None
+    assert posed.far_views is not None
+    if posed.far_views.result.apart:
+        return posed.adjustment.result.doubtful_seams
+    return posed.adjustment.result.splits
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
@@ -189,10 +232,13 @@ def _pose_stages(
     links = matched.result.links
     if links.gaps or links.fast:
         posed = remapped_poses(run, posed, image_set)
-    far_views = far_view_stage(
-        run, posed.tracks, image_set, posed.moving, posed.last, linked=links.looked_again
-    )
-    return replace(posed, far_views=far_views)
+    return replace(posed, far_views=_far_views(run, posed, image_set))
+
+
+def _far_views(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
+    """The long-range check of the poses."""
+    linked = posed.matches.result.links.looked_again
+    return far_view_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
 
 
 def believed_tracks(
@@ -216,16 +262,27 @@ def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         again = remap_stage(run, image_set, adjustment, number=number)
         if not again.result.is_better:
             break
-        adjustment = adjustment_stage(
-            run,
-            posed.tracks,
-            posed.links,
-            image_set,
-            again,
-            corners=partial(corners_in_images, run, posed.moving),
-            number=number,
-        )
+        adjustment = _adjusted(run, posed, image_set, again, number=number)
     return replace(posed, adjustment=adjustment)
+
+
+def _adjusted(
+    run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
+) -> Kept[AdjustedResult]:
+    """Adjust poses by the tracks that are believed, see `adjustment_stage`."""
+    moving, in_place = posed.moving, posed.in_place
+    follows = in_place and (bool(moving) or has_moving_masks(image_set))
+    return adjustment_stage(
+        run,
+        posed.tracks,
+        posed.links,
+        image_set,
+        poses,
+        moved=posed.dynamic.digest if posed.dynamic is not None and moving else None,
+        follow=partial(follow_behind, run, moving) if follows else None,
+        corners=partial(corners_in_images, run, moving) if in_place else None,
+        number=number,
+    )
 
 
 def refined_poses(
@@ -250,35 +307,26 @@ def refined_poses(
         in_place: see `Posed`.
     """
     tracks, links = believed
-    resection = dynamic = adjustment = None
-    posed: Kept[PosesResult] = mapped
+    resection = dynamic = None
+    poses: Kept[PosesResult] = mapped
     if len(keyed.sequence) < len(image_set.sequence):
-        posed = resection = resection_stage(run, tracks, image_set, keyed, mapped)
+        poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        dynamic = moving_stage(run, tracks, image_set, posed)
+        dynamic = moving_stage(run, tracks, image_set, poses)
         moving = read_moving(run.stages)
     tracks, links = (without_moving(own, image_set, moving, run) for own in (tracks, links))
-    if run.options.mapping.adjust:
-        follows = in_place and (bool(moving) or has_moving_masks(image_set))
-        adjustment = adjustment_stage(
-            run,
-            tracks,
-            links,
-            image_set,
-            posed,
-            moved=dynamic.digest if dynamic is not None and moving else None,
-            follow=partial(follow_behind, run, moving) if follows else None,
-            corners=partial(corners_in_images, run, moving) if in_place else None,
-        )
-    return Posed(
+    posed = Posed(
         matches=matched,
         mapped=mapped,
         resection=resection,
         dynamic=dynamic,
-        adjustment=adjustment,
+        adjustment=None,
         tracks=tracks,
         links=links,
         moving=moving,
         in_place=in_place,
     )
+    if not run.options.mapping.adjust:
+        return posed
+    return replace(posed, adjustment=_adjusted(run, posed, image_set, poses))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, T
 from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
 from colmap_av1.poses.reconstruct_stages import MatchesResult
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
-from colmap_av1.poses.seams import model_joints
+from colmap_av1.poses.seams import model_seams
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress, no_progress, progress_in
@@ -111,11 +111,13 @@ class AdjustedResult(PosesResult):
         num_motion_points: points of motion tracks, which come first; those of corners and links
             follow.
         doubtful_seams: names of neighbouring images that few points join.
+        splits: names of those that nothing holds together, see `Seams.splits`.
         seams_warning: what the user should know of them.
     """
 
     num_motion_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
+    splits: tuple[tuple[str, str], ...]
     seams_warning: str | None
 
 
@@ -175,7 +177,7 @@ def pose_stage(
         return MappedResult(
             poses=files[0],
             num_registered=len(found[0].images),
-            registered=_registered(found[0], keyed),
+            registered=registered_by_video(found[0].by_name, keyed),
             mapper=mapper,
             other_models=tuple(files[1:]),
         )
@@ -211,13 +213,17 @@ def _largest_first(
     return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
 
 
-def _registered(model: PosedModel, image_set: ImageSet) -> dict[str, int]:
-    """Images with a pose of each of several videos, by its name."""
+def registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
+    """Number of registered images of each of several videos, by its name.
+
+    Args:
+        names: names of the registered images.
+        image_set: the images.
+    """
     if len(image_set.videos) == 1:
         return {}
-    posed = model.by_name
     return {
-        name: sum(image in posed for image in image_set.of_video(video).names)
+        name: sum(image in names for image in image_set.of_video(video).names)
         for video, name in enumerate(image_set.videos)
     }
 
@@ -269,7 +275,7 @@ def resection_stage(
             placed = _resect(run, tracks, image_set, known)
         model = PosedModel(known.cameras, placed)
         write_posed_model(partial / "placed.npz", model)
-        return PosesResult("placed.npz", len(placed), _registered(model, image_set))
+        return PosesResult("placed.npz", len(placed), registered_by_video(model.by_name, image_set))
 
     return run_stage(
         run.stages,
@@ -388,7 +394,7 @@ def adjustment_stage(
             adjust_in(run, folder)
             run.progress("adjustment", 1, 1)
             adjusted = without_unseen_images(folder)
-        joints = model_joints(adjusted)
+        seams = model_seams(adjusted)
         result = posed_model(adjusted, with_points=True)
         # Point ids count from 1, in the order of the points.
         is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
@@ -396,10 +402,11 @@ def adjustment_stage(
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
-            registered=_registered(result, image_set),
+            registered=registered_by_video(result.by_name, image_set),
             num_motion_points=int(is_motion.sum()),
-            doubtful_seams=tuple(joints.pairs[i] for i in joints.doubtful),
-            seams_warning=joints.warning,
+            doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
+            splits=tuple(seams.pairs[i] for i in seams.splits),
+            seams_warning=seams.warning,
         )
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)

@@ -16,23 +16,23 @@ from colmap_av1.images.names import natural_order, video_of
 
 # Two views of a point say nothing of how far one of them is from a third.
 _FEWEST_VIEWS = 3
-# A joint is doubtful, and may be looked at again, that has less than this share of the points that
-# the joints of a model usually have; and weak below the other. Jerks that links mend have 15 % and
+# A seam is doubtful, and may be looked at again, that has less than this share of the points that
+# the seams of a model usually have; and weak below the other. Jerks that links mend have 15 % and
 # more afterwards, models that were bent there 1 to 5 %.
 _DOUBTFUL = 0.15
 _WEAK = 0.07
-# Images between two that see a point, beyond which these say nothing of the joints between: a place
+# Images between two that see a point, beyond which these say nothing of the seams between: a place
 # seen again would count for all of the way there and back.
 _REACH = 10
-# So many points hold any joint, however many others have: bent ones had 50 at most.
+# So many points hold any seam, however many others have: bent ones had 50 at most.
 _ENOUGH = 100
-# Share of the points of usual joints that images before a joint share with those after it, however
+# Share of the points of usual seams that images before a seam share with those after it, however
 # far apart, from which on it is not weak: parts of a cut video may see each other elsewhere.
 _ELSEWHERE = 0.5
 # A point has depth where it is seen under this angle in degrees: many times what its error and that
 # of the poses come to.
 _LEAST_ANGLE = 0.2
-# The scale of a model is lost at a joint that less than this share of the usual points carry it
+# The scale of a model is lost at a seam that less than this share of the usual points carry it
 # across, though so many points have depth on either side. Where a camera stands still and turns by
 # as much as it sees at once none do; other clips, also those that jerk, have 7 % and more.
 _LOST = 0.03
@@ -40,11 +40,11 @@ _DEEP = 100
 
 
 @dataclass(frozen=True)
-class Joints:
+class Seams:
     """What joins neighbouring images of the same camera and folder.
 
     Attributes:
-        pairs: names of the images before and after each joint, in the order of their names.
+        pairs: names of the images before and after each seam, in the order of their names.
         num_points: int64 [n] points that join them: which images on both sides see, up to ten
             images apart, and three images at least.
         num_elsewhere: int64 [n] points that images on both sides see, however far apart.
@@ -62,7 +62,7 @@ class Joints:
 
     @property
     def weak(self) -> list[int]:
-        """Joints, by index, that hold far less than the others do: a model may be bent there."""
+        """Seams, by index, that hold far less than the others do: a model may be bent there."""
         if len(self.num_points) == 0:
             return []
         enough = _ELSEWHERE * float(np.median(self.num_points))
@@ -71,17 +71,36 @@ class Joints:
 
     @property
     def doubtful(self) -> list[int]:
-        """Joints, by index, that hold much less than the others do, the weak ones among them."""
+        """Seams, by index, that hold much less than the others do, the weak ones among them."""
         return self._below(_DOUBTFUL)
 
     @property
     def unscaled(self) -> list[int]:
-        """Joints, by index, across which nothing carries the scale of the model."""
+        """Seams, by index, across which nothing carries the scale of the model."""
         if len(self.num_points) == 0:
             return []
         # Much of a clip may be a turn.
         least = _LOST * float(np.quantile(self.num_scaled, 0.75))
         return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
+
+    @property
+    def splits(self) -> list[int]:
+        """Seams, by index, at which the model falls into parts.
+
+        These are the weak seams, and of every run of seams that do not carry the scale the one that
+        carries it least.
+        """
+        runs: list[list[int]] = []
+        for seam in self.unscaled:
+            if runs and runs[-1][-1] == seam - 1:
+                runs[-1].append(seam)
+            else:
+                runs.append([seam])
+        middle = {
+            min(run, key=lambda i: (int(self.num_scaled[i]), abs(2 * i - run[0] - run[-1])))
+            for run in runs
+        }
+        return sorted(middle | set(self.weak))
 
     def _below(self, share: float, most: float = math.inf) -> list[int]:
         if len(self.num_points) == 0:
@@ -121,18 +140,18 @@ class Joints:
         )
 
 
-def model_joints(reconstruction: Any) -> Joints:
+def model_seams(reconstruction: Any) -> Seams:
     """What joins neighbouring images in a model.
 
     Images that are neighbours in the order of their names, as frames of a video are named, have a
-    joint where one camera took both into one folder.
+    seam where one camera took both into one folder.
 
     Args:
         reconstruction: pycolmap.Reconstruction.
     """
-    images, joints = images_in_time(reconstruction)
+    images, seams = images_in_time(reconstruction)
     views, point, xyz = _seen_points(reconstruction, images)
-    num_images, num_joints = len(images), max(len(images) - 1, 0)
+    num_images, num_seams = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))
     views, point = views[order], point[order]
     near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
@@ -148,21 +167,21 @@ def model_joints(reconstruction: Any) -> Joints:
     np.maximum.at(deep_to, point[from_last], views[from_last])
 
     def between(start: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-        """How many points have each joint from `start` on and before `end`."""
+        """How many points have each seam from `start` on and before `end`."""
         some = start < end
         change = np.bincount(start[some], minlength=num_images + 1)
         change -= np.bincount(end[some], minlength=num_images + 1)
-        return np.cumsum(change)[:num_joints]
+        return np.cumsum(change)[:num_seams]
 
     deep = deep_from < num_images
     before = between(deep_from[deep], np.full(np.count_nonzero(deep), num_images))
     after = between(np.zeros(np.count_nonzero(deep), np.int64), deep_to[deep] + 1)
-    return Joints(
-        tuple((images[k].name, images[k + 1].name) for k in joints),
-        num_points=between(views[near], views[near + 1])[joints],
-        num_elsewhere=between(first, last)[joints],
-        num_scaled=between(deep_from, deep_to + 1)[joints],
-        num_deep=np.minimum(before, after)[joints],
+    return Seams(
+        tuple((images[k].name, images[k + 1].name) for k in seams),
+        num_points=between(views[near], views[near + 1])[seams],
+        num_elsewhere=between(first, last)[seams],
+        num_scaled=between(deep_from, deep_to + 1)[seams],
+        num_deep=np.minimum(before, after)[seams],
     )
 
 

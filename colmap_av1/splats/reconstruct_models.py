@@ -76,13 +76,15 @@ def further_models(
     mapped = first.mapped
     keyed = image_set.some(first.matches.result.key_images)
     found: list[FurtherModel] = []
-    for poses in mapped.result.other_models:
-        known = set(read_posed_model(run.stages / poses).by_name)
+    models = mapped.result.other_models
+    names = [set(read_posed_model(run.stages / poses).by_name) for poses in models]
+    for number, (poses, known) in enumerate(zip(models, names, strict=True)):
         if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
             continue
         own = _run_of_model(run, len(found) + 1)
         own_poses = _poses_of_model(run, own, mapped, poses)
-        some, key = _named(image_set, known | left), _named(keyed, known)
+        free = left.difference(*names[number + 1 :])
+        some, key = _named(image_set, known | free), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
         believed = believed_tracks(run, videos, image_set)
         posed = refined_poses(

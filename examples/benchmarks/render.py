@@ -582,6 +582,18 @@ def loops(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
 
+def walks(rows: list[Row]) -> str:
+    """Models of walks with fast turns."""
+    columns = [
+        words("walk", "walk"),
+        words("images", "images"),
+        words("registered", "registered"),
+        words("camera centres", "errors"),
+        words("warnings", "warnings"),
+    ]
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'walk')}"
+
+
 def one_model(rows: list[Row]) -> str:
     """Models of what is cut, in several videos, fast, or seen again."""
 
@@ -692,6 +704,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "rolling_shutter": rolling_shutter,
     "splats": splats,
     "one_model": one_model,
+    "walks": walks,
     "long_video": plain,
     "batch": plain,
     "image_pairs": plain,

@@ -44,13 +44,23 @@ def rays_of(camera: pycolmap.Camera, samples: int = 2) -> Floats:
     return np.concatenate([flat, np.ones((*flat.shape[:3], 1))], axis=3)
 
 
-def render(rays: Floats, cam_from_world: Floats, textures: list[NDArray[np.float32]]) -> Any:
+def render(
+    rays: Floats,
+    cam_from_world: Floats,
+    textures: list[NDArray[np.float32]],
+    *,
+    walls: Floats = ROOM,
+    boxes: Floats = BOXES,
+) -> Any:
     """A picture, uint8 [height, width, 3].
 
     Args:
         rays: as `rays_of` gives them.
         cam_from_world: float64 [height, 3, 4] pose of each row.
-        textures: as `make_textures` gives them.
+        textures: as `make_textures` gives them, for the faces across x, y and z of the room and
+            then of each box; they begin again if there are fewer.
+        walls: float64 [2, 3] least and largest corner of the room.
+        boxes: float64 [n, 2, 3] those of what stands in it.
     """
     rotation = cam_from_world[:, :, :3]
     origin = -np.einsum("nij,ni->nj", rotation, cam_from_world[:, :, 3])
@@ -58,8 +68,8 @@ def render(rays: Floats, cam_from_world: Floats, textures: list[NDArray[np.float
     start = origin[:, None, None, :].astype(np.float32)
     with np.errstate(divide="ignore"):
         step = 1 / direction
-    best, face = _leave(start, step)
-    for number, box in enumerate(BOXES.astype(np.float32)):
+    best, face = _leave(start, step, walls)
+    for number, box in enumerate(boxes.astype(np.float32)):
         near, axis = _enter(start, step, box)
         closer = near < best
         best = np.where(closer, near, best)
@@ -100,9 +110,9 @@ def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
     return made
 
 
-def _leave(start: Any, step: Any) -> tuple[Any, Any]:
+def _leave(start: Any, step: Any, walls: Floats) -> tuple[Any, Any]:
     """Where rays meet the room's walls from inside: distance along them, and the axis."""
-    low, high = ROOM.astype(np.float32)
+    low, high = walls.astype(np.float32)
     far = np.maximum((low - start) * step, (high - start) * step)
     axis = far.argmin(axis=-1)
     return far.min(axis=-1), axis

@@ -15,7 +15,7 @@ from colmap_av1.cli import main
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
 from colmap_av1.options import CameraOptions
-from colmap_av1.poses.seams import model_joints
+from colmap_av1.poses.seams import model_seams
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1
@@ -24,13 +24,13 @@ _SOUND = 0.95
 
 
 def test_model_that_holds_together(made: ReconstructReport) -> None:
-    joints = model_joints(read_model(made.output / "sparse" / "0"))
-    assert len(joints.pairs) == made.num_registered - 1
-    assert joints.weak == []
-    assert joints.warning is None
+    seams = model_seams(read_model(made.output / "sparse" / "0"))
+    assert len(seams.pairs) == made.num_registered - 1
+    assert seams.weak == []
+    assert seams.warning is None
 
 
-def test_a_joint_that_few_points_hold(
+def test_a_seam_that_few_points_hold(
     made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = read_model(made.output / "sparse" / "0")
@@ -45,10 +45,10 @@ def test_a_joint_that_few_points_hold(
     for _, point_id in sorted(joining)[:-_LEFT]:
         model.delete_point3D(point_id)
 
-    joints = model_joints(model)
+    seams = model_seams(model)
     first, second = by_name[middle - 1].name, by_name[middle].name
-    assert [joints.pairs[i] for i in joints.weak] == [(first, second)]
-    assert joints.num_points[joints.weak].tolist() == [_LEFT]
+    assert [seams.pairs[i] for i in seams.weak] == [(first, second)]
+    assert seams.num_points[seams.weak].tolist() == [_LEFT]
 
     model.write(tmp_path)
     words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
@@ -59,16 +59,16 @@ def test_a_joint_that_few_points_hold(
 def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
     """Thirty images in a row; 100 points join neighbours, 500 are seen by the first and last."""
     write_row(tmp_path, [[k, k + 1, k + 2] for k in range(28) for _ in range(100)], 500)
-    found = model_joints(read_model(tmp_path)).num_points
+    found = model_seams(read_model(tmp_path)).num_points
     assert found.tolist() == [600, *[200] * 27, 600]
 
 
-def test_a_cut_is_no_weak_joint_where_its_sides_see_each_other_elsewhere(tmp_path: Path) -> None:
+def test_a_cut_is_no_weak_seam_where_its_sides_see_each_other_elsewhere(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 20)
-    assert model_joints(read_model(tmp_path)).weak == [14]
+    assert model_seams(read_model(tmp_path)).weak == [14]
     write_row(tmp_path, views, 150)
-    assert model_joints(read_model(tmp_path)).weak == []
+    assert model_seams(read_model(tmp_path)).weak == []
 
 
 def write_row(folder: Path, views: list[list[int]], again: int) -> None:
@@ -183,17 +183,17 @@ def test_turns_that_something_is_seen_across(
     tmp_path: Path, degrees: float, aside: float, rest: int
 ) -> None:
     _walk_with_a_turn(tmp_path, degrees, aside, rest)
-    joints = model_joints(read_model(tmp_path))
-    assert joints.unscaled == []
-    assert joints.warning is None
+    seams = model_seams(read_model(tmp_path))
+    assert seams.unscaled == []
+    assert seams.warning is None
 
 
 def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80)
-    joints = model_joints(read_model(tmp_path))
-    assert joints.weak == []
-    lost = {joints.pairs[i] for i in joints.unscaled}
+    seams = model_seams(read_model(tmp_path))
+    assert seams.weak == []
+    lost = {seams.pairs[i] for i in seams.unscaled}
     assert len(lost) > len(turn) / 2
     assert lost <= set(pairwise(turn))
-    assert joints.warning is not None
-    assert joints.warning.startswith("nothing carries the scale from 'frame_0000")
+    assert seams.warning is not None
+    assert seams.warning.startswith("nothing carries the scale from 'frame_0000")

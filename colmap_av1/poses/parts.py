@@ -1,0 +1,138 @@
+"""The parts of a model that nothing holds together.
+
+An adjustment puts the two sides of a seam anywhere if hardly any point joins them, and gives them
+different scales if no point carries the scale across. Such a model is bent, although each side is
+straight. The sides become models of their own, as COLMAP's mapper leaves what it cannot connect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.reconstruct_poses import AdjustedResult, MappedResult, registered_by_video
+from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run
+from colmap_av1.util.graphs import connected_components
+from colmap_av1.util.stages import Kept, run_stage
+
+# Stretches of different videos with this many common points hold together, as for COLMAP's mapper.
+_BETWEEN_VIDEOS = 15
+# Stretches of one video that a seam separates need this many beyond the next seam, as at a place
+# that is seen again.
+_WITHIN_VIDEO = 100
+
+
+def split_stage(
+    run: Run,
+    image_set: ImageSet,
+    mapped: Kept[MappedResult],
+    adjusted: Kept[AdjustedResult],
+    seams: Sequence[tuple[str, str]],
+    *,
+    number: int,
+) -> Kept[MappedResult]:
+    """Split an adjusted model at seams that nothing holds.
+
+    Args:
+        run: what every stage is given.
+        image_set: all images.
+        mapped: the models that the mapper found.
+        adjusted: the first of these, adjusted.
+        seams: names of the images before and after each seam.
+        number: of the adjustment that follows.
+
+    Returns:
+        The poses of the largest part. The other parts, largest first, come before the mapper's
+        other models.
+    """
+    name = f"parts_{number}"
+
+    def make(partial: Path) -> MappedResult:
+        known = read_posed_model(run.stages / adjusted.result.poses)
+        parts = parts_of(known, image_set, seams)
+        (partial / name).mkdir()
+        files = [f"{name}/{part}.npz" for part in range(len(parts))]
+        for file, names in zip(files, parts, strict=True):
+            images = [image for image in known.images if image.name in names]
+            write_posed_model(partial / file, PosedModel(known.cameras, images))
+        return MappedResult(
+            poses=files[0],
+            num_registered=len(parts[0]),
+            registered=registered_by_video(parts[0], image_set),
+            mapper=mapped.result.mapper,
+            other_models=(*files[1:], *mapped.result.other_models),
+        )
+
+    return run_stage(
+        run.stages,
+        name,
+        [mapped.digest, adjusted.digest, seams, _BETWEEN_VIDEOS, _WITHIN_VIDEO],
+        MappedResult,
+        into=run.stages,
+        products=[name],
+        make=make,
+    )
+
+
+def parts_of(
+    model: PosedModel, image_set: ImageSet, seams: Sequence[tuple[str, str]]
+) -> list[AbstractSet[str]]:
+    """The names of the images of each part of a model, the largest part first.
+
+    The images between two seams of a video form a stretch. Stretches that see enough points in
+    common elsewhere than across the seam between them belong to the same part. Parts of fewer than
+    three images are left out, if there is a larger one.
+
+    Args:
+        model: the model with its points.
+        image_set: all images.
+        seams: names of the images before and after each seam.
+    """
+    before = {first for first, _ in seams}
+    registered = model.by_name
+    stretch: dict[str, int] = {}
+    sequence_of: list[int] = []
+    is_new = True
+    for name, sequence in zip(image_set.images.names, image_set.sequence.tolist(), strict=True):
+        if is_new or sequence_of[-1] != sequence:
+            sequence_of.append(sequence)
+        is_new = name in before
+        if name in registered:
+            stretch[name] = len(sequence_of) - 1
+    of_image = np.array([stretch[image.name] for image in model.images])
+    edges = _held(_common_points(model, of_image, len(sequence_of)), np.array(sequence_of))
+    component = connected_components(len(sequence_of), edges)[of_image]
+    names = np.array([image.name for image in model.images])
+    parts = [set(names[component == number].tolist()) for number in np.unique(component)]
+    parts.sort(key=lambda part: -len(part))
+    large = [part for part in parts if len(part) >= LEAST_IMAGES]
+    return [*(large or parts[:1])]
+
+
+def _common_points(
+    model: PosedModel, of_image: NDArray[np.int64], num_stretches: int
+) -> NDArray[np.int64]:
+    """Int64 [n, n] how many points two stretches both see."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+
+    points = model.points
+    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    seen = np.unique(np.column_stack([point, of_image[points.image]]), axis=0)
+    shape = (len(points.xyz), num_stretches)
+    sees = coo_array((np.ones(len(seen), np.int64), (seen[:, 0], seen[:, 1])), shape=shape).tocsr()
+    return np.asarray((sees.T @ sees).toarray())
+
+
+def _held(common: NDArray[np.int64], sequence: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The pairs of stretches that hold together, int64 [m, 2]."""
+    number = np.arange(len(sequence))
+    is_same = sequence[:, None] == sequence
+    is_next = is_same & (np.abs(number[:, None] - number) == 1)
+    least = np.where(is_same, _WITHIN_VIDEO, _BETWEEN_VIDEOS)
+    return np.argwhere((common >= least) & ~is_next)

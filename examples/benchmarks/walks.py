@@ -1,0 +1,217 @@
+"""Measure models of walks with fast turns: whole, in straight parts, or bent.
+
+python examples/benchmarks/walks.py --cache benchmark_walks
+
+Renders walks through three furnished rooms with plain walls, 320x240 at 25 frames a
+second. The camera turns by 8 to 12 degrees a frame at the doors, blurred by half a frame's motion.
+Each walk has its own furniture, turns and speed. The intrinsics are not given. Poses are exact.
+`reconstruct` runs with its defaults. A model is bent if its camera centres are off by more than 1 %
+of their extent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pycolmap
+import render
+import room
+from numpy.typing import NDArray
+from results import add_results, read_rows, save
+
+from colmap_av1 import ColmapAv1Error, reconstruct
+from colmap_av1.evaluate import model_poses, pose_errors
+from colmap_av1.geometry.colmap_model import read_model
+
+Floats = NDArray[np.float64]
+
+WIDTH, HEIGHT, FOCAL, RATE = 320, 240, 240.0, 25
+WALLS = np.array([[-9.0, -3.0, 0.0], [9.0, 3.0, 2.7]])
+DOORS = (-3.0, 3.0)  # x of the walls between the rooms
+BENT = 0.01
+# Pictures that a blurred frame is the mean of.
+NUM_BLURRED = 3
+NUM_FACES = 60  # with a texture of their own; cv2.remap takes pictures of up to 32767 rows
+PLAIN = 3.0  # standard deviation of plain walls in grey levels
+
+
+@dataclass(frozen=True)
+class Row:
+    """The models of a walk.
+
+    Attributes:
+        walk: seed of the walk.
+        images: chosen for it.
+        registered: images of each model, the largest first.
+        errors: error of the camera centres of each model, as a share of their extent.
+        warnings: what `reconstruct` warned of.
+    """
+
+    walk: str
+    images: int
+    registered: str
+    errors: str
+    warnings: str
+
+
+def main() -> int:
+    """Reconstruct each walk, and keep and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and models")
+    parser.add_argument("--walks", nargs="+", type=int, default=list(range(20)))
+    add_results(parser, "walks")
+    arguments = parser.parse_args()
+    for seed in arguments.walks:
+        folder = arguments.cache.resolve() / str(seed)
+        video = folder / "walk.mp4"
+        if not video.is_file():
+            folder.mkdir(parents=True, exist_ok=True)
+            make_clip(video, seed)
+        save(arguments.results, [asdict(measure(video, seed))], ("walk",))
+    print(render.walks(read_rows(arguments.results)), end="")
+    return 0
+
+
+def measure(video: Path, seed: int) -> Row:
+    """Reconstruct a walk."""
+    output = video.parent / "output"
+    shutil.rmtree(output, ignore_errors=True)
+    try:
+        report = reconstruct(video, output)
+    except ColmapAv1Error as error:
+        return Row(str(seed), 0, "", "", str(error))
+    truth = walk(seed)
+    folders = [output, *(model.output for model in report.other_models)]
+    models = [model_poses(read_model(own / "sparse" / "0"), len(truth)) for own in folders]
+    found = [pose_errors(model, truth) for model in models]
+    return Row(
+        str(seed),
+        report.num_images,
+        " + ".join(str(int(np.isfinite(model[:, 0, 0]).sum())) for model in models),
+        " + ".join("-" if own is None else f"{own.ate / own.extent:.2%}" for own in found),
+        "; ".join(report.warnings),
+    )
+
+
+def walk(seed: int) -> Floats:
+    """The poses of a walk, float64 [num_frames, 3, 4]."""
+    return _poses(*_path(seed))
+
+
+def _path(seed: int) -> tuple[Floats, Floats]:
+    """Where the camera is, float64 [n, 3] in metres, and its yaw, float64 [n] in degrees."""
+    rng = np.random.default_rng(seed)
+    speed = rng.uniform(0.03, 0.06)
+    yaw, x = [0.0], [rng.uniform(-8.0, -7.0)]
+
+    def go(to: float, moving: float) -> None:
+        frames = max(1, round(abs(to - yaw[-1]) / rng.uniform(8, 12)))
+        start = yaw[-1]
+        for k in range(1, frames + 1):
+            yaw.append(start + (to - start) * k / frames)
+            x.append(x[-1] + moving)
+
+    def ahead(frames: int) -> None:
+        for _ in range(frames):
+            yaw.append(yaw[-1])
+            x.append(x[-1] + speed)
+
+    for _ in range(2):
+        ahead(int(rng.integers(15, 30)))
+        side = float(rng.choice([-90, 90]))
+        go(side, 0.3 * speed)
+        ahead(int(rng.integers(8, 16)))
+        if rng.random() < 0.5:
+            go(-side, 0.3 * speed)
+            ahead(int(rng.integers(8, 16)))
+        go(0.0, 0.3 * speed)
+    ahead(20)
+    seconds = np.arange(len(x)) / RATE
+    sway = [
+        sum(np.sin(2 * np.pi * (f * seconds + rng.random())) / f for f in (0.7, 1.6, 3.0))
+        for _ in range(3)
+    ]
+    centre = np.column_stack([x, 0.03 * sway[0], 1.55 + 0.02 * sway[1]])
+    return centre, np.array(yaw) + 0.6 * sway[2]
+
+
+def _poses(centre: Floats, yaw: Floats) -> Floats:
+    angle = np.radians(yaw)
+    ahead = np.column_stack([np.cos(angle), np.sin(angle), np.full(len(yaw), -0.05)])
+    return room.look(centre, centre + ahead)
+
+
+def furniture(seed: int) -> Floats:
+    """What stands in the rooms, and the walls between them, float64 [n, 2, 3]."""
+    rng = np.random.default_rng(1000 + seed)
+    boxes = []
+    for x in DOORS:
+        boxes += [
+            [[x - 0.1, -3.0, 0.0], [x + 0.1, -0.6, 2.7]],
+            [[x - 0.1, 0.6, 0.0], [x + 0.1, 3.0, 2.7]],
+            [[x - 0.1, -0.6, 2.1], [x + 0.1, 0.6, 2.7]],
+        ]
+    for _ in range(16):
+        size = rng.uniform(0.3, 1.0, 3) * [1, 1, 2]
+        side = rng.choice([-1, 1])
+        at = np.array([rng.uniform(-8.5, 8.0), side * rng.uniform(1.2, 2.2), 0.0])
+        low = at - [0, size[1] / 2, 0]
+        boxes.append([low, low + size])
+    return np.array(boxes)
+
+
+def textures() -> list[NDArray[np.float32]]:
+    """Textures of the faces, see `room.render`: the room and some furniture are plain."""
+    made = room.make_textures(NUM_FACES)
+    plain = [128 + (texture - 128) * np.float32(PLAIN / 38) for texture in made[:3]]
+    return [*plain, *made[3:]]
+
+
+def pictures(seed: int) -> Iterator[NDArray[np.uint8]]:
+    """The frames of a walk, uint8 [HEIGHT, WIDTH, 3], BGR."""
+    camera = pycolmap.Camera(
+        model="PINHOLE",
+        width=WIDTH,
+        height=HEIGHT,
+        params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2],
+    )
+    rays = room.rays_of(camera, samples=1)
+    boxes = furniture(seed)
+    faces = textures()
+    centre, yaw = _path(seed)
+    rng = np.random.default_rng(3000 + seed)
+    for k in range(len(yaw)):
+        step = yaw[k] - yaw[max(k - 1, 0)]
+        parts = NUM_BLURRED if abs(step) > 1 else 1
+        angles = yaw[k] + step * 0.5 * (np.arange(parts) / parts - (parts - 1) / (2 * parts))
+        seen = [
+            room.render(rays, np.repeat(own[None], HEIGHT, 0), faces, walls=WALLS, boxes=boxes)
+            for own in _poses(np.repeat(centre[k][None], parts, 0), angles)
+        ]
+        noisy = np.mean(seen, axis=0) + rng.normal(0, 2.0, (HEIGHT, WIDTH, 3))
+        yield np.clip(noisy.round(), 0, 255).astype(np.uint8)
+
+
+def make_clip(path: Path, seed: int) -> None:
+    """Render a walk, and encode it as a phone does."""
+    raw = f"-f rawvideo -pix_fmt bgr24 -s {WIDTH}x{HEIGHT} -r {RATE} -i -".split()
+    encoder = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"]
+    subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *encoder, str(path)],
+        input=b"".join(picture.tobytes() for picture in pictures(seed)),
+        check=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
