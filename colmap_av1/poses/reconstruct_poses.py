@@ -507,8 +507,11 @@ def triangulate_in(
 ) -> TriangulatedPoints:
     """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
     return triangulate_tracks(
-        *(seen, view, placed.camera_of_image),
-        *([image.cam_from_world for image in placed.images], pinholes),
+        seen,
+        view,
+        placed.camera_of_image,
+        [image.cam_from_world for image in placed.images],
+        pinholes,
         options=options,
         num_threads=run.options.match.run.num_threads,
         progress=progress,

@@ -118,7 +118,10 @@ def match_stage(
         cameras, matched = found.cameras, found.matched
         with clock.measure("database"):
             write_matched_images(
-                *(partial / "database.db", keyed.images.names, cameras, matched),
+                partial / "database.db",
+                keyed.images.names,
+                cameras,
+                matched,
                 places=run.positions.places[index] if run.positions is not None else None,
             )
         _write_links(partial / run.stages.name, found)
@@ -145,7 +148,11 @@ def match_stage(
         "matches",
         [
             [t.digest for t in tracked],
-            *(image_set.videos, run.photo_digests, given, options.match.run.seed, list(doubted)),
+            image_set.videos,
+            run.photo_digests,
+            given,
+            options.match.run.seed,
+            list(doubted),
             run.positions.digest if run.positions is not None else None,
         ],
         MatchesResult,

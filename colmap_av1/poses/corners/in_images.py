@@ -81,7 +81,7 @@ def _followed(
             pictures.keep(image_of[first + frame], grey)
 
         corners = follow_corners(
-            *(guide, decoded, partial(_keeps, mask_of), report), density=density, keep=keep
+            guide, decoded, partial(_keeps, mask_of), report, density=density, keep=keep
         )
         found = Tracks.concatenate(found, replace(corners, frame=corners.frame + np.int32(first)))
     return found
@@ -100,7 +100,9 @@ def _seen_again(
     views = views_of(placed.images, placed.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
     return found_again(
-        *(seen, view, points),
+        seen,
+        view,
+        points,
         views=views,
         frames=placed.frames,
         pictures=pictures,
@@ -131,7 +133,9 @@ def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
         guesses = np.array([images[i].cam_from_world for i in own])
         focal = float(camera.mean_focal_length())
         found = resect(
-            *(sightings, guesses, focal),
+            sightings,
+            guesses,
+            focal,
             loss_scale=_LOSS_SCALE,
             seed=how.seed,
             num_threads=how.num_threads,

@@ -112,9 +112,7 @@ def found_again(
         followed = by_image[bounds[number] : bounds[number + 1]]
         own, at = point[followed], xy[followed]
         if number in pictures:
-            seen, where = _found_in(
-                *(number, patches, views[number], pictures), followed=own, at=at
-            )
+            seen, where = _found_in(number, patches, views[number], pictures, followed=own, at=at)
             if len(seen) < _FEW:
                 left = ~np.isin(own, seen) & (patches.image[own] != number)
                 seen, where = np.append(seen, own[left]), np.append(where, at[left], axis=0)
@@ -227,7 +225,8 @@ def _found_in(
     expected[seen] = at[place[index[seen]]] / scale
     grey = pictures.read(number)
     found, missed, likeness = _core.find_patches(
-        *(patches.grey, index),
+        patches.grey,
+        index,
         middle=patches.fraction[index].astype(np.float32),
         change=change.astype(np.float32),
         target=grey,

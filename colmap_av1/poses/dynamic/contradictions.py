@@ -276,11 +276,9 @@ class Contradictions:
             proof = own[agreeing[placed.track[own]]]
             step = steps(placed.depth[own]) - _STEPS_BEFORE
             at = placed.row[own], placed.column[own], np.maximum(step, 0)
-            there = self._at_most(
-                *(shown.row[kept], shown.column[kept], steps(shown.depth[kept])), at
-            )
+            there = self._at_most(shown.row[kept], shown.column[kept], steps(shown.depth[kept]), at)
             seen = self._at_most(
-                *(placed.row[proof], placed.column[proof], steps(placed.depth[proof])), at
+                placed.row[proof], placed.column[proof], steps(placed.depth[proof]), at
             )
             is_through = (there >= _FEWEST_BEFORE) & (seen == 0) & (step >= 0)
             # An image sees a track once.

@@ -71,7 +71,11 @@ def follow_behind(
         images = [placed.images[i] for i in own]
         views = views_of(images, placed.cameras, [masks[i] for i in own])
         points = triangulate_tracks(
-            *(seen, view, [v.camera for v in views], [v.cam_from_world for v in views], None),
+            seen,
+            view,
+            [v.camera for v in views],
+            [v.cam_from_world for v in views],
+            None,
             options=FOR_POSES,
             num_threads=run.options.match.run.num_threads,
             progress=no_progress,

@@ -139,8 +139,11 @@ def _moving_in_video(
         max_reprojection_error=float(cell), min_angle=0.0, max_depth_error=None, points="survey"
     )
     points = triangulate_tracks(
-        *(seen, image, [view.camera for view in views]),
-        *([view.cam_from_world for view in views], None),
+        seen,
+        image,
+        [view.camera for view in views],
+        [view.cam_from_world for view in views],
+        None,
         options=how,
         num_threads=run.options.match.run.num_threads,
         progress=no_progress,
