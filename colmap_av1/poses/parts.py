@@ -23,8 +23,7 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Stretches of different videos with this many common points hold together, as for COLMAP's mapper.
 _BETWEEN_VIDEOS = 15
-# Stretches of one video that a seam separates need this many beyond the next seam, as at a place
-# that is seen again.
+# Stretches of one video need this many, as models that were bent at a seam had half of it at most.
 _WITHIN_VIDEO = 100
 
 
@@ -44,7 +43,8 @@ def split_stage(
         image_set: all images.
         mapped: the models that the mapper found.
         adjusted: the first of these, adjusted.
-        seams: names of the images before and after each seam.
+        seams: names of the images before and after each seam that few points join; where the
+            camera turns, see `AdjustedResult`, the model is split as well.
         number: of the adjustment that follows.
 
     Returns:
@@ -55,7 +55,7 @@ def split_stage(
 
     def make(partial: Path) -> MappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
-        parts = parts_of(known, image_set, seams)
+        parts = parts_of(known, image_set, seams, adjusted.result.turns)
         (partial / name).mkdir()
         files = [f"{name}/{part}.npz" for part in range(len(parts))]
         for file, names in zip(files, parts, strict=True):
@@ -72,7 +72,7 @@ def split_stage(
     return run_stage(
         run.stages,
         name,
-        [mapped.digest, adjusted.digest, seams, _BETWEEN_VIDEOS, _WITHIN_VIDEO],
+        [mapped.digest, adjusted.digest, list(seams), _BETWEEN_VIDEOS, _WITHIN_VIDEO],
         MappedResult,
         into=run.stages,
         products=[name],
@@ -81,32 +81,44 @@ def split_stage(
 
 
 def parts_of(
-    model: PosedModel, image_set: ImageSet, seams: Sequence[tuple[str, str]]
+    model: PosedModel,
+    image_set: ImageSet,
+    seams: Sequence[tuple[str, str]],
+    turns: Sequence[tuple[str, str]] = (),
 ) -> list[AbstractSet[str]]:
     """The names of the images of each part of a model, the largest part first.
 
     The images between two seams of a video form a stretch. Stretches that see enough points in
-    common elsewhere than across the seam between them belong to the same part. Parts of fewer than
-    three images are left out, if there is a larger one.
+    common belong to the same part, but not for what they see of each other across a turn. Parts of
+    fewer than three images are left out, if there is a larger one.
 
     Args:
         model: the model with its points.
         image_set: all images.
-        seams: names of the images before and after each seam.
+        seams: names of the images before and after each seam that few points join.
+        turns: names of those between which the camera turns and the scale is lost.
     """
-    before = {first for first, _ in seams}
+    turned = {first for first, _ in turns}
+    before = turned | {first for first, _ in seams}
     registered = model.by_name
     stretch: dict[str, int] = {}
     sequence_of: list[int] = []
-    is_new = True
+    after_turn: list[int] = []
+    is_new = is_turn = False
     for name, sequence in zip(image_set.images.names, image_set.sequence.tolist(), strict=True):
-        if is_new or sequence_of[-1] != sequence:
+        if is_new or not sequence_of or sequence_of[-1] != sequence:
+            if is_turn:
+                after_turn.append(len(sequence_of))
             sequence_of.append(sequence)
-        is_new = name in before
+        is_new, is_turn = name in before, name in turned
         if name in registered:
             stretch[name] = len(sequence_of) - 1
     of_image = np.array([stretch[image.name] for image in model.images])
-    edges = _held(_common_points(model, of_image, len(sequence_of)), np.array(sequence_of))
+    common = _common_points(model, of_image, len(sequence_of))
+    common[after_turn, np.array(after_turn, np.int64) - 1] = 0
+    common[np.array(after_turn, np.int64) - 1, after_turn] = 0
+    is_same = np.equal.outer(sequence_of, sequence_of)
+    edges = np.argwhere(common >= np.where(is_same, _WITHIN_VIDEO, _BETWEEN_VIDEOS))
     component = connected_components(len(sequence_of), edges)[of_image]
     names = np.array([image.name for image in model.images])
     parts = [set(names[component == number].tolist()) for number in np.unique(component)]
@@ -127,12 +139,3 @@ def _common_points(
     shape = (len(points.xyz), num_stretches)
     sees = coo_array((np.ones(len(seen), np.int64), (seen[:, 0], seen[:, 1])), shape=shape).tocsr()
     return np.asarray((sees.T @ sees).toarray())
-
-
-def _held(common: NDArray[np.int64], sequence: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The pairs of stretches that hold together, int64 [m, 2]."""
-    number = np.arange(len(sequence))
-    is_same = sequence[:, None] == sequence
-    is_next = is_same & (np.abs(number[:, None] - number) == 1)
-    least = np.where(is_same, _WITHIN_VIDEO, _BETWEEN_VIDEOS)
-    return np.argwhere((common >= least) & ~is_next)

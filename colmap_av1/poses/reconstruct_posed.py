@@ -144,21 +144,24 @@ def estimate_poses(
 def _split(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     """Split the poses at seams that nothing holds, and adjust the largest part on its own.
 
-    What held two sides together before may not agree once the largest part is adjusted on its own,
-    so its seams are looked at again.
+    If pictures far apart in time contradict the poses, doubtful seams do not hold either. What held
+    two sides together before may not agree once the largest part is adjusted on its own, so its
+    seams are looked at again.
     """
     for number in range(_MOST_MAPPINGS + 1, _MOST_MAPPINGS + _MOST_SPLITS + 1):
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result
-        seams = _seams_to_split(posed)
-        if not seams:
+        seams = adjusted.thin_seams
+        if posed.far_views is not None and posed.far_views.result.apart:
+            seams = adjusted.doubtful_seams
+        if not (seams or adjusted.turns):
             break
         parts = split_stage(run, image_set, posed.mapped, posed.adjustment, seams, number=number)
         if parts.result.num_registered == adjusted.num_registered:
             break
         frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
-        frames = [frame_of[first] for first, _ in seams]
+        frames = [frame_of[first] for first, _ in {*seams, *adjusted.turns}]
         posed = replace(
             posed,
             mapped=parts,
@@ -168,15 +171,6 @@ def _split(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
         posed = replace(posed, far_views=_far_views(run, posed, image_set))
     return posed
-
-
-def _seams_to_split(posed: Posed) -> Sequence[tuple[str, str]]:
-    """Seams that do not hold: doubtful ones, too, if pictures far apart contradict the poses."""
-    assert posed.adjustment is not None
-    assert posed.far_views is not None
-    if posed.far_views.result.apart:
-        return posed.adjustment.result.doubtful_seams
-    return posed.adjustment.result.splits
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:

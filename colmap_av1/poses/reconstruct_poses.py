@@ -111,13 +111,16 @@ class AdjustedResult(PosesResult):
         num_motion_points: points of motion tracks, which come first; those of corners and links
             follow.
         doubtful_seams: names of neighbouring images that few points join.
-        splits: names of those that nothing holds together, see `Seams.splits`.
+        thin_seams: names of those that few points join at this place, see `Seams.thin`.
+        turns: names of those between which the camera turns and the scale is lost, see
+            `Seams.turns`.
         seams_warning: what the user should know of them.
     """
 
     num_motion_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
-    splits: tuple[tuple[str, str], ...]
+    thin_seams: tuple[tuple[str, str], ...]
+    turns: tuple[tuple[str, str], ...]
     seams_warning: str | None
 
 
@@ -405,7 +408,8 @@ def adjustment_stage(
             registered=registered_by_video(result.by_name, image_set),
             num_motion_points=int(is_motion.sum()),
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
-            splits=tuple(seams.pairs[i] for i in seams.splits),
+            thin_seams=tuple(seams.pairs[i] for i in seams.thin),
+            turns=tuple(seams.pairs[i] for i in seams.turns),
             seams_warning=seams.warning,
         )
 

@@ -66,8 +66,7 @@ class Seams:
         if len(self.num_points) == 0:
             return []
         enough = _ELSEWHERE * float(np.median(self.num_points))
-        below = self._below(_WEAK, most=_ENOUGH)
-        return [i for i in below if self.num_elsewhere[i] < enough]
+        return [i for i in self.thin if self.num_elsewhere[i] < enough]
 
     @property
     def doubtful(self) -> list[int]:
@@ -84,23 +83,23 @@ class Seams:
         return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
 
     @property
-    def splits(self) -> list[int]:
-        """Seams, by index, at which the model falls into parts.
+    def thin(self) -> list[int]:
+        """Seams, by index, that few points join, whatever both sides see elsewhere."""
+        return self._below(_WEAK, most=_ENOUGH)
 
-        These are the weak seams, and of every run of seams that do not carry the scale the one that
-        carries it least.
-        """
+    @property
+    def turns(self) -> list[int]:
+        """Of every run of seams that do not carry the scale, by index, the one that does least."""
         runs: list[list[int]] = []
         for seam in self.unscaled:
             if runs and runs[-1][-1] == seam - 1:
                 runs[-1].append(seam)
             else:
                 runs.append([seam])
-        middle = {
+        return [
             min(run, key=lambda i: (int(self.num_scaled[i]), abs(2 * i - run[0] - run[-1])))
             for run in runs
-        }
-        return sorted(middle | set(self.weak))
+        ]
 
     def _below(self, share: float, most: float = math.inf) -> list[int]:
         if len(self.num_points) == 0:

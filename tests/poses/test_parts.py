@@ -49,11 +49,19 @@ def seam(image_set: ImageSet, before: int) -> tuple[str, str]:
     return image_set.images.names[before], image_set.images.names[before + 1]
 
 
-def test_what_is_seen_across_one_seam_does_not_hold() -> None:
+def test_a_seam_that_few_points_join() -> None:
     image_set = images(10)
-    known = model(image_set, [[3, 4]] * 1000)
+    known = model(image_set, [[3, 4]] * 50)
     first, second = parts_of(known, image_set, [seam(image_set, 3)])
     assert (first, second) == (names(image_set, *range(4, 10)), names(image_set, *range(4)))
+    known = model(image_set, [[2, 3, 4]] * 200)
+    assert len(parts_of(known, image_set, [seam(image_set, 3)])) == 1
+
+
+def test_points_seen_in_a_turn_do_not_hold() -> None:
+    image_set = images(10)
+    known = model(image_set, [[3, 4]] * 1000)
+    assert len(parts_of(known, image_set, [], [seam(image_set, 3)])) == 2
 
 
 def test_a_place_seen_again_holds() -> None:
