@@ -135,13 +135,13 @@ def estimate_poses(
         make=make,
     ).result
     if first and not found.doubted and not found.apart:
-        return _split(run, first[0], image_set)
+        return split_at_seams(run, first[0], image_set)
     again = _with_all_links(run) if found.apart else run
     posed = _pose_stages(again, videos, image_set, tracked, doubted=found.doubted)
-    return _split(again, posed, image_set)
+    return split_at_seams(again, posed, image_set)
 
 
-def _split(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
+def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     """Split the poses at seams that nothing holds, and adjust the largest part on its own.
 
     If pictures far apart in time contradict the poses, doubtful seams do not hold either. What held
@@ -169,7 +169,8 @@ def _split(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             links=posed.links.split_after_frames(frames),
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
-        posed = replace(posed, far_views=_far_views(run, posed, image_set))
+        if posed.far_views is not None:
+            posed = replace(posed, far_views=_far_views(run, posed, image_set))
     return posed
 
 

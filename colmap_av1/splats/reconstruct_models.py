@@ -11,7 +11,12 @@ from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
-from colmap_av1.poses.reconstruct_posed import Posed, believed_tracks, refined_poses
+from colmap_av1.poses.reconstruct_posed import (
+    Posed,
+    believed_tracks,
+    refined_poses,
+    split_at_seams,
+)
 from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
 from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
@@ -96,6 +101,7 @@ def further_models(
             keyed=key,
             in_place=first.in_place,
         )
+        posed = split_at_seams(own, posed, some)
         new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
         if len(images) < LEAST_IMAGES:
