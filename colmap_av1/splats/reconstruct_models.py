@@ -92,16 +92,19 @@ def further_models(
         some, key = _named(image_set, known | free), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
         believed = believed_tracks(run, videos, image_set)
-        posed = refined_poses(
-            own,
-            first.matches,
-            own_poses,
-            believed=believed,
-            image_set=some,
-            keyed=key,
-            in_place=first.in_place,
-        )
-        posed = split_at_seams(own, posed, some)
+        try:
+            posed = refined_poses(
+                own,
+                first.matches,
+                own_poses,
+                believed=believed,
+                image_set=some,
+                keyed=key,
+                in_place=first.in_place,
+            )
+            posed = split_at_seams(own, posed, some)
+        except ModelError:  # no track agrees with what the mapper made of these images
+            continue
         new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
         if len(images) < LEAST_IMAGES:
