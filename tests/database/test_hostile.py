@@ -165,18 +165,18 @@ SQL = {
             "DROP TABLE keypoints",
             ENDLESS.format("keypoints", "image_id, rows, cols, data", "image_id"),
         ],
-        "'keypoints' is no table",
+        "'keypoints' is not a table",
     ),
     "matches that never end": (
         ["DROP TABLE matches", ENDLESS.format("Matches", "pair_id, rows, cols, data", "pair_id")],
-        "'matches' is no table",
+        "'matches' is not a table",
     ),
     "virtual table": (
         [
             "DROP TABLE descriptors",
             "CREATE VIRTUAL TABLE descriptors USING fts5(image_id, rows, cols, data)",
         ],
-        "'descriptors' is no table|no such module",
+        "'descriptors' is not a table|no such module",
     ),
     "trigger": (
         [
