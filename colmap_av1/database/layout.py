@@ -164,8 +164,8 @@ def _check_values(connection: sqlite3.Connection, path: Path, table: str) -> Non
     ).fetchone()
     if row is not None:
         raise DatabaseError(
-            f"{path}: table '{table}' is damaged (row {row[1]!r} has an invalid {row[0]!r}): "
-            "restore the file from a copy"
+            f"{path}: table '{table}' is damaged ({row[0]!r} of row {row[1]!r} is "
+            "invalid): restore the file from a copy"
         )
 
 
