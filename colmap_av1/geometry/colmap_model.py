@@ -290,7 +290,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
     if cameras.is_file() and cameras.stat().st_size < 8 + sum(sizes):
         raise unreadable
     if reconstruction.num_reg_images() == 0:
-        raise ModelError(f"{path}: the model has no registered images: give a mapped model")
+        raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
     _check_values(path, reconstruction)
     point_ids = list(reconstruction.points3D)
     xyz = np.array([p.xyz for p in reconstruction.points3D.values()]).reshape(-1, 3)

@@ -1,4 +1,5 @@
 """Points of all tracks for training Gaussian splats, including distant ones."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
