@@ -206,7 +206,7 @@ def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
 def _squares(
     view: PosedCamera, rows: _Ints, columns: _Ints
 ) -> tuple[_Floats, _Ints, NDArray[np.bool_]]:
-    """Squares in cells: centres in pixels, index of the cell, and whether it is the cell's first."""
+    """Squares in cells: centres in pixels, cells, and whether each is the first of its cell."""
     per_cell = CELL // _FILLING
     xy = squares_of_cells(rows, columns, per_cell)
     cell = np.repeat(np.arange(len(rows)), per_cell**2)
