@@ -32,7 +32,7 @@ _OVERSAMPLING = 2
 # Distance of the viewpoint behind and above the camera, in median depths of the points, and its
 # tilt in degrees.
 _BEHIND, _ABOVE, _TILT = 0.25, 0.15, 5.0
-# Quantiles of the point coordinates between which a plan shows the cloud.
+# Quantiles of the points that a plan shows.
 _SHOWN = (0.03, 0.97)
 _WIDTH = 640
 _STYLE = {

@@ -57,8 +57,8 @@ class Cloud:
 
     Attributes:
         points: float64 [n, 3].
-        colours: uint8 [n, 3] RGB.
-        cam_from_world: float64 [num_images, 3, 4], NaN for images that are not registered.
+        colours: uint8 [n, 3], red first.
+        cam_from_world: float64 [num_images, 3, 4], NaN for images without a pose.
         focal_length: focal length of the first camera in pixels.
         is_aligned: whether the coordinates are those of the reference, not the model's own.
     """
