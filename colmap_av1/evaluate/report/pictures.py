@@ -284,9 +284,9 @@ def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
 
     Args:
         cloud: the cloud.
-        like: a cloud in the same coordinates, whose cameras and extent determine the up direction
-            and the displayed area.
-        size: (width, height) of the picture in pixels.
+        like: the cloud, in the same coordinates, whose cameras and extent say what is up and
+            what is shown.
+        size: (width, height) of the picture.
     """
     poses = like.cam_from_world[np.isfinite(like.cam_from_world).all((1, 2))]
     forward, down = poses[:, 2, :3].mean(0), poses[:, 1, :3].mean(0)
