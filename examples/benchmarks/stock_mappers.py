@@ -1,13 +1,13 @@
-"""Measure what COLMAP's mappers, as they are, make of the database of `match`.
+"""Measure the models of COLMAP's mappers, with default options, on the database of `match`.
 
 python examples/benchmarks/stock_mappers.py --cache benchmark_mappers
 
-`match` gets each clip as it was shot and runs with its defaults; intrinsics are given where they
-are known. Its database is mapped by the command that it prints, which is `colmap mapper` of the
-COLMAP that is installed, and by the incremental and the global mapper of pycolmap, with their
-defaults but for what that command says of forward motion. Folder 0 is what users open, whether it
-is the largest model or not. Camera centres are compared with the true ones, or with those of the
-model that pycolmap makes of the same frames from SIFT, matched sequentially.
+`match` gets the original video of each clip and runs with its defaults; known intrinsics are given.
+Its database is mapped by the command that it prints, `colmap mapper` of the installed COLMAP, and
+by the incremental and the global mapper of pycolmap, with default options except those that the
+command sets for forward motion. Folder 0 is measured, because that is what users open, even if it
+is not the largest model. Camera centres are compared with the ground truth, or with pycolmap's
+model of the same frames from sequentially matched SIFT.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Row:
-    """What a mapper made of a database.
+    """Result of a mapper on a database.
 
     Attributes:
         sequence: name of the clip.
         way: features and mapper.
-        images: of the database.
-        models: that the mapper wrote.
-        registered: images with a pose in folder 0.
-        points: of folder 0.
+        images: number of images of the database.
+        models: number of models that the mapper wrote.
+        registered: number of registered images in folder 0.
+        points: number of points in folder 0.
         error_px: its mean reprojection error in pixels.
         ate_of_extent: error of its camera centres, as a share of the extent of the true ones.
-        database_cpu_s: CPU seconds of the features and matches, conversion included.
+        database_cpu_s: CPU seconds of features and matches, including conversion.
         mapper_cpu_s: CPU seconds of the mapper.
     """
 
@@ -75,7 +75,7 @@ class Row:
 
 
 def main() -> int:
-    """Map each clip every way, and keep and print the table."""
+    """Map each clip in every way, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -96,7 +96,7 @@ def main() -> int:
 
 
 def measure(name: str, folder: Path, console: Console) -> list[Row]:
-    """The rows of a sequence: SIFT's, and one for each mapper on the database of `match`."""
+    """The rows of a sequence: SIFT, and each mapper on the database of `match`."""
     case = next((case for case in ruler.CASES if case.name == name), ruler.Case(name))
     sequence = read_sequence(ruler.SEQUENCES / name)
     camera = CameraOptions() if sequence.camera is None else ruler.camera_options(sequence.camera)
@@ -130,7 +130,7 @@ def measure(name: str, folder: Path, console: Console) -> list[Row]:
     options = MatchOptions(camera=camera, images=ImageOptions(every=case.image_step))
     matched = run_measured(run_match, video, database, pictures, options, log=log)
     images, command = matched.result
-    # As it is printed, on the database itself: that of pycolmap's mappers is brought to its layout.
+    # The printed command runs on the database itself; pycolmap's mappers get migrated copies.
     console.print(f"{name}: {PRINTED}", markup=False)
     mapped = run_measured(run_command, command, log=log)
     cpu = (matched.cpu_seconds, mapped.cpu_seconds)
@@ -149,18 +149,18 @@ def measure(name: str, folder: Path, console: Console) -> list[Row]:
 def run_match(
     video: Path, database: Path, pictures: Path, options: MatchOptions
 ) -> tuple[int, str]:
-    """The number of images of a new database, and the command for COLMAP that `match` prints."""
+    """Number of images of a new database, and the command for COLMAP that `match` prints."""
     report = match(database, video, image_path=pictures, options=options)
     return report.num_images, report.next_commands[0]
 
 
 def run_command(words: str) -> None:
-    """A command line, in a shell."""
+    """Run a command line in a shell."""
     subprocess.run(words, shell=True, check=True)
 
 
 def map_incrementally(database: Path, pictures: Path, output: Path, forward: bool) -> None:
-    """The incremental mapper of pycolmap; where motion is forward as `match` prints for it."""
+    """Run pycolmap's incremental mapper, with the options that `match` prints for forward motion."""
     output.mkdir()
     pycolmap.set_random_seed(SEED)
     how = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
@@ -172,7 +172,7 @@ def map_incrementally(database: Path, pictures: Path, output: Path, forward: boo
 
 
 def map_globally(database: Path, pictures: Path, output: Path, forward: bool) -> None:
-    """The global mapper of pycolmap."""
+    """Run pycolmap's global mapper."""
     output.mkdir()
     pycolmap.set_random_seed(SEED)
     how = pycolmap.GlobalPipelineOptions(random_seed=SEED)
