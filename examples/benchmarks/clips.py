@@ -228,8 +228,8 @@ def far_views(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
     if not FAR_VIEWS.is_file():
         return {}
     command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(apart)]
-    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
-    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
+    printed = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", printed)
     return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
 
 

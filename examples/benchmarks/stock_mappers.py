@@ -160,7 +160,7 @@ def run_command(words: str) -> None:
 
 
 def map_incrementally(database: Path, pictures: Path, output: Path, forward: bool) -> None:
-    """Run pycolmap's incremental mapper, with the options that `match` prints for forward motion."""
+    """Run pycolmap's incremental mapper with the options that `match` prints."""
     output.mkdir()
     pycolmap.set_random_seed(SEED)
     how = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
