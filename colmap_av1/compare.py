@@ -1,4 +1,4 @@
-"""Comparison of front-ends on one video: their clouds, poses and costs, in a report."""
+"""Comparison of front-ends on one video: point clouds, poses and costs, in a report."""
 
 from __future__ import annotations
 
@@ -34,28 +34,28 @@ from colmap_av1.util.stages import open_stages
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.metadata.spherical import check_is_plane
 
-# Its cloud and its poses stand for the truth where none is given.
+# Without a given reference, the model of this front-end is the pseudo truth.
 PSEUDO_TRUTH = "sift-exhaustive"
-# Whose cloud stands for it where poses are given: the first that has them, up to a share of the
-# path's extent.
+# If only poses are given, the cloud of the first of these front-ends is the reference cloud whose
+# ATE is at most this share of the path's extent.
 _PSEUDO_TRUTHS = (PSEUDO_TRUTH, "sift-sequential")
 _LARGEST_ATE = 0.02
 ALL_TRACKS = " + all tracks"
 _OWN = "av1"
-# Folder of the front-ends in the output.
+# Folder in the output for the results of the front-ends.
 _FRONTENDS = "frontends"
 
 
 @dataclass(frozen=True)
 class _Reference:
-    """What is measured against.
+    """The poses and the cloud that models are compared with.
 
     Attributes:
-        poses: float64 [num_images, 3, 4], NaN where unknown; None where all are.
+        poses: float64 [num_images, 3, 4], NaN where unknown; None if all are unknown.
         points: float64 [n, 3] in the same coordinates; None without a cloud.
-        pose_source: whose poses these are.
-        cloud_source: whose points these are.
-        is_truth: the poses are a given truth.
+        pose_source: path or front-end that the poses come from.
+        cloud_source: path or front-end that the points come from.
+        is_truth: whether the poses are a given truth.
     """
 
     poses: NDArray[np.float64] | None = None
@@ -76,38 +76,40 @@ def compare(
 ) -> CompareReport:
     """Compare this package's matches with those of other front-ends on one video.
 
-    Every front-end gets the same images, and the same camera where its model or parameters are
-    given, and fills a database; each of these is mapped by COLMAP's incremental mapper with the
-    same settings, and the models are measured. Where no model is given, that is SIMPLE_RADIAL, and
-    RADIAL where this package estimates the focal length from the tracks.
-    The folder gets `report.html` and `results.json`, and keeps what every stage
-    made: another run does only what is missing or damaged, or depends on what has changed. A
-    front-end that fails leaves a line in its column; the others stand.
+    Every front-end gets the same images and fills a database, with the given camera model and
+    parameters if there are any. COLMAP's incremental mapper maps each database with the same
+    settings, and the models are measured. The default camera model is SIMPLE_RADIAL, or RADIAL if
+    this package estimates the focal length from the tracks.
+
+    The folder gets `report.html` and `results.json`, and keeps the results of every stage: another
+    run repeats only stages whose results are missing or damaged, or whose inputs have changed. The
+    report states the error of a front-end that fails; the others are not affected.
 
     Args:
-        video: a video; one that is not AV1 is converted first, to a stream that lies in the
-            folder, or where `options.match.keep_stream` says.
-        output: the folder; new, empty, or that of an earlier run.
-        image_path: folder of images that exist or are to be written; None: within the output.
-        reference: given truth: folder of a COLMAP model with images of the same names, or a
-            file of poses, see `read_poses`. None: the model of "sift-exhaustive" where it is
+        video: a video. A video that is not AV1 is first converted to a stream in the folder, or at
+            `options.match.keep_stream`.
+        output: the folder; new, empty, or from an earlier run.
+        image_path: folder of existing images, or to write images to; None: within the output.
+        reference: ground truth: folder of a COLMAP model with images of the same names, or a
+            file of poses, see `read_poses`. None: the model of "sift-exhaustive", if it is
             compared.
         options: options of every stage.
-        progress: called with a stage's name, what is done, and of how much where known.
+        progress: called with a stage's name, the amount of work done, and the total if known.
 
     Raises:
         VideoError: the video cannot be read.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: images cannot be chosen or written, or the reference fits none.
-        ModelError: the reference is no readable model.
-        OptionError: there is no such front-end, or the folder holds other things.
+        BitstreamError: the stream is damaged, and `strict` is set or the damage is before the
+            second frame.
+        ImageError: images cannot be chosen or written, or do not match the reference.
+        ModelError: the reference is not a readable model, or has poses of fewer than 3 images.
+        OptionError: a front-end is unknown, or the folder has other content.
         EvaluationError: a package is missing that the report, a front-end or the trainer needs.
     """
     options = options if options is not None else CompareOptions()
     progress = progress if progress is not None else no_progress
     output = Path(output)
     write_report = _report_writer()
-    # Front-ends have processes of their own: they share the stream.
+    # Front-ends run in separate processes: keep the converted stream, so that they share it.
     options = replace(options, match=with_stream_kept(options.match, output))
     frontends = _chosen_frontends(options)
     if options.trainer is not None:
@@ -170,15 +172,15 @@ def _writing(output: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.filename is not None and output not in Path(error.filename).parents:
-            raise  # of what is read
+            raise  # An input cannot be read.
         raise OptionError(
-            f"{output}: cannot be written: {error.strerror or error}: what is finished is kept, "
-            "run the same command again once that is fixed"
+            f"{output}: cannot be written: {error.strerror or error}: fix that and run the same "
+            "command again, finished stages are kept"
         ) from error
 
 
 def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> None:
-    """Refuse a truth within the output; the model of a front-end is one that stays."""
+    """Refuse a reference within the output, except the model of a front-end, which is kept."""
     models = (output / _FRONTENDS).resolve()
     if reference is not None and not Path(reference).resolve().is_relative_to(models):
         check_apart(output, [reference])
@@ -186,7 +188,7 @@ def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> 
 
 def _report_writer() -> Callable[[CompareReport, Mapping[str, Cloud], Footage], None]:
     check_packages("the report", ("matplotlib",), "evaluate")
-    from colmap_av1.evaluate.report.writing import write_report  # noqa: PLC0415 - of an extra
+    from colmap_av1.evaluate.report.writing import write_report  # noqa: PLC0415 - optional
 
     return write_report
 
@@ -201,7 +203,7 @@ def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
             if not (colon and features and matches):
                 raise OptionError(f"front-end '{word}': give NAME=FEATURES.h5:MATCHES.h5")
             if name in known or not name or Path(name).name != name:
-                raise OptionError(f"front-end '{word}': give it another name")
+                raise OptionError(f"front-end '{word}': name is taken or invalid: give another")
             frontend = imported_frontend(Path(features), Path(matches))
         elif name in known:
             frontend = known[name]
@@ -211,7 +213,7 @@ def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
                 "NAME=FEATURES.h5:MATCHES.h5"
             )
         if name in chosen:
-            raise OptionError(f"front-end '{name}' is given twice: leave one out")
+            raise OptionError(f"front-end '{name}' is given twice: omit one")
         frontend.check()
         chosen[name] = frontend
     if not chosen:
@@ -229,7 +231,7 @@ def _run_column(
     options: CompareOptions,
     progress: Progress,
 ) -> list[Column]:
-    """The columns of a front-end: its model as mapped and, of this package's, all tracks."""
+    """The columns of a front-end: the mapped model and, for this package, also all tracks."""
     own = name.startswith(f"{_OWN}-") or name == _OWN
     total = 3 if own and options.all_tracks else 2
     column = Column(name)
@@ -256,7 +258,7 @@ def _run_column(
     except ColmapAv1Error as error:
         return [replace(column, error=str(error))]
     if column.model_path is None:
-        return [replace(column, error="no image is registered: the mapper finds no initial pair")]
+        return [replace(column, error="no image is registered: the mapper found no initial pair")]
     if not (own and options.all_tracks):
         return [column]
     dense = replace(column, name=f"{name}{ALL_TRACKS}", num_models=1)
@@ -279,7 +281,7 @@ def _run_column(
 def _trained(
     column: Column, footage: Footage, output: Path, options: CompareOptions, progress: Progress
 ) -> Column:
-    """The column with the training on its model."""
+    """The column with the results of training on its model."""
     if column.model_path is None or not (options.split or options.trainer):
         return column
     folder = output / "splats" / column.name.replace(" ", "")
@@ -317,8 +319,8 @@ def _read_reference(path: Path, footage: Footage) -> _Reference:
     known = int(np.isfinite(poses).all((1, 2)).sum())
     if known < 3:
         raise ModelError(
-            f"{path}: has poses of {known} of the {len(footage.names)} images, named "
-            f"{footage.names[0]} and on: give the truth of this video"
+            f"{path}: has poses of {known} of the {len(footage.names)} images (first name: "
+            f"{footage.names[0]}), needs 3: give the ground truth of this video"
         )
     return _Reference(
         poses,
@@ -330,7 +332,10 @@ def _read_reference(path: Path, footage: Footage) -> _Reference:
 
 
 def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footage) -> _Reference:
-    """The same, with SIFT's model for what is not given; where poses are, one that has these."""
+    """The reference, completed by SIFT's model.
+
+    If poses are given, a SIFT model provides the cloud only if its poses agree with them.
+    """
     if given.points is not None:
         return given
     for name in _PSEUDO_TRUTHS if given.poses is not None else (PSEUDO_TRUTH,):
@@ -351,12 +356,12 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
 def _measure(
     column: Column, reference: _Reference, footage: Footage
 ) -> tuple[Column, Cloud | None]:
-    """The column with the figures of its model, and what is drawn of it."""
+    """The column with the figures of its model, and its cloud for the pictures."""
     if column.model_path is None:
         return column, None
     model = read_model(column.model_path)
     poses, points = image_poses(model, footage.names), point_cloud(model)
-    # A point may lie at several keypoints of an image.
+    # A track may have several keypoints in the same image.
     lengths = [len({e.image_id for e in p.track.elements}) for p in model.points3D.values()]
     counts = np.bincount(np.array(lengths, dtype=np.int64))
     column = replace(

@@ -1,4 +1,4 @@
-"""From a database to a model, with one of COLMAP's mappers."""
+"""Mapping a database with one of COLMAP's mappers."""
 
 from __future__ import annotations
 
@@ -41,21 +41,20 @@ from colmap_av1.util.progress import Clock, Progress, no_progress
 
 @dataclass(frozen=True)
 class MapReport:
-    """What `map_database` made.
+    """Result of `map_database`.
 
     Attributes:
-        output: folder of the models, one folder each; 0 is the one with the most images.
+        output: folder of the models, one numbered folder each; 0 has the most images.
         database: the database.
-        mapper: which of COLMAP's mappers made them.
-        num_images: images of the database.
-        num_registered: images with a pose in each model, the most first.
-        place: where that in folder 0 lies in the world: units, axes, origin and what said so, as
-            in `place.json`.
+        mapper: the mapper that was used.
+        num_images: number of images of the database.
+        num_registered: number of registered images of each model, in descending order.
+        place: coordinates of the model in folder 0: units, axes, origin and their source, as in
+            `place.json`.
         figures: figures of the model in folder 0.
-        far_views: how far views from far apart in time disagree, by the pictures of that model;
-            None where these cannot be read.
+        far_views: result of the long-range check of this model; None if its images cannot be read.
         seconds: wall time of each stage.
-        warnings: what the user should know.
+        warnings: warnings for the user.
     """
 
     output: Path
@@ -85,25 +84,26 @@ def map_database(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> MapReport:
-    """Map a COLMAP database of any origin; the database stays as it is.
+    """Map a COLMAP database of any origin, which is not changed.
 
     Args:
         database: a COLMAP database with verified matches.
-        image_path: folder of its images, for the points' colours.
-        output: new or empty folder; gets a folder for each model, numbered from the one with the
-            most images, `mapper.log`, and `place.json`, which says where folder 0 lies.
-        options: which mapper, and how.
-        place: where the model in folder 0 lies in the world; positions are the pose priors of the
-            database.
-        progress: called with a stage's name, what is done, and of how much where known.
-        overwrite: replace an output that holds models and nothing else.
+        image_path: folder of its images, for the colours of the points and the long-range check.
+        output: new or empty folder. It gets a folder for each model, numbered in descending order
+            of the number of images, `mapper.log`, and `place.json`, which describes the coordinates
+            of the model in folder 0.
+        options: the mapper and its options.
+        place: how to place the model in folder 0 in the world. Positions are the pose priors of
+            the database.
+        progress: called with a stage's name, the amount of work done, and the total if known.
+        overwrite: replace an output that has models and nothing else.
 
     Raises:
-        DatabaseError: the database is missing, unreadable, or nothing that mappers can use.
-        ImageError: an image of the database is not in the folder, or of another size.
+        DatabaseError: the database is missing, unreadable, or has no matches that a mapper can use.
+        ImageError: an image of the database is missing from the folder or differs in size.
         ModelError: the mapper fails or finds no model; the message names its log.
-        OptionError: the output is not empty, or must not be replaced, or the known distance is
-            none of the model.
+        OptionError: the output is not empty and must not be replaced, or the known distance does
+            not fit the model.
     """
     options = options if options is not None else MapOptions()
     place = place if place is not None else PlaceOptions()
@@ -131,7 +131,7 @@ def map_database(
             if not num_registered:
                 raise ModelError(
                     f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
-                    "share too few matches, or too little parallax: see 'colmap-av1 check' and "
+                    "share too few matches or have too little parallax: see 'colmap-av1 check' and "
                     f"{log}, try the other --mapper, or give --camera_params when matching"
                 )
             shutil.copyfile(log, partial / "mapper.log")
@@ -144,13 +144,13 @@ def map_database(
     with clock.measure("far views"):
         try:
             found = check_model(model, image_path=image_path, database=database, progress=progress)
-        except ImageError as error:  # the model stands all the same
-            unreadable = f"far views are not compared: {error}"
+        except ImageError as error:  # The model itself is valid without the check.
+            unreadable = f"skipped the long-range check: {error}"
             found = check_model(model, database=database)
     warnings = (
         *placement.warnings,
         _missing(num_images, num_registered),
-        # What the model itself shows says more than the matches it is made of.
+        # Seams of the model are more specific than gaps of the matches.
         *(found.seam_warnings or (few_matches_warning(thin_gaps),)),
         found.far_views.warning() if found.far_views else unreadable,
     )
@@ -170,7 +170,7 @@ def map_database(
 
 @contextmanager
 def _log() -> Iterator[Path]:
-    """A file for what the mapper prints, which stays where that fails."""
+    """A file for the mapper's log, which is kept if the mapper fails."""
     descriptor, name = tempfile.mkstemp(prefix="colmap-av1-map-", suffix=".log")
     os.close(descriptor)
     try:
@@ -184,24 +184,24 @@ def _log() -> Iterator[Path]:
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
-    """What the user should know of images that the largest model lacks."""
+    """A warning about images that the largest model lacks, or about further models."""
     largest, *others = num_registered
     if not others:
-        left_out = num_images - largest
-        return f"{left_out} of {num_images} images have no pose" if left_out else None
-    further = ", ".join(f"'{number}' {size}" for number, size in enumerate(others, start=1))
+        missing = num_images - largest
+        return f"{missing} of {num_images} images are not registered" if missing else None
+    further = ", ".join(f"'{number}' has {size}" for number, size in enumerate(others, start=1))
     if largest == num_images:
-        return f"model '0' holds all {num_images} images, {further} of them again: leave that out"
+        return f"model '0' has all {num_images} images, {further} of them again: ignore the others"
     return (
-        f"nothing holds all {num_images} images together: model '0' holds {largest}, {further}; "
-        "each has coordinates of its own"
+        f"no model has all {num_images} images: '0' has {largest}, {further}; each model has its "
+        "own coordinates"
     )
 
 
 def _place(
     output: Path, database: Path, image_path: Path, options: PlaceOptions, seed: int
 ) -> Placement:
-    """Place the model in folder 0 of the output, and write down where."""
+    """Place the model in folder 0 of the output in the world, and write `place.json`."""
     folder = output / "0"
     model = read_model(folder)
     images = [*posed_images(model).values()]
@@ -229,26 +229,26 @@ def _place(
 
 
 def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]]:
-    """Refuse what a mapper would stop at; returns the number of images, and thin gaps."""
+    """Refuse inputs that make a mapper fail; returns the number of images, and thin gaps."""
     checked = check(database)
     stops = [f.text for f in checked.findings if f.severity == "error"]
     if stops:
         raise DatabaseError(
-            f"{database}: {stops[0]}: see 'colmap-av1 check', and match the images anew"
+            f"{database}: {stops[0]}: see 'colmap-av1 check', and match the images again"
         )
     if not image_path.is_dir():
-        raise ImageError(f"{image_path}: no such folder: give that of the database's images")
+        raise ImageError(f"{image_path}: no such folder: give the folder of the database's images")
     images = read_images(database)
     files = [image_file(image_path, image.name) for image in images]
     missing = next((file for file in files if not file.is_file()), None)
     if missing is not None:
         raise ImageError(
-            f"{missing}: is missing, but the database lists it: give the folder of its images"
+            f"{missing}: is missing, but in the database: give the folder of its images"
         )
     size, wanted = image_size(files[0]), (images[0].width, images[0].height)
     if size != wanted:
         raise ImageError(
-            f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database "
+            f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database is "
             f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
         )
     return len(images), checked.thin_gaps

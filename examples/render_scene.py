@@ -1,12 +1,12 @@
-"""Render the example clip: a static courtyard seen by a hand-held moving camera, with exact truth.
+"""Render the example clip, a static courtyard filmed by a hand-held camera, with ground truth.
 
-``python examples/render_scene.py`` writes ``scene.mp4`` (AV1) and ``scene_truth.npz`` beside this
-file. Everything in the picture is procedural and seeded: planes, boxes, spheres and a cylinder,
-with textures, bumps, leaves and lighting painted onto them once. Light does not depend on the
-viewpoint, so a surface point keeps its colour over the whole clip.
+``python examples/render_scene.py`` writes ``scene.mp4`` (AV1) and ``scene_truth.npz`` next to this
+file. The scene is procedural and seeded: planes, boxes, spheres and a cylinder, with textures,
+bumps, leaves and lighting baked into them. Light does not depend on the viewpoint, so a surface
+point keeps its colour over the whole clip.
 
-As the surfaces are analytic, the truth is exact at any sub-pixel position. Import this file and
-call :func:`surface_points`, :func:`project` and :func:`transfer` on :func:`build_scene`.
+Because the surfaces are analytic, the ground truth is exact at any sub-pixel position. Import this
+file and call :func:`surface_points`, :func:`project` and :func:`transfer` on :func:`build_scene`.
 
 Conventions: the world is in metres, z up. Cameras look along +z with x right and y down. Image
 positions are COLMAP's: the image's top-left corner is (0, 0), the first pixel's centre (0.5, 0.5).
@@ -60,7 +60,7 @@ class Surface:
             (0, 0, radius).
         material: name of the function that paints it.
         texels: texels per metre of its texture.
-        casts: whether it throws a shadow.
+        casts: whether it casts a shadow.
     """
 
     kind: str
@@ -97,7 +97,7 @@ class Scene:
     """Surfaces, cameras and intrinsics.
 
     Attributes:
-        surfaces: every surface; all rays of all frames end on one.
+        surfaces: all surfaces; every ray of every frame hits one.
         cam_from_world: [frames, 3, 4] float64, x_cam = R x_world + t.
         width: image width in pixels.
         height: image height in pixels.
@@ -140,7 +140,7 @@ def _box(
     faces = []
     for k in range(4):
         a, b = corners[k], corners[(k + 1) % 4]
-        # v runs down the side so that textures are upright.
+        # v points down the side, so that textures are upright.
         faces.append(Surface("quad", a + up, b - a, -up, material, texels))
     along, across = corners[1] - corners[0], corners[3] - corners[0]
     faces.append(Surface("quad", corners[3] + up, along, -across, material, texels))
@@ -163,10 +163,11 @@ def _outward(face: Surface, inside: FloatArray) -> Surface:
 def _wall(
     start: tuple[float, float], end: tuple[float, float], height: float, material: str
 ) -> Surface:
-    """An upright wall from ``start`` to ``end``, seen with ``start`` on the left."""
+    """A vertical wall from ``start`` (left, as seen from its front) to ``end``."""
     a = np.array([*start, height])
     b = np.array([*end, height])
-    # Reach past the neighbouring wall and into the ground: no ray may slip through by rounding.
+    # Extend beyond the neighbouring wall and into the ground, so that no ray slips through by
+    # rounding.
     margin = 0.04 * (b - a) / np.linalg.norm(b - a)
     a, b = a - margin, b + margin
     down = np.array([0, 0, -height - 0.04])
@@ -175,7 +176,7 @@ def _wall(
 
 
 def build_scene() -> Scene:
-    """The example's geometry and cameras; cheap, nothing is painted."""
+    """The geometry and cameras of the example; fast, because nothing is painted."""
     ground = Surface(
         "quad",
         np.array([-9.0, 6.0, 0.0]),
@@ -238,9 +239,9 @@ def build_scene() -> Scene:
 
 
 def unsteady(seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Steps and hand tremor at some times: of amplitude 1, at most 1.6."""
+    """Motion by steps and hand tremor at the given times, of amplitude about 1 and at most 1.6."""
     total = np.zeros_like(seconds)
-    # Faster means smaller, as in real hand-held footage.
+    # Higher frequencies have smaller amplitudes, as in real hand-held footage.
     for hertz, share in ((0.7, 1.0), (1.7, 0.42), (3.1, 0.16), (5.3, 0.05)):
         phase, detune = rng.uniform(0, 2 * math.pi), rng.uniform(0.85, 1.15)
         total += share * np.sin(2 * math.pi * hertz * detune * seconds + phase)
@@ -248,14 +249,14 @@ def unsteady(seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def hand_held(seconds: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """What a hand adds to a camera's way: shifts in metres and rotation vectors, each [n, 3]."""
+    """Shake of a hand-held camera: shifts in metres and rotation vectors, each [n, 3]."""
     shift = [size * unsteady(seconds, rng) for size in (0.020, 0.015, 0.018)]
     turn = [size * unsteady(seconds, rng) for size in (0.45, 0.40, 0.55)]
     return np.stack(shift, 1), np.radians(np.stack(turn, 1))
 
 
 def look(centre: FloatArray, target: FloatArray, turn: FloatArray) -> FloatArray:
-    """Pose [3, 4] of an upright camera that looks at a target, but for a rotation vector."""
+    """Pose [3, 4] of an upright camera that looks at a target, changed by a rotation vector."""
     forward = target - centre
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1.0])
@@ -265,7 +266,7 @@ def look(centre: FloatArray, target: FloatArray, turn: FloatArray) -> FloatArray
 
 
 def _camera_path() -> FloatArray:
-    """[FRAMES, 3, 4] poses: an arc of 42 degrees walked with an unsteady hand."""
+    """[FRAMES, 3, 4] poses of a hand-held camera on an arc of 42 degrees."""
     poses = np.empty((FRAMES, 3, 4))
     along = np.linspace(0, 1, FRAMES)
     angle = np.radians(-22 + 42 * (along + 0.02 * np.sin(2 * math.pi * along)))
@@ -279,15 +280,15 @@ def _camera_path() -> FloatArray:
 
 
 def _intersect(surface: Surface, o_dot: Dot, d_dot: Dot) -> tuple[Any, Any, Any]:
-    """Where rays first meet a surface.
+    """First intersections of rays with a surface.
 
     Args:
-        surface: what to hit.
+        surface: the surface.
         o_dot: maps a [3] vector to its dot product with each ray's origin.
         d_dot: maps a [3] vector to its dot product with each ray's direction.
 
     Returns:
-        Ray parameter (inf where missed), u and v, broadcast over the rays.
+        Ray parameter (inf for rays that miss the surface), u and v, broadcast over the rays.
     """
     if surface.kind in ("quad", "disc"):
         n = surface.normal
@@ -324,7 +325,7 @@ _UNIT = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 def _bounds(scene: Scene, frame: int, surface: Surface) -> tuple[float, float, float, float] | None:
-    """Rectangle (x0, y0, x1, y1) in pixels a surface can be seen in; None when it cannot be."""
+    """Rectangle (x0, y0, x1, y1) in pixels that bounds a surface; None if it is not visible."""
     pose = scene.cam_from_world[frame]
     if surface.kind in ("quad", "disc"):
         centre = -pose[:, :3].T @ pose[:, 3]
@@ -346,17 +347,17 @@ def _bounds(scene: Scene, frame: int, surface: Surface) -> tuple[float, float, f
         return -math.inf, -math.inf, math.inf, math.inf
     x = scene.fx * local[:, 0] / local[:, 2] + scene.cx
     y = scene.fy * local[:, 1] / local[:, 2] + scene.cy
-    # Rounding must not shave off a surface's own rim.
+    # A margin, so that rounding does not cut off the rim of the surface.
     return x.min() - 1e-6, y.min() - 1e-6, x.max() + 1e-6, y.max() + 1e-6
 
 
 def _cast(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
-    """[n] depth along the camera's z axis of what is seen at positions ``xy`` [n, 2]."""
+    """[n] depth along the camera's z axis at positions ``xy`` [n, 2]."""
     return cast(scene, frame, xy)[0]
 
 
 def cast(scene: Scene, frame: int, xy: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-    """What is seen at image positions.
+    """Depths and surfaces at image positions.
 
     Args:
         scene: the scene.
@@ -364,7 +365,7 @@ def cast(scene: Scene, frame: int, xy: FloatArray) -> tuple[FloatArray, NDArray[
         xy: [n, 2] positions in pixels, corner (0, 0); they may lie between pixels.
 
     Returns:
-        [n] depth along the camera's z axis, inf where nothing is seen, and [n] index of the
+        [n] depth along the camera's z axis, inf where there is no surface, and [n] index of the
         surface.
     """
     pose = scene.cam_from_world[frame]
@@ -395,7 +396,7 @@ def _rays(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
 
 
 def surface_points(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
-    """World points seen at image positions.
+    """World points at image positions.
 
     Args:
         scene: the scene.
@@ -403,7 +404,8 @@ def surface_points(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
         xy: [n, 2] positions in pixels, corner (0, 0); they may lie between pixels.
 
     Returns:
-        [n, 3] float64 world points in metres, NaN where a position outside the image sees nothing.
+        [n, 3] float64 world points in metres, NaN at positions without a surface, which are
+        outside the image.
     """
     xy = np.asarray(xy, float)
     pose = scene.cam_from_world[frame]
@@ -415,7 +417,7 @@ def surface_points(scene: Scene, frame: int, xy: FloatArray) -> FloatArray:
 def project(
     scene: Scene, frame: int, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Project world points and say which of them the frame really shows.
+    """Project world points and determine which of them are visible.
 
     Args:
         scene: the scene.
@@ -435,7 +437,7 @@ def project(
     )
     visible = (xy >= 0).all(1) & (xy[:, 0] <= scene.width) & (xy[:, 1] <= scene.height)
     nearest = _cast(scene, frame, xy[visible])
-    # A surface may hide its own points only by rounding.
+    # A tolerance, so that a surface does not occlude its own points by rounding.
     visible[visible] = nearest >= depth[visible] * (1 - 1e-6)
     return xy, depth, visible
 
@@ -457,7 +459,7 @@ def surface_distance(scene: Scene, points: FloatArray) -> FloatArray:
         else:
             uv = np.stack([offset @ e / (e @ e) for e in (surface.edge_u, surface.edge_v)], 1)
             if surface.kind == "disc":
-                # The ellipse of the example is a circle.
+                # The only ellipse of the example is a circle.
                 away = np.linalg.norm(uv - 0.5, axis=1, keepdims=True)
                 uv = 0.5 + (uv - 0.5) * np.minimum(1, 0.5 / np.maximum(away, 1e-12))
             uv = np.clip(uv, 0, 1)
@@ -470,16 +472,16 @@ def surface_distance(scene: Scene, points: FloatArray) -> FloatArray:
 def transfer(
     scene: Scene, xy: FloatArray, frame_a: int, frame_b: int
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Exact positions in frame b of what frame a shows.
+    """Exact positions in frame b of the surface points at positions in frame a.
 
     Args:
         scene: the scene.
         xy: [n, 2] positions in frame a in pixels, corner (0, 0).
-        frame_a: frame index the positions are in.
-        frame_b: frame index to carry them to.
+        frame_a: frame index of the positions.
+        frame_b: frame index of the result.
 
     Returns:
-        [n, 2] positions in frame b and [n] bool: visible there.
+        [n, 2] positions in frame b, and [n] bool whether the points are visible there.
     """
     xy_b, _, visible = project(scene, frame_b, surface_points(scene, frame_a, xy))
     return xy_b, visible
@@ -498,7 +500,7 @@ def _noise(
     octaves: int = 6,
     gain: float = 0.55,
 ) -> FloatArray:
-    """[h, w] fractal noise of about unit variance; ``cell`` is the coarsest wave in texels."""
+    """[h, w] fractal noise of about unit variance; ``cell`` is the longest wavelength in texels."""
     cell_y, cell_x = cell if isinstance(cell, tuple) else (cell, cell)
     total = np.zeros(shape, np.float32)
     power = 0.0
@@ -525,7 +527,7 @@ def _mix(a: FloatArray, b: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _rgb(*values: int) -> FloatArray:
-    """A colour given as 8-bit sRGB, made linear."""
+    """Linear colour of 8-bit sRGB values."""
     return ((np.array(values, np.float32) / 255) ** 2.2).astype(np.float32)
 
 
@@ -540,7 +542,7 @@ def _edges(labels: FloatArray) -> FloatArray:
 def _warp_labels(
     rng: np.random.Generator, labels: FloatArray, amount: float, cell: float
 ) -> FloatArray:
-    """Move label borders by smooth noise of ``amount`` texels, as nothing hand-made is straight."""
+    """Move label borders by smooth noise of ``amount`` texels, for a hand-made look."""
     h, w = labels.shape
     ys, xs = np.mgrid[0:h, 0:w].astype(np.float32)
     xs += amount * _noise(rng, (h, w), cell, 4)
@@ -590,7 +592,7 @@ def _courses(
 def _per_label(
     rng: np.random.Generator, labels: FloatArray, palette: FloatArray, spread: float
 ) -> FloatArray:
-    """[h, w, 3] a palette colour for each label, varied in brightness and tint."""
+    """[h, w, 3] palette colours by label, with random brightness and tint."""
     count = int(labels.max()) + 1
     colours = palette[rng.integers(0, len(palette), count)]
     colours = colours * np.exp(spread * rng.standard_normal((count, 1)))
@@ -714,7 +716,7 @@ def _plastered_brick(rng: np.random.Generator, shape: tuple[int, int], texels: f
     face = _step(0.004, 0.012, gap + 0.003 * fine)
     albedo = _mix(mortar, brick, face) * _speckle(rng, shape, 0.13)
     height = 0.010 * face + 0.002 * fine
-    # Plaster left on the wall, thicker than the bricks' relief so that its broken rim shows.
+    # The remaining plaster is thicker than the relief of the bricks, so that its edge is visible.
     cover = _noise(rng, shape, 1.7 * texels, 8, 0.58)
     depth_down = np.linspace(0.55, -0.75, shape[0], dtype=np.float32)[:, None]
     plaster = _step(0.02, 0.07, cover + depth_down + 0.33)
@@ -756,7 +758,7 @@ def _boards(
     *,
     upright: bool = False,
 ) -> Painted:
-    """Weathered boards ``width`` metres wide, lying or upright."""
+    """Weathered boards ``width`` metres wide, horizontal or vertical."""
     if upright:
         albedo, height = _boards(rng, shape[::-1], texels, palette, width)
         return albedo.transpose(1, 0, 2).copy(), height.T.copy()
@@ -838,7 +840,7 @@ def _concrete(rng: np.random.Generator, shape: tuple[int, int], texels: float) -
 def _solid_noise(
     rng: np.random.Generator, points: FloatArray, cell: float, octaves: int, gain: float
 ) -> FloatArray:
-    """Fractal noise at 3D ``points`` [..., 3]: the same from every side, without seam or pole."""
+    """Fractal noise at 3D ``points`` [..., 3], which has no seams or poles on any surface."""
     total = np.zeros(points.shape[:-1], np.float32)
     power = 0.0
     for k in range(octaves):
@@ -927,7 +929,7 @@ def _paint(surface: Surface, serial: int, points: FloatArray) -> Painted:
 
 
 # ---------------------------------------------------------------------------------------------
-# Light, baked once: a low sun through leaves, and open sky darkened in corners
+# Baked light: a low sun through leaves, and sky light with ambient occlusion
 
 
 def _texel_points(surface: Surface, rows: int, cols: int) -> tuple[FloatArray, FloatArray]:
@@ -950,7 +952,7 @@ def _texel_points(surface: Surface, rows: int, cols: int) -> tuple[FloatArray, F
 def _blocked(
     surfaces: list[Surface], points: FloatArray, direction: FloatArray, reach: float
 ) -> NDArray[np.bool_]:
-    """[n] whether a ray from each point meets a surface closer than ``reach`` metres."""
+    """[n] whether a ray from each point hits a surface within ``reach`` metres."""
     shadow = np.zeros(len(points), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         for s in surfaces:
@@ -981,7 +983,7 @@ def _light(scene: Scene, surface: Surface) -> tuple[FloatArray, FloatArray]:
     sky = np.zeros(len(start), np.float32)
     weights = np.full(len(start), 1e-3, np.float32)
     for k in range(28):
-        # A spiral over the whole sphere: each texel weighs the directions its normal faces.
+        # Directions on a spiral over the sphere, weighted by the cosine with the texel's normal.
         z = 1 - (2 * k + 1) / 28
         turn = k * 2.399963
         ring = math.sqrt(1 - z * z)
@@ -998,7 +1000,7 @@ def _light(scene: Scene, surface: Surface) -> tuple[FloatArray, FloatArray]:
 
 
 def _dapple(points: FloatArray) -> FloatArray:
-    """Leaf shadow [rows, cols]: soft noise on a plane across the sun's direction."""
+    """Shadow of leaves [rows, cols]: smooth noise on a plane perpendicular to the sun."""
     rng = np.random.default_rng(_SEED + 2)
     a = np.cross(_SUN, [0, 0, 1.0])
     a /= np.linalg.norm(a)
@@ -1012,7 +1014,7 @@ def _dapple(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Texture:
-    """Linear radiance in halving resolutions, ``levels[k]`` float32 [h, w, 3]."""
+    """Mipmaps of linear radiance, ``levels[k]`` float32 [h, w, 3]."""
 
     metres: float
     levels: list[FloatArray] = field(default_factory=list)
@@ -1025,7 +1027,7 @@ def _texture(scene: Scene, serial: int) -> _Texture:
     points, normals = _texel_points(surface, rows, cols)
     albedo, height = _paint(surface, serial, points)
 
-    # Tilt the normal by the painted height's slope along the surface's own axes.
+    # Bump mapping: tilt the normal by the slope of the painted height.
     along_v = np.gradient(height, axis=0) * surface.texels
     along_u = np.gradient(height, axis=1) * surface.texels
     if surface.kind in ("quad", "disc"):
@@ -1036,7 +1038,7 @@ def _texture(scene: Scene, serial: int) -> _Texture:
         tangent_u /= np.linalg.norm(tangent_u, axis=-1, keepdims=True) + 1e-9
         tangent_v = np.cross(tangent_u, normals)
         if surface.kind == "sphere":
-            # A texel gets narrower towards the poles.
+            # Texels are narrower near the poles.
             narrow = np.sin((np.arange(rows) + 0.5) / rows * math.pi)[:, None]
             along_u = along_u / np.maximum(narrow, 0.05)
     bent = normals - along_u[..., None] * tangent_u - along_v[..., None] * tangent_v
@@ -1063,7 +1065,7 @@ def _texture(scene: Scene, serial: int) -> _Texture:
 
 
 def _sample(texture: _Texture, u: FloatArray, v: FloatArray, spacing: FloatArray) -> FloatArray:
-    """[n, 3] texture values, trilinear, blurred to the samples' ``spacing`` in metres."""
+    """[n, 3] texture values with trilinear filtering for the samples' ``spacing`` in metres."""
     detail = np.log2(np.maximum(spacing / texture.metres, 1))
     detail = np.minimum(detail, len(texture.levels) - 1)
     result = np.zeros((len(u), 3), np.float32)
@@ -1073,7 +1075,7 @@ def _sample(texture: _Texture, u: FloatArray, v: FloatArray, spacing: FloatArray
         if len(at) == 0:
             continue
         level = texture.levels[k]
-        # cv2.remap takes at most 32767 rows or columns: fold the list into a sheet.
+        # cv2.remap accepts at most 32767 rows or columns: arrange the list as a table.
         sheet = np.zeros((2, math.ceil(len(at) / 1024), 1024), np.float32)
         sheet[0].ravel()[: len(at)] = u[at] * level.shape[1] - 0.5
         sheet[1].ravel()[: len(at)] = v[at] * level.shape[0] - 0.5
@@ -1085,7 +1087,7 @@ def _sample(texture: _Texture, u: FloatArray, v: FloatArray, spacing: FloatArray
 
 
 def render_frame(scene: Scene, textures: list[_Texture], frame: int) -> NDArray[np.uint8]:
-    """[height, width, 3] uint8 sRGB picture of a frame; each pixel averages its own square."""
+    """[height, width, 3] uint8 sRGB picture of a frame; each pixel averages several samples."""
     s = SUPERSAMPLE
     pose = scene.cam_from_world[frame]
     rotation = pose[:, :3]
@@ -1122,7 +1124,7 @@ def render_frame(scene: Scene, textures: list[_Texture], frame: int) -> NDArray[
         if flat:
             cosine = np.abs(d_dot(surface.normal)) / length[window]
         else:
-            # The angle at which a round surface is met, from how far off its axis the ray passes.
+            # Angle of incidence on a round surface, from the distance of the ray from its axis.
             normal = [
                 d_dot(a) * np.where(nearer, t, 0) + (centre - surface.origin) @ a for a in np.eye(3)
             ]
@@ -1143,7 +1145,7 @@ def render_frame(scene: Scene, textures: list[_Texture], frame: int) -> NDArray[
 
 
 def _tone(linear: FloatArray) -> FloatArray:
-    """Linear radiance to sRGB in [0, 1] with a soft shoulder instead of clipped highlights."""
+    """Tone mapping of linear radiance to sRGB in [0, 1], without clipped highlights."""
     x = np.maximum(1.15 * linear, 0)
     x = x * (1 + x / 1.9**2) / (1 + x)
     x = np.minimum(x * 1.25, 1)
@@ -1151,7 +1153,7 @@ def _tone(linear: FloatArray) -> FloatArray:
 
 
 def paint(scene: Scene, first: int = 0) -> list[_Texture]:
-    """Textures of the surfaces, from one on, in the scene's light."""
+    """Lit textures of the surfaces, starting with number ``first``."""
     return [_texture(scene, k) for k in range(first, len(scene.surfaces))]
 
 
@@ -1163,14 +1165,14 @@ def render(scene: Scene) -> Iterator[NDArray[np.uint8]]:
 
 
 def encode(frames: Iterator[NDArray[np.uint8]], output: Path, crf: int = CRF) -> None:
-    """Write RGB frames as AV1 in mp4 with ffmpeg's libaom.
+    """Write RGB frames as AV1 in MP4 with ffmpeg's libaom.
 
     Raises:
-        RuntimeError: ffmpeg failed, with the last line it printed.
+        RuntimeError: ffmpeg failed; the message includes the last line that it printed.
     """
     executable = os.environ.get("IMAGEIO_FFMPEG_EXE")
     if not executable:
-        # Only the encoder needs it, not those who import the truth.
+        # Only encoding needs this package, not importing the ground truth.
         import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: PLC0415
 
         executable = imageio_ffmpeg.get_ffmpeg_exe()
@@ -1192,7 +1194,7 @@ def encode(frames: Iterator[NDArray[np.uint8]], output: Path, crf: int = CRF) ->
                 process.stdin.write(frame.tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # ffmpeg says below why it stopped reading
+            pass  # ffmpeg's message is reported below.
         message = process.stderr.read().decode(errors="replace").strip()
     if process.returncode != 0:
         raise RuntimeError(f"ffmpeg could not encode the clip: {message.splitlines()[-1:]}")
@@ -1201,8 +1203,8 @@ def encode(frames: Iterator[NDArray[np.uint8]], output: Path, crf: int = CRF) ->
 def write_truth(scene: Scene, path: Path) -> None:
     """Write poses, intrinsics and a coarse depth map of every frame.
 
-    ``depth[k, j, i]`` is frame k's depth along its z axis at (depth_x[i], depth_y[j]), in metres,
-    rounded to float16; exact depths come from :func:`project`.
+    ``depth[k, j, i]`` is the depth of frame k along its z axis at (depth_x[i], depth_y[j]), in
+    metres, rounded to float16. :func:`project` returns exact depths.
     """
     depth_x = np.arange(DEPTH_STEP / 2, scene.width, DEPTH_STEP)
     depth_y = np.arange(DEPTH_STEP / 2, scene.height, DEPTH_STEP)
@@ -1226,11 +1228,13 @@ def write_truth(scene: Scene, path: Path) -> None:
 
 
 def main() -> int:
-    """Command line: write the clip and its truth."""
+    """Write the clip and its ground truth."""
     here = Path(__file__).resolve().parent
-    parser = argparse.ArgumentParser(description="Render the example clip and its exact truth.")
+    parser = argparse.ArgumentParser(description="Render the example clip and its ground truth.")
     parser.add_argument("--output", type=Path, default=here / "scene.mp4", help="the clip (AV1)")
-    parser.add_argument("--truth", type=Path, default=here / "scene_truth.npz", help="its truth")
+    parser.add_argument(
+        "--truth", type=Path, default=here / "scene_truth.npz", help="its ground truth"
+    )
     options = parser.parse_args()
     scene = build_scene()
     write_truth(scene, options.truth)

@@ -147,7 +147,7 @@ def test_the_report_needs_no_other_file(compared):
     assert len(sources) == 3 + 2 * 3
     assert all(source.startswith("data:image/") for source in sources)
     assert not re.search(r'(href|src)="(?!data:)|@import|url\(', html)
-    for told in ("broken: no.h5: no such file", "8 of 8", "the given truth (poses.txt)"):
+    for told in ("broken: no.h5: no such file", "8 of 8", "the ground truth (poses.txt)"):
         assert told in html
     assert len(re.findall("<tr><td>av1 [+] all tracks</td>", html)) == 3
     assert len(set(sources)) == len(sources)
@@ -324,7 +324,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     # What fails leaves its line, and figures of the clouds.
     refused = {
         "false {data}": f"the trainer ended with status 1: see {log}",
-        "echo {data}": "holds 0 renderings for 4 test images",
+        "echo {data}": "has 0 renderings for 4 test images",
     }
     for command, told in refused.items():
         options = replace(options, trainer=command)
@@ -332,14 +332,14 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
         assert told in column.training_error
         assert column.model.num_registered == 8
         page = unescape((output / "report.html").read_text())
-        assert f"nothing rendered of av1: {column.training_error}" in page
+        assert f"no renderings of av1: {column.training_error}" in page
 
 
 def test_renderings_are_found_by_name_or_order(tmp_path):
     references = [tmp_path / f"frame_{i:06d}.png" for i in (1, 3, 5)]
     renders = tmp_path / "renders"
     renders.mkdir()
-    with pytest.raises(EvaluationError, match="holds 0 renderings for 3 test images"):
+    with pytest.raises(EvaluationError, match="has 0 renderings for 3 test images"):
         match_renders(renders, references)
     for name in ("9.png", "10.png", "100.png"):
         (renders / name).touch()
@@ -361,7 +361,7 @@ def test_images_that_exist_and_nothing_to_measure_against(compared, video, tmp_p
     names = {i.name for i in pycolmap.Reconstruction(column.model_path).images.values()}
     assert names == {f"shot{i + 1}.png" for i in range(8)}
     assert (column.poses, column.cloud, report.pose_reference) == (None, None, "")
-    assert "no poses or cloud to measure against" in (report.output / "report.html").read_text()
+    assert "no reference poses or cloud" in (report.output / "report.html").read_text()
     assert not (report.output / "footage" / "images").exists()
 
 
@@ -387,8 +387,8 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         "av1,surf": "front-end 'surf': give one of av1,",
         "av1,av1": "front-end 'av1' is given twice",
         "mine=features.h5": "give NAME=FEATURES.h5:MATCHES.h5",
-        "av1=a.h5:b.h5": "give it another name",
-        "../x=a.h5:b.h5": "give it another name",
+        "av1=a.h5:b.h5": "name is taken or invalid",
+        "../x=a.h5:b.h5": "name is taken or invalid",
     }
     for frontends, told in refused.items():
         assert main([*given, "--frontends", frontends]) == 2
@@ -425,7 +425,7 @@ def test_a_reference_of_other_images_is_refused(video, tmp_path):
     with pytest.raises(ModelError, match="has poses of 1 of the 8 images"):
         compare(video, tmp_path / "report", reference=poses, options=options)
     poses.write_text("0.png 0 0 here\n")
-    with pytest.raises(ImageError, match=r"'0.png 0 0 here' is no pose"):
+    with pytest.raises(ImageError, match=r"'0.png 0 0 here' is not a pose"):
         compare(video, tmp_path / "report", reference=poses, options=options)
     with pytest.raises(ImageError, match="No such file or directory: give lines of"):
         compare(video, tmp_path / "report", reference=tmp_path / "none", options=options)

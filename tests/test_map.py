@@ -95,7 +95,7 @@ def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) ->
     report = map_database(apart, images, tmp_path / "model", options=options)
     sizes = [read_model(tmp_path / "model" / str(i)).num_reg_images() for i in range(2)]
     assert report.num_registered == tuple(sizes) == (NUM_IMAGES - num_first, num_first)
-    said = f"model '0' holds {NUM_IMAGES - num_first}, '1' {num_first}; each has coordinates"
+    said = f"'0' has {NUM_IMAGES - num_first}, '1' has {num_first}; each model has its"
     assert any(said in warning for warning in report.warnings)
 
 
@@ -116,7 +116,7 @@ def test_a_model_of_images_that_the_first_one_has_is_said(
 
     monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
     report = map_database(database, images, tmp_path / "model")
-    said = f"model '0' holds all {NUM_IMAGES} images, '1' 2 of them again: leave that out"
+    said = f"model '0' has all {NUM_IMAGES} images, '1' has 2 of them again: ignore the others"
     assert said in report.warnings
 
 

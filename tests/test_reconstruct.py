@@ -598,7 +598,7 @@ def test_command_line(
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
     assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2
-    assert "give a name that ends so" in capsys.readouterr().err
+    assert "give a name that ends in .ply" in capsys.readouterr().err
     # Brush takes the last .ply of a folder, or init.ply: there is one only where it is wanted.
     assert main([*words, "--gaussians", str(tmp_path / "dense" / "init.ply")]) == 0
     assert [p.name for p in tmp_path.glob("dense/*.ply")] == ["init.ply"]

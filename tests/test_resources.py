@@ -238,7 +238,7 @@ def test_model_whose_numbers_are_none(tmp_path: Path) -> None:
     # Places of the first parameter, and of the pose in both files that have it.
     for places, text in (
         ({"cameras.bin": 32}, "parameters that are not numbers"),
-        ({"images.bin": 44, "frames.bin": 48}, "a pose that is not of numbers"),
+        ({"images.bin": 44, "frames.bin": 48}, "a pose that is not finite"),
     ):
         for name, data in model_files({}).items():
             changed = bytearray(data)

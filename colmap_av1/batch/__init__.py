@@ -1,1 +1,1 @@
-"""One task on many videos: on this machine, on a cluster, or as parts of an array of jobs."""
+"""One task on many videos: on this machine, on a Ray cluster, or as shards of a job array."""

@@ -1,4 +1,4 @@
-"""Our command in a process of its own, and what it reported."""
+"""Running a `colmap-av1` command in a separate process, and reading its report."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from colmap_av1.util.remote import without_secrets
 
 _WARNING = re.compile(r"^colmap-av1: warning: (.*)$", re.MULTILINE)
 _ERROR = re.compile(r"^colmap-av1: error: (.*)$", re.MULTILINE)
-_MOST_SAID = 1 << 16  # bytes of what a process printed last
-# Statuses of a process that the system or an operator has ended: by a signal, or in order after it.
+_MOST_PRINTED = 1 << 16  # Bytes of the end of a process's log that are read.
+# Exit statuses of a process that the system or an operator ended: by the signal itself, or by an
+# orderly exit after it.
 _SENT = (signal.SIGTERM, signal.SIGINT, getattr(signal, "SIGKILL", signal.SIGTERM))
 _ENDED = {*(-number for number in _SENT), *(128 + number for number in _SENT)}
-_END = 5.0  # seconds
+_END = 5.0  # Seconds that a process gets to end after SIGTERM.
 
 
 class Processes:
-    """Runs processes, one for each thread that asks for one, and can stop them all."""
+    """Runs processes from several threads, and can stop all of them."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()
@@ -38,20 +39,28 @@ class Processes:
         self.stopped = False
 
     def run(self, words: list[str], folder: Path, log: Path, timeout: float | None) -> int | None:
-        """The exit status of our command, negative for a signal; None where it took too long."""
-        # Not the working folder, in which another version of the package may lie.
+        """Run a command; returns its exit status, negative for a signal, or None after a timeout.
+
+        Args:
+            words: the command and its options.
+            folder: its working folder.
+            log: file that gets its standard error.
+            timeout: seconds; None: no limit.
+        """
+        # Without the working folder, which may hold another version of the package.
         path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, sys.path)])
-        with log.open("wb") as said, self._lock:
+        with log.open("wb") as printed, self._lock:
             if self.stopped:
                 return -signal.SIGTERM
             process = subprocess.Popen(
                 bound([sys.executable, "-m", "colmap_av1", *words]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=said,
+                stderr=printed,
                 cwd=folder,
                 env={**os.environ, "PYTHONPATH": path},
-                # The interrupt of a terminal is for the driver, which ends the others in order.
+                # An interrupt from the terminal must reach the parent only, which then ends the
+                # other processes in an orderly way.
                 start_new_session=True,
             )
             self._running.add(process)
@@ -66,7 +75,7 @@ class Processes:
             process.wait()
 
     def stop(self) -> None:
-        """End all processes, in order if they heed that in time, and let no further one start."""
+        """Terminate all processes, kill those that do not end in time, and start no more."""
         with self._lock:
             self.stopped = True
             running = list(self._running)
@@ -80,7 +89,7 @@ class Processes:
 
 
 def _signal(process: subprocess.Popen[bytes], name: str) -> None:
-    """Send a signal to a process that runs, and to those that it has started."""
+    """Send a signal to a running process and the processes that it started."""
     if process.poll() is not None:
         return
     with suppress(ProcessLookupError, PermissionError):
@@ -91,10 +100,10 @@ def _signal(process: subprocess.Popen[bytes], name: str) -> None:
 
 
 class CommandFailedError(Exception):
-    """Our command has failed.
+    """A `colmap-av1` command failed.
 
     Attributes:
-        failure: why.
+        failure: the reason.
     """
 
     def __init__(self, failure: Failure) -> None:
@@ -109,20 +118,20 @@ def run_command(
     timeout: float | None,
     processes: Processes,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Run our command and read its report.
+    """Run a `colmap-av1` command and read its report.
 
     Args:
         words: the command and its options.
-        scratch: the folder it is started in.
-        names: paths of unfinished work, and what they are called afterwards.
-        timeout: seconds after which it is stopped; None: never.
-        processes: runs it.
+        scratch: its working folder.
+        names: paths of unfinished work, and the names that replace them in texts.
+        timeout: seconds after which the command is stopped; None: never.
+        processes: runs the command.
 
     Returns:
-        What --report_json wrote, and the warnings.
+        The content of --report_json, and the warnings.
 
     Raises:
-        CommandFailedError: it failed.
+        CommandFailedError: the command failed.
     """
 
     def renamed(text: str) -> str:
@@ -133,13 +142,13 @@ def run_command(
     log, written = scratch / "log", scratch / "report.json"
     status = processes.run([*words, f"--report_json={written}"], scratch, log, timeout)
     with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - _MOST_SAID))
-        said = renamed(file.read().decode("utf-8", "backslashreplace"))
+        file.seek(max(0, log.stat().st_size - _MOST_PRINTED))
+        printed = renamed(file.read().decode("utf-8", "backslashreplace"))
     facts: Any = {}
     with suppress(OSError, ValueError):
         facts = plain(json.loads(written.read_bytes()), renamed)
     if status == 0 and "report" in facts:
-        return facts, _WARNING.findall(said)
+        return facts, _WARNING.findall(printed)
     if status is None:
         text = f"stopped after {timeout:g} seconds: give a longer --timeout"
         raise CommandFailedError(Failure("timeout", text, transient=True))
@@ -152,8 +161,8 @@ def run_command(
     if status < 0:
         text = f"its process ended by signal {-status}: please report the video"
         raise CommandFailedError(Failure("crashed", text))
-    errors = _ERROR.findall(said)
-    if errors:  # the report of it could not be written
+    errors = _ERROR.findall(printed)
+    if errors:  # The command could not write its report.
         raise CommandFailedError(Failure("reading or writing", errors[-1], transient=True))
-    last = said.strip().rpartition("\n")[2]
+    last = printed.strip().rpartition("\n")[2]
     raise CommandFailedError(Failure("defect", last or f"its process ended with status {status}"))

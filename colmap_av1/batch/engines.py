@@ -1,4 +1,4 @@
-"""What runs the videos of a batch: threads that start processes here, or tasks of Ray."""
+"""Engines that process the videos of a batch: local processes, or tasks of Ray."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from colmap_av1.util.signals import handlers_kept
 
 EXTRA = "colmap-av1[cluster]"
 _MEMORY_OF_VIDEO = 4 << 30
-_ANSWERS = 10.0  # seconds in which something must answer at an address
+_ANSWERS = 10.0  # Seconds to wait for a connection to the address of Ray.
 
 
 class LocalEngine:
-    """A process of this machine for each video.
+    """Processes each video in a separate process on this machine.
 
     Attributes:
-        about: what it runs on, a line for the user.
+        about: one line for the user about the resources in use.
     """
 
     def __init__(self, work: Work, options: BatchOptions, num_videos: int) -> None:
@@ -39,7 +39,7 @@ class LocalEngine:
         num_jobs = max(1, min(most, num_videos))
         self._work, self._threads = work, options.cores or max(1, cores // num_jobs)
         self._processes = Processes()
-        # The threads only wait for processes.
+        # These threads only wait for the processes.
         self._pool = ThreadPoolExecutor(num_jobs)
         self.about = f"{num_jobs} videos at a time, {self._threads} threads each"
 
@@ -48,7 +48,7 @@ class LocalEngine:
         return self._pool.submit(process_video, self._work, video, self._threads, self._processes)
 
     def failure(self, error: BaseException) -> Failure:
-        """Why a future has no outcome."""
+        """The reason why a future has no outcome."""
         return failure_of(error)
 
     def close(self) -> None:
@@ -59,15 +59,15 @@ class LocalEngine:
 
 
 class RayEngine:
-    """Tasks of a Ray that is started on this machine, or of one that runs.
+    """Processes each video in a task of Ray, started on this machine or already running.
 
     Attributes:
-        about: what it runs on, a line for the user.
+        about: one line for the user about the resources in use.
     """
 
     def __init__(self, work: Work, options: BatchOptions) -> None:
         try:
-            import ray  # noqa: PLC0415 - few need it
+            import ray  # noqa: PLC0415 - an optional dependency
         except ImportError as error:
             raise OptionError(f"engine ray needs the package ray: pip install '{EXTRA}'") from error
         self._ray: Any = ray
@@ -79,7 +79,7 @@ class RayEngine:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             how = {"num_cpus": threads_or_cpus(None), "address": "local"}
         try:
-            with handlers_kept():  # Ray has one of its own for the end of a process
+            with handlers_kept():  # Ray installs a SIGTERM handler of its own.
                 context = ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError, RuntimeError) as error:
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -87,17 +87,17 @@ class RayEngine:
         nodes = [n["Resources"].get("CPU", 0) for n in ray.nodes() if n["Alive"]]
         if not any(nodes):
             ray.shutdown()
-            raise OptionError("Ray has no node with a CPU: start one, or leave out --address")
+            raise OptionError("Ray has no node with a CPU: start one, or omit --address")
         self._threads = int(min(options.cores or 1, max(nodes)))
         dashboard = f", dashboard http://{context.dashboard_url}" if context.dashboard_url else ""
         self.about = f"Ray of {sum(nodes):.0f} cores{dashboard}"
-        # Ray itself tries again where a node or its process is lost.
+        # Ray retries a task whose node or process was lost.
         self._task = ray.remote(max_retries=options.retries)(_process_on_node)
         self._work = ray.put(work)
         self._running: set[Any] = set()
 
     def submit(self, video: Video) -> Future[Outcome]:
-        """Process a video as soon as a node has the cores it needs."""
+        """Process a video as soon as a node has enough free cores."""
         task = self._task.options(num_cpus=self._threads, name=f"video {video.name}")
         reference = task.remote(self._work, video, self._threads)
         self._running.add(reference)
@@ -106,7 +106,7 @@ class RayEngine:
         return future
 
     def failure(self, error: BaseException) -> Failure:
-        """How Ray lost a video."""
+        """The reason why Ray could not process a video."""
         failures = self._ray.exceptions
         if isinstance(error, failures.OutOfMemoryError):
             return Failure("memory", "stopped by Ray, as its node ran out of memory")
@@ -123,19 +123,19 @@ class RayEngine:
 
 
 def _check_answers(address: str) -> None:
-    """Refuse an address where nothing answers, to which Ray would try to connect for long.
+    """Refuse an address that does not accept connections: Ray itself would retry for minutes.
 
     Raises:
-        OptionError: nothing answers.
+        OptionError: the connection fails.
     """
     host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdecimal():  # such as 'auto'
+    if not colon or not port.isdecimal():  # For example 'auto'.
         return
     try:
         socket.create_connection((host, int(port)), _ANSWERS).close()
     except (OSError, OverflowError) as error:
         raise OptionError(
-            f"no Ray at {address}: {error}: give the address that 'ray start' has printed"
+            f"no Ray at {address}: {error}: give the address that 'ray start' printed"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The videos that are given as lists, patterns, folders and URLs, with their names."""
+"""The videos of a batch, found from lists, patterns, folders and URLs, and their names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from colmap_av1.util.remote import (
     without_secrets,
 )
 
-# What a folder is searched for; lists and patterns may name others.
+# Files that a folder is searched for. Lists and patterns may name other files.
 VIDEO_SUFFIXES = (
     ".mp4",
     ".m4v",
@@ -42,7 +42,7 @@ VIDEO_SUFFIXES = (
 )
 _SPECIAL = frozenset("*?[")
 _LONGEST_LINE = 1 << 16
-_LONGEST_PART = 240  # bytes of a file name, with room for a suffix
+_LONGEST_PART = 240  # Bytes of a file name; file systems allow 255, and suffixes are appended.
 
 
 @dataclass(frozen=True)
@@ -59,23 +59,28 @@ class Video:
 
 
 def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[Video], int]:
-    """The videos of a batch in the order in which they are given, and how many are repeated.
+    """The videos of a batch in the order given, and the number of repeated ones.
 
-    A folder is searched for videos, in the order of their paths; a pattern names files; any other
-    file that is not a video is a list: a line for each video, its path or URL, relative to the
-    list, and if wanted a tab and its name. The name is the path without its suffix below the
-    folder, the fixed part of the pattern or the folder of the list; of other files it is that of
-    the file.
+    An input is one of:
+
+    - a folder, which is searched for videos in the order of their paths,
+    - a pattern of file names,
+    - a video,
+    - any other file: a list with one video on each line, as a path relative to the list or a URL,
+      optionally followed by a tab and a name.
+
+    A video's default name is its path without suffix, relative to the folder, to the fixed part of
+    the pattern or to the list's folder; for a video elsewhere it is the file name.
 
     Args:
         inputs: paths, patterns and URLs.
-        output: absolute path or URL of the output, which no searched folder may hold.
-        stall: seconds without data after which a URL is given up.
+        output: absolute path or URL of the output, which must not lie in a searched folder.
+        stall: seconds without data after which reading a URL fails.
 
     Raises:
-        OptionError: there is no such file, no video, a list that is not one, the output is in a
-            folder that is searched, or names cannot be those of folders or clash.
-        OSError: something cannot be read.
+        OptionError: a file does not exist, an input has no video, a list is not a text file, the
+            output lies in a searched folder, or names clash or are not valid folder names.
+        OSError: an input cannot be read.
     """
     videos: dict[str, Video] = {}
     num_repeated = 0
@@ -83,7 +88,7 @@ def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[
         found = [Video(name, absolute(address)) for name, address in _listed(word, output, stall)]
         if not found:
             raise OptionError(
-                f"{without_secrets(word)}: holds no video: give a list, pattern or folder with one"
+                f"{without_secrets(word)}: has no video: give a list, pattern or folder with one"
             )
         for video in found:
             _check_name(video)
@@ -91,16 +96,16 @@ def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[
             if there.address != video.address:
                 raise OptionError(
                     f"{without_secrets(there.address)} and {without_secrets(video.address)} would "
-                    f"both be '{video.name}' in the output: give a list with a tab and a name of "
-                    "its own after each"
+                    f"both be '{video.name}' in the output: give a list with a tab and a unique "
+                    "name after each"
                 )
             num_repeated += there is not video
     folders = {str(folder) for name in videos for folder in PurePosixPath(name).parents}
     nested = next((name for name in videos if name in folders), None)
     if nested is not None:
         raise OptionError(
-            f"'{nested}' is a video and the folder of others, which would be in its output: "
-            "give a list with a tab and a name of its own after each"
+            f"'{nested}' is a video and the folder of others, so their outputs would mix: "
+            "give a list with a tab and a unique name after each"
         )
     return list(videos.values()), num_repeated
 
@@ -112,19 +117,19 @@ def _check_name(video: Video) -> None:
     if unfit or any(len(os.fsencode(part)) > _LONGEST_PART for part in parts):
         raise OptionError(
             f"{without_secrets(video.address)}: '{video.name}' cannot be the name of its folder: "
-            "give another after a tab in a list"
+            "give another name after a tab in a list"
         )
 
 
 def _listed(word: str, output: str, stall: float) -> Iterable[tuple[str, str]]:
-    """Names and addresses of the videos that one word of the inputs stands for."""
+    """Names and addresses of the videos of one input."""
     place = _Url(word, stall) if is_url(word) else _Local(word)
     if place.is_folder():
         root = absolute(word).rstrip("/")
         if f"{output.rstrip('/')}/".startswith(f"{root}/"):
             raise OptionError(
                 f"{without_secrets(output)}: the output is in {without_secrets(word)}, which is "
-                "searched for videos: give one outside"
+                "searched for videos: give an output outside it"
             )
         return ((_name_below(address, root), address) for address in place.videos_below())
     if place.is_file():
@@ -141,7 +146,7 @@ def _listed(word: str, output: str, stall: float) -> Iterable[tuple[str, str]]:
 
 
 def _name_below(address: str, root: str) -> str:
-    """The path without suffix below a folder; the file's name alone where it is elsewhere."""
+    """The path without suffix relative to a folder; the file name if it is not below it."""
     prefix = root if root.endswith("/") or not root else f"{root}/"
     below = address[len(prefix) :] if address.startswith(prefix) else ""
     if is_url(address):
@@ -163,10 +168,10 @@ def _of_list(word: str) -> Iterator[tuple[str, str]]:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
             if len(line) == _LONGEST_LINE or b"\0" in line:
                 raise OptionError(
-                    f"{without_secrets(word)}: line {number} is no path: give a text file "
-                    "with a line for each video, or a video by a name that ends as videos do"
+                    f"{without_secrets(word)}: line {number} is not a path: give a text file "
+                    "with one video on each line, or a video with a usual suffix such as .mp4"
                 )
-            # Names of files need not be valid text.
+            # File names need not be valid UTF-8.
             address, tab, name = os.fsdecode(line.rstrip(b"\r\n")).partition("\t")
             if not address.strip():
                 continue
@@ -206,7 +211,7 @@ class _Url:
         self._system, self._path = filesystem(url)
 
     def is_folder(self) -> bool:
-        # On a web server, an address that looks like a file is not a folder.
+        # Web servers have no folders: an address with a suffix is a file.
         if _suffix_of(self._url) or _SPECIAL & set(self._url):
             return False
         return bool(self._ask(self._system.isdir))

@@ -1,4 +1,4 @@
-"""The output of a batch: a folder for each video, complete once it holds `report.json`."""
+"""The output of a batch: a folder for each video, which is complete once it has `report.json`."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from colmap_av1.util.remote import filesystem, is_url
 
 # Marks the folder of a video as complete.
 REPORT = "report.json"
-# Names in the output that no video may have.
+# Names in the output that no video may use.
 HIDDEN = ".batch"
 ROWS, PAGE = "batch", "report.html"
-# Lists our files in the folder of a video while they are written.
+# Lists this package's files in a video's folder while they are being written.
 _UNFINISHED = ".unfinished"
 
 
 class Output:
-    """A folder of this machine, or one that it has mounted; paths in it have '/' between parts."""
+    """An output on a local or mounted file system. Paths in it use '/'."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
 
     def read(self, path: str) -> bytes | None:
-        """The content of a file; None if there is none."""
+        """The content of a file; None if it does not exist."""
         try:
             return (self._root / path).read_bytes()
         except (FileNotFoundError, NotADirectoryError):
@@ -47,13 +47,13 @@ class Output:
             partial.write_bytes(content)
 
     def take(self, file: Path, path: str) -> None:
-        """Move or copy a file of this machine here."""
+        """Move or copy a local file into the output."""
         target = self._root / path
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             file.replace(target)
         except OSError as error:
-            if error.errno != errno.EXDEV:  # the scratch is on another disk
+            if error.errno != errno.EXDEV:  # EXDEV: the file is on another disk.
                 raise
             with whole_file(target) as partial:
                 shutil.copyfile(file, partial)
@@ -71,15 +71,15 @@ class Output:
         return {path.relative_to(top).as_posix() for path in top.rglob("*") if not path.is_dir()}
 
     def names(self) -> list[str]:
-        """Names at the top, sorted; none if there is no output yet."""
+        """Names at the top level, sorted; empty if there is no output yet."""
         return sorted(os.listdir(self._root)) if self._root.exists() else []
 
     @contextmanager
     def opened(self, shard: str) -> Iterator[None]:
-        """Make the output if it is missing, and be alone with a shard of the videos.
+        """Create the output if it is missing, and lock a shard of the videos.
 
         Raises:
-            OptionError: it cannot be made, or another batch is at work on the shard.
+            OptionError: the output cannot be created, or another batch has locked the shard.
         """
         lock = self._root / HIDDEN / f"{ROWS}{shard}.lock"
         try:
@@ -90,20 +90,20 @@ class Output:
         with only_run(lock) as alone:
             if not alone:
                 raise OptionError(
-                    f"{self._root}: another batch is at work in it: wait for its end, or give "
+                    f"{self._root}: another batch is at work in it: wait until it ends, or give "
                     "another output"
                 )
             yield
 
 
 class StoreOutput(Output):
-    """A folder of an object store, whose files appear one by one, each of them whole."""
+    """An output in an object store, where files appear one by one, each complete."""
 
     def __init__(self, address: str) -> None:
         self._system, self._top = filesystem(address.rstrip("/"))
 
     def read(self, path: str) -> bytes | None:
-        """The content of a file; None if there is none."""
+        """The content of a file; None if it does not exist."""
         with suppress(FileNotFoundError):
             return bytes(self._system.cat_file(f"{self._top}/{path}"))
         return None
@@ -113,7 +113,7 @@ class StoreOutput(Output):
         self._system.pipe_file(f"{self._top}/{path}", content)
 
     def take(self, file: Path, path: str) -> None:
-        """Copy a file of this machine here."""
+        """Copy a local file into the output."""
         self._system.put_file(str(file), f"{self._top}/{path}")
 
     def remove(self, path: str) -> None:
@@ -128,7 +128,7 @@ class StoreOutput(Output):
         return set()
 
     def names(self) -> list[str]:
-        """Names at the top, sorted; none if there is no output yet."""
+        """Names at the top level, sorted; empty if there is no output yet."""
         with suppress(FileNotFoundError):
             paths = self._system.ls(self._top, detail=False)
             return sorted(str(path).rpartition("/")[2] for path in paths)
@@ -136,7 +136,7 @@ class StoreOutput(Output):
 
     @contextmanager
     def opened(self, shard: str) -> Iterator[None]:
-        """Nothing: stores have no locks, and of two that write a file the later one wins."""
+        """Do nothing: object stores have no locks, and the last writer of a file wins."""
         del shard
         yield
 
@@ -147,17 +147,17 @@ def output_at(address: str) -> Output:
 
 
 def publish(output: Output, folder: Path, name: str, report: dict[str, object]) -> None:
-    """Move a finished folder into the output as that of a video, in place of an earlier one.
+    """Move a finished folder into the output as a video's folder, replacing an earlier result.
 
-    Files that others have put there stay. The report is written last; until then a list of our
-    files is there, so that a later run can finish what was stopped.
+    Other files in that folder stay. The report is written last. Until then a list of this package's
+    files is there, so that a later run can replace the result of an interrupted one.
 
     Raises:
-        OptionError: no batch has made what is there, or a file of others is in the way.
+        OptionError: the folder exists and no batch created it, or another file is in the way.
         OSError: it cannot be written.
     """
     sources = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-    sources.pop(REPORT, None)  # the command's own, which `report` holds
+    sources.pop(REPORT, None)  # Written by the command; `report` includes its content.
     new = {*sources, REPORT}
     there = output.files(name)
     ours = _files_of_ours(output, name, there, new)
@@ -171,7 +171,7 @@ def publish(output: Output, folder: Path, name: str, report: dict[str, object]) 
 
 
 def earlier_report(output: Output, name: str) -> dict[str, Any] | None:
-    """The report of a video that is done; None if there is none of a batch."""
+    """The report of a finished video; None if no batch has written one."""
     try:
         report = json.loads(output.read(f"{name}/{REPORT}") or b"")
     except (ValueError, RecursionError):
@@ -188,10 +188,10 @@ def scratch_for(output: str, scratch: str | os.PathLike[str] | None) -> str:
 
 
 def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) -> set[str]:
-    """The files of a video's folder that an earlier run wrote, as its report or list says.
+    """The files of a video's folder that an earlier run wrote, by its report or list.
 
     Raises:
-        OptionError: no batch has made the folder, or a new file would replace one of others.
+        OptionError: no batch created the folder, or a new file would replace a foreign file.
     """
     if not there:
         return set()
@@ -202,14 +202,16 @@ def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) ->
         with suppress(ValueError, RecursionError):
             listed = json.loads(unfinished)
     elif report is not None:
-        listed = report.get("files", sorted(new))  # earlier versions kept no list
+        listed = report.get("files", sorted(new))  # Reports of earlier versions have no list.
     if not isinstance(listed, list):
         raise OptionError(
-            f"{name}: is there and not of a batch: give another output, or move it away"
+            f"{name}: exists and was not created by a batch: give another output, or move it away"
         )
-    # A list from elsewhere must not reach out of the folder: only what was found in it counts.
+    # A manipulated list must not refer to files outside the folder: only count those found in it.
     ours = {_UNFINISHED, REPORT, *(path for path in listed if isinstance(path, str))} & there
     for path in sorted(there - ours):
         if any(path == n or path.startswith(f"{n}/") or n.startswith(f"{path}/") for n in new):
-            raise OptionError(f"{name}/{path}: is in the way and not of a batch: move it away")
+            raise OptionError(
+                f"{name}/{path}: is in the way and was not created by a batch: move it away"
+            )
     return ours

@@ -1,4 +1,4 @@
-"""The page of a batch: one HTML file with every failure, the videos, and how they are spread."""
+"""The HTML page of a batch: failures, quantiles of the results, and a table of the videos."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.pages import render_page
 from colmap_av1.util.remote import absolute, without_secrets
 
-# Rows that browsers sort at once; of more videos, failures come first.
+# Number of rows that browsers still sort without delay. Failures are shown first.
 MOST_ROWS = 2000
 _QUANTILES = {
-    0.0: "least",
+    0.0: "minimum",
     0.1: "10%",
     0.25: "25%",
     0.5: "median",
     0.75: "75%",
     0.9: "90%",
-    1.0: "largest",
+    1.0: "maximum",
 }
 _NUMBERS = {
     "seconds": "seconds",
@@ -51,19 +51,20 @@ _NUM_BARS = 24
 
 
 def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) -> str:
-    """Write `report.html` into the output of a batch: it needs no other file and no network.
+    """Write `report.html`, a self-contained page, into the output of a batch.
 
-    It shows the rows that `batch.json`, and those of shards, hold.
+    It shows the rows of `batch.json`, or of the files of all shards.
 
     Args:
         output: the output, a folder or URL.
-        most_rows: videos that the table shows, failures first.
+        most_rows: maximum number of videos in the table; failures are shown first.
 
     Returns:
         The page's path or URL.
 
     Raises:
-        OptionError: there is no batch, a file of it is damaged, or the page cannot be written.
+        OptionError: the output has no batch, a file of the batch is damaged, or the page cannot be
+            written.
     """
     place = absolute(os.fspath(output)).rstrip("/")
     shown_place = without_secrets(place)
@@ -111,7 +112,7 @@ def _rows(into: Output, place: str) -> list[Row]:
             f"{place}: cannot be read: {error}: give the output of a batch"
         ) from error
     if not names:
-        raise OptionError(f"{place}: holds no {ROWS}.json: give the output of a batch")
+        raise OptionError(f"{place}: has no {ROWS}.json: give the output of a batch")
     rows = []
     for name in names:
         try:
@@ -122,7 +123,7 @@ def _rows(into: Output, place: str) -> list[Row]:
 
 
 def _spreads(rows: Sequence[Row]) -> list[Mapping[str, object]]:
-    """For each number: its title, its quantiles over all rows, and heights of a histogram."""
+    """Title, quantiles over all rows, and histogram heights of each numeric column."""
     spreads: list[Mapping[str, object]] = []
     for name, title in _NUMBERS.items():
         known = [value for row in rows if (value := getattr(row, name)) is not None]
@@ -141,7 +142,7 @@ def _spreads(rows: Sequence[Row]) -> list[Mapping[str, object]]:
 
 
 def _cell(row: Row, name: str) -> tuple[str, object]:
-    """What a cell shows, and what it is sorted by."""
+    """A cell's text and sort key."""
     value: object = getattr(row, name)
     if isinstance(value, (int, float)):
         return _number(name, value), value
@@ -160,9 +161,9 @@ def _number(name: str, value: float) -> str:
 
 
 def _thumbnail(row: Row, into: Output) -> str | None:
-    """The small picture of a video in base64."""
+    """The thumbnail of a video in base64; None if there is none."""
     try:
         content = into.read(f"{row.name}/{THUMBNAIL}") if row.state == "done" else None
-    except OSError:  # a page without it is of use
+    except OSError:  # The page is useful without it.
         content = None
     return base64.b64encode(content).decode() if content else None

@@ -18,23 +18,23 @@ from colmap_av1.util.remote import without_secrets
 
 @dataclass(frozen=True)
 class Row:
-    """What became of a video; the fields are the columns of `batch.csv`.
+    """Result of a video; the fields are the columns of `batch.csv`.
 
     Attributes:
         name: path of its folder in the output.
         input: path or URL of the video, without secrets.
-        state: what became of it.
-        reason: kind of the failure; empty where it is done.
+        state: whether the video was processed.
+        reason: kind of the failure; empty if done.
         seconds: wall time of the last attempt.
-        cpu_seconds: CPU time of it, programs that it ran included; None where unknown.
-        video_seconds: length of the video; None where unknown.
-        frames: shown frames.
-        images: frames chosen as images.
-        registered: images with a pose.
-        tracks: tracks of the video.
-        points: 3D points.
+        cpu_seconds: CPU time of the last attempt, including child processes; None if unknown.
+        video_seconds: duration of the video; None if unknown.
+        frames: number of shown frames.
+        images: number of frames chosen as images.
+        registered: number of registered images.
+        tracks: number of tracks.
+        points: number of 3D points.
         coverage: share of the images' cells that visible points project into.
-        warnings: what the user should know.
+        warnings: warnings for the user.
         error: the failure's message.
     """
 
@@ -56,7 +56,7 @@ class Row:
 
 
 def csv_of(rows: Iterable[Row]) -> bytes:
-    """Rows as CSV; names that are not valid text keep their bytes."""
+    """Rows as CSV; names that are not valid UTF-8 keep their bytes."""
     text = io.StringIO()
     columns = [field.name for field in dataclasses.fields(Row)]
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -71,16 +71,16 @@ def json_of(rows: Iterable[Row], facts: Mapping[str, object]) -> bytes:
 
 
 def json_text(value: object) -> bytes:
-    """A value as the content of a JSON file, without the secrets of URLs."""
+    """A value as the content of a JSON file, with secrets removed from URLs."""
     text = json.dumps(plain(value, without_secrets), indent=1, allow_nan=False)
     return f"{text}\n".encode("ascii")
 
 
 def row_of(facts: object) -> Row:
-    """The row of facts from a JSON file.
+    """Convert an object of a JSON file to a row.
 
     Raises:
-        ValueError: they are not those of a row.
+        ValueError: it is not a row.
     """
     try:
         return cattrs.structure(facts, Row)

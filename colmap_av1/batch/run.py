@@ -1,4 +1,4 @@
-"""A batch: every video of the inputs ends done, or named with the reason."""
+"""Processing many videos: each is done, or reported as failed with the reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.remote import absolute, without_secrets
 
-# Rows are written at most so often, and for at most this share of the time.
+# Seconds between writes of the rows, and the largest share of the time spent on writing them.
 _WRITE_EVERY = 5.0
 _WRITE_SHARE = 0.05
 _WAIT = 1.0
@@ -36,14 +36,14 @@ _WAIT = 1.0
 
 @dataclass
 class Counts:
-    """How far a batch is.
+    """Progress of a batch.
 
     Attributes:
-        total: videos of this shard.
-        done: those that are done, by this or an earlier run.
-        kept: those of them that an earlier run had finished.
-        failed: those that failed, by reason.
-        retried: attempts beyond the first.
+        total: number of videos of this shard.
+        done: number of videos that are done, by this or an earlier run.
+        kept: number of videos that an earlier run has finished.
+        failed: number of failed videos by reason.
+        retried: number of attempts beyond the first.
     """
 
     total: int
@@ -54,25 +54,25 @@ class Counts:
 
     @property
     def ended(self) -> int:
-        """Videos that are done or failed."""
+        """Number of videos that are done or failed."""
         return self.done + self.failed.total()
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of a batch.
+    """Result of a batch.
 
     Attributes:
         output: the output, as an absolute path or URL, without secrets.
-        num_videos: videos of this shard.
-        num_done: those that are done.
-        num_kept: those of them that an earlier run had finished.
-        failed: numbers of failed videos by reason.
-        num_retried: attempts beyond the first.
+        num_videos: number of videos of this shard.
+        num_done: number of videos that are done.
+        num_kept: number of videos that an earlier run has finished.
+        failed: number of failed videos by reason.
+        num_retried: number of attempts beyond the first.
         seconds: wall time.
-        cpu_seconds: CPU time of the attempts by which this run has done videos.
-        video_seconds: length of these videos.
-        warnings: what the user should know.
+        cpu_seconds: CPU time of this run's successful attempts.
+        video_seconds: duration of the videos that this run has processed.
+        warnings: warnings for the user.
     """
 
     output: str
@@ -100,25 +100,25 @@ def run_batch(
     hear: Callable[[str], None] | None = None,
     watch: Watch | None = None,
 ) -> BatchReport:
-    """Do one task on many videos.
+    """Run one task on many videos.
 
-    Each video gets a folder in the output, which is complete once it holds `report.json`.
-    `batch.csv` and `batch.json` there have a row for each video, in the order of the inputs, and
-    are written as it goes. Videos whose folder comes of the same file, options and version are
-    kept from an earlier run; others are made again, and so is what failed.
+    Each video gets a folder in the output, which is complete once it has `report.json`.
+    `batch.csv` and `batch.json` have a row for each video, in the order of the inputs, and are
+    updated during the run. A video is skipped if an earlier run has finished it with the same file,
+    options and version; all others, including failed ones, are processed again.
 
     Args:
-        inputs: lists, patterns, folders and files, see `list_videos`; paths or URLs.
+        inputs: lists, patterns, folders and files, as paths or URLs, see `list_videos`.
         output: folder or URL.
-        task: options of the task, whose type says which it is: those of `reconstruct`, `match`,
-            `densify` or, `ReadOptions`, `info`.
-        models: of `densify`: folder or URL that has a model for each video, under its name.
-        options: where the videos are processed, and what becomes of those that fail.
-        hear: is told what the videos are processed on.
-        watch: called at the start and whenever a video has ended, with its row.
+        task: options of the task. Their type selects it: the options of `reconstruct`, `match` or
+            `densify`, or `ReadOptions` for `info`.
+        models: for `densify`: folder or URL with a model for each video, under its name.
+        options: where the videos are processed, and how failures are handled.
+        hear: called once with a line about the resources in use.
+        watch: called at the start, and with the row of each video when it has ended.
 
     Raises:
-        OptionError: the inputs or options cannot work, or nothing can be written.
+        OptionError: the inputs or options are invalid, or the output cannot be written.
         OSError: the inputs cannot be read.
     """
     options = options if options is not None else BatchOptions()
@@ -180,7 +180,7 @@ def run_batch(
                 _write_rows(into, shard, rows, facts)
             raise
         _write_rows(into, shard, rows, facts)
-    repeated = f"{num_repeated} of the inputs are there twice and count once"
+    repeated = f"ignored {num_repeated} repeated inputs"
     return BatchReport(
         output=without_secrets(place),
         num_videos=counts.total,
@@ -202,28 +202,27 @@ def batch_files(output: Output) -> list[str]:
 
 
 def _refuse_another_task(output: Output, place: str, task: str) -> None:
-    """Refuse an output whose rows are those of another task.
+    """Refuse an output that has the batch of another task.
 
     Raises:
-        OptionError: they are.
+        OptionError: it has.
     """
     for name in batch_files(output):
         found: object = None
-        with suppress(ValueError, RecursionError):  # a damaged one is written again
+        with suppress(ValueError, RecursionError):  # A damaged file will be replaced.
             found = json.loads(output.read(name) or b"")
         earlier = found.get("task") if isinstance(found, dict) else None
         if isinstance(earlier, str) and earlier in TASK_OPTIONS and earlier != task:
             raise OptionError(
-                f"{without_secrets(place)}: holds a batch of the task {earlier}: give another "
-                "output"
+                f"{without_secrets(place)}: has a batch of the task {earlier}: give another output"
             )
 
 
 def _check_scratch(scratch: str) -> None:
-    """Make the folder for unfinished work, and remove what killed processes left there.
+    """Create the folder for unfinished work, and remove leftovers of killed processes.
 
     Raises:
-        OptionError: it cannot be made.
+        OptionError: it cannot be created.
     """
     try:
         os.makedirs(scratch, exist_ok=True)
@@ -235,7 +234,7 @@ def _check_scratch(scratch: str) -> None:
 def _outcomes(
     engine: LocalEngine | RayEngine, videos: Sequence[Video]
 ) -> Iterator[tuple[int, Outcome]]:
-    """The outcomes of all videos as they come, with their positions."""
+    """The outcomes of all videos in the order in which they end, with their positions."""
     ended: queue.SimpleQueue[Future[Outcome]] = queue.SimpleQueue()
     positions: dict[Future[Outcome], int] = {}
     for position, video in enumerate(videos):
@@ -255,7 +254,7 @@ def _outcomes(
 def _next(ended: queue.SimpleQueue[Future[Outcome]]) -> Future[Outcome]:
     while True:
         with suppress(queue.Empty):
-            return ended.get(timeout=_WAIT)  # without a time, Windows takes no interrupt
+            return ended.get(timeout=_WAIT)  # Windows cannot interrupt a wait without timeout.
 
 
 def _write_rows(
@@ -277,17 +276,21 @@ def _write_rows(
 
 
 def _work_of(task: Options, output: str, models: str | None, options: BatchOptions) -> Work:
-    """What is done with each video, after a look at what cannot work."""
+    """The work for each video; refuses options that contradict each other.
+
+    Raises:
+        OptionError: they do.
+    """
     name = next((name for name, kind in TASK_OPTIONS.items() if type(task) is kind), None)
     if name is None:
         kinds = ", ".join(kind.__name__ for kind in TASK_OPTIONS.values())
-        raise OptionError(f"{type(task).__name__} are no options of a batch: give one of {kinds}")
+        raise OptionError(f"{type(task).__name__} is not a task of a batch: give one of {kinds}")
     if (models is not None) != isinstance(task, DensifyOptions):
         what = "is for" if models is not None else "is missing for"
-        raise OptionError(f"models {what} the task densify: give a folder of models with it alone")
+        raise OptionError(f"models {what} the task densify: give a folder of models with it only")
     matching = task if isinstance(task, MatchOptions) else getattr(task, "match", None)
     if isinstance(matching, MatchOptions) and matching.keep_stream is not None:
-        raise OptionError("keep_stream is one file, and a batch has many videos: leave it out")
+        raise OptionError("keep_stream is one file, but a batch has many videos: omit it")
     return Work(
         task=name,
         options=task,

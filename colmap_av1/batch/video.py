@@ -1,4 +1,4 @@
-"""One video of a batch: our command in a process of its own, and what it made, published."""
+"""Processing one video of a batch: run the command, then publish its files."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from colmap_av1.util.processes import bound
 from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
 
 THUMBNAIL = "thumbnail.jpg"
-# Names of folders for unfinished work hold it.
+# Part of the names of folders for unfinished work.
 SCRATCH = "video"
 _THUMBNAIL_WIDTH = 160
 _THUMBNAIL_TIME = 60.0  # seconds
 _IMAGES = "images"
-# What only a further run of the same command would use.
+# Intermediate results, which only another run of the same command would use.
 _STAGES = ".stages"
-# Where a model may lie in the folder that is given for a video.
+# Where a model may lie in the folder given for a video.
 _MODEL_FOLDERS = ("", "sparse/0", "0")
 _MODEL_FILES = ("cameras", "images", "points3D")
-# Columns of the row, and the fields of reports that they show.
+# Columns of the row, and the report fields that they show.
 _FIGURES = {
     "frames": "num_frames",
     "images": "num_images",
@@ -50,15 +50,15 @@ _FIGURES = {
 
 @dataclass(frozen=True)
 class Work:
-    """What is done with each video of a batch.
+    """The task of a batch, for each video.
 
     Attributes:
         task: name of the command.
         options: its options.
-        output: absolute path, or URL, of the folder that gets a folder for each video.
-        models: the same of the folder with a model for each video, for `densify`.
-        scratch: absolute path of the folder for unfinished work, on whatever machine.
-        batch: how it is done.
+        output: absolute path or URL of the output, which gets a folder for each video.
+        models: for `densify`: absolute path or URL of the folder with a model for each video.
+        scratch: absolute path of the folder for unfinished work, on each machine.
+        batch: options of the batch.
         version: version of this package, which results depend on.
     """
 
@@ -73,12 +73,12 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a video.
+    """Result of a video.
 
     Attributes:
         row: its row.
-        kept: an earlier run had finished it.
-        retried: attempts beyond the first.
+        kept: whether an earlier run has finished it.
+        retried: number of attempts beyond the first.
     """
 
     row: Row
@@ -87,16 +87,16 @@ class Outcome:
 
 
 def process_video(work: Work, video: Video, threads: int, processes: Processes) -> Outcome:
-    """Do the task on a video, unless its folder in the output is of the same video and options.
+    """Process a video, unless its folder in the output comes from the same video and options.
 
     Args:
         work: the task.
         video: the video.
-        threads: threads of the command where its options do not say.
-        processes: runs it.
+        threads: threads of the command, if its options do not set them.
+        processes: runs the command.
 
     Returns:
-        What became of it; whatever goes wrong is a row.
+        The outcome; any failure is reported in its row.
     """
     retried = 0
     while True:
@@ -104,7 +104,7 @@ def process_video(work: Work, video: Video, threads: int, processes: Processes) 
         try:
             outcome = _attempt(work, video, threads, processes)
             return dataclasses.replace(outcome, retried=retried)
-        except Exception as error:  # of one video: the others go on
+        except Exception as error:  # A failing video must not stop the others.
             failure = error.failure if isinstance(error, CommandFailedError) else failure_of(error)
         if not failure.transient or retried >= work.batch.retries or processes.stopped:
             return Outcome(failed_row(video, failure, time.perf_counter() - start), False, retried)
@@ -126,9 +126,9 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
     key = digest_of([source, [v for _, v in models], work.version, *_depends_on(work)])
     earlier = earlier_report(output, video.name)
     if earlier is not None and earlier.get("task") != work.task:
-        raise OptionError(f"{video.name}: is of another task: give another output")
+        raise OptionError(f"{video.name}: was created by another task: give another output")
     if earlier is not None and earlier["key"] == key:
-        with suppress(ValueError):  # a damaged one is made again
+        with suppress(ValueError):  # A video with a damaged report is processed again.
             row = dataclasses.replace(
                 row_of(earlier["row"]), name=video.name, input=without_secrets(video.address)
             )
@@ -172,7 +172,7 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
 
 
 def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: int) -> list[str]:
-    """The words of our command that does the task on a video, in a folder."""
+    """The command line that processes a video into a folder."""
     words = [work.task, f"--video={video}", *words_of(work.options), "--quiet"]
     if not any(word.startswith("--num_threads=") for word in words):
         words.append(f"--num_threads={threads}")
@@ -188,7 +188,7 @@ def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: i
 
 
 def _depends_on(work: Work) -> list[object]:
-    """What the result depends on beside the video and the version."""
+    """What the result depends on, in addition to the video and the version."""
     options = work.options
     matching = options if isinstance(options, MatchOptions) else getattr(options, "match", None)
     if not isinstance(matching, MatchOptions):
@@ -198,7 +198,7 @@ def _depends_on(work: Work) -> list[object]:
 
 
 def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, object]]]:
-    """The files of the video's model and their versions; none where the task needs no model."""
+    """The files of the video's model and their versions; empty if the task needs no model."""
     if work.models is None:
         return []
     top = f"{work.models.rstrip('/')}/{video.name}"
@@ -206,7 +206,7 @@ def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, objec
         for suffix in (".bin", ".txt"):
             parts = (filter(None, (top, folder, f"{file}{suffix}")) for file in _MODEL_FILES)
             files = ["/".join(part) for part in parts]
-            with suppress(VideoError):  # it has not this one
+            with suppress(VideoError):  # A file is missing: try the next place.
                 return [(file, version_of(file, work.batch.stall)) for file in files]
     raise ModelError(
         f"{work.models}: has no model of '{video.name}': give a folder with cameras, images and "
@@ -229,9 +229,9 @@ def _fetch_model(
 
 
 def _write_thumbnail(video: Path, folder: Path) -> None:
-    """Write a small picture, of the middle image or the start of the video, if there is any."""
+    """Write a thumbnail of the middle image or, without images, of the start of the video."""
     images = sorted((folder / _IMAGES).glob("*"))
-    if images:  # its name may hold what stands for a number elsewhere
+    if images:  # Its name may have a '%', which ffmpeg would take for a number pattern.
         source = ["-f", "image2", "-pattern_type", "none", "-i", str(images[len(images) // 2])]
     else:
         source = ["-i", f"file:{video}"]

@@ -1,1 +1,1 @@
-"""COLMAP's database, and the files that other programs use instead."""
+"""COLMAP's database: opening, checking, reading and writing it."""

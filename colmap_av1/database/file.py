@@ -1,7 +1,8 @@
-"""The file of a COLMAP database: opening it, writing all of it or nothing.
+"""Opening a COLMAP database safely, and writing to it all or nothing.
 
-SQLite is used directly, because opening a file with pycolmap migrates it. A file may come from
-anywhere: it is opened so that nothing in it is run, and read only if it has COLMAP's layout.
+SQLite is used directly because pycolmap migrates a database when it opens it. A database may come
+from an untrusted source: SQL code stored in it is never run, and it is read only if it has COLMAP's
+layout.
 """
 
 from __future__ import annotations
@@ -17,20 +18,21 @@ from colmap_av1.database.layout import SCHEMA, USER_VERSION, check_layout
 from colmap_av1.errors import DatabaseError, cannot_write
 from colmap_av1.util.files import remove_leftovers, whole_file
 
-# Seconds to wait for another writer: one that is only closing a file is soon done.
+# Seconds to wait for another writer. A process that is only closing the file finishes sooner.
 _BUSY_TIMEOUT = 2.0
-# Instructions of SQLite's virtual machine that reading a file may take: so many, and so many for
-# each of its bytes, of which `check` takes 3 where all rows are empty and less elsewhere. Only
-# pages that refer to each other over and over take more.
+# Limit on the instructions of SQLite's virtual machine that reading a file may take: a constant,
+# plus a number for each byte of the file. `check` takes at most 3 for each byte. Only a damaged
+# file, whose pages refer to each other in a cycle, takes more.
 _BUDGET, _BUDGET_PER_BYTE = 2_000_000, 20
 _BUDGET_STEP = 10_000
 
 
 def is_new(path: Path) -> bool:
-    """Whether the file is absent or empty, so that making it loses nothing.
+    """Whether the file is absent or empty, so that creating a database there loses nothing.
 
     Raises:
-        DatabaseError: it can be no database: its folder is missing, or it is no plain file.
+        DatabaseError: the path cannot be a database: its folder is missing, it is not a regular
+            file, or the journal of another database lies next to it.
     """
     if path.is_dir():
         raise DatabaseError(f"{path} is a folder: give the path of a database file")
@@ -38,39 +40,41 @@ def is_new(path: Path) -> bool:
     if path.exists() and path.stat().st_size > 0:
         return False
     if not target.parent.is_dir():
-        raise DatabaseError(f"{path}: the folder does not exist: make it first")
+        raise DatabaseError(f"{path}: the folder does not exist: create it first")
     for leftover in _logs(path):
-        # SQLite would replay such a file into whatever database appears beside it.
+        # SQLite would replay such a journal into a new database of the same name.
         if leftover.exists():
             raise DatabaseError(f"{leftover} is left from another database: remove it first")
     return True
 
 
 def _target(path: Path) -> Path:
-    """The file that a path, which may be a link, stands for.
+    """The file that a path refers to, with links resolved.
 
-    A new one would take the place of a device, such as /dev/null, and a pipe has no end.
+    Devices and pipes are refused: a new file would replace a device such as /dev/null, and reading
+    a pipe may never end.
     """
     if path.exists() and not path.is_file():
         raise DatabaseError(f"{path} is not a regular file: give the path of a database file")
     try:
         return path.resolve()
     except (OSError, RuntimeError) as error:
-        raise DatabaseError(f"{path} is a link that leads nowhere: give another path") from error
+        raise DatabaseError(f"{path} is a broken link: give another path") from error
 
 
 def open_database(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Open an existing COLMAP database and close it at the end.
+    """Context manager that opens an existing COLMAP database and closes it on exit.
 
     Raises:
-        DatabaseError: it is no COLMAP database, is damaged, or SQLite fails in the body.
+        DatabaseError: the file is not a COLMAP database or is damaged, or SQLite fails in the body
+            of the `with` statement.
     """
     return _open_checked(path, "mode=rw")
 
 
 def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """As `open_database`, to read it without leaving a trace in it or beside it."""
-    # Without a log beside it the file is all there is, and SQLite needs no lock of its own.
+    """Like `open_database`, for reading without changing the file or its folder."""
+    # Without a journal the file is complete, so SQLite can read it without a lock file.
     busy = any(log.exists() and log.stat().st_size > 0 for log in _logs(_target(path)))
     return _open_checked(path, "mode=ro" if busy else "mode=ro&immutable=1")
 
@@ -83,11 +87,11 @@ def _open_checked(path: Path, how: str) -> Iterator[sqlite3.Connection]:
 
 
 def copy_database(path: Path, copy: Path) -> None:
-    """Copy a database with everything committed to it, without a trace in it or beside it.
+    """Copy a database with all committed transactions, without changing the original.
 
     Args:
         path: the database.
-        copy: file that is made.
+        copy: the file to create.
     """
     with (
         open_unaltered(path) as source,
@@ -102,7 +106,7 @@ def _logs(target: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
-    """Open a file with the given parameters of SQLite's URI; its errors become ours."""
+    """Open a file with the given SQLite URI parameters, and translate SQLite's errors."""
     target = _target(path)
     try:
         with contextlib.closing(
@@ -121,9 +125,9 @@ def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _run_nothing(connection: sqlite3.Connection) -> None:
-    """Let SQLite run nothing that the file's layout asks for; where it can, no triggers and views.
+    """Keep SQLite from running code stored in the file, such as triggers and views.
 
-    What it cannot forbid, `check_layout` refuses.
+    Older versions of Python cannot turn these off; `check_layout` refuses files that have them.
     """
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
@@ -134,10 +138,10 @@ def _run_nothing(connection: sqlite3.Connection) -> None:
 
 
 def _bound_reading(connection: sqlite3.Connection, target: Path) -> None:
-    """End what takes longer than a sound file can: SQLite then says that it was interrupted."""
+    """Interrupt a statement that takes longer than any valid file of this size needs."""
     size = sum(file.stat().st_size for file in (target, *_logs(target)) if file.exists())
     steps = (_BUDGET + _BUDGET_PER_BYTE * size) // _BUDGET_STEP
-    # No Python runs in this, so signals wait for the statement's end: here they would be lost.
+    # A C-level iterator as the handler: Python code here could swallow a signal's exception.
     ends = itertools.chain(itertools.repeat(0, steps), itertools.repeat(1))
     connection.set_progress_handler(ends.__next__, _BUDGET_STEP)
 
@@ -147,35 +151,35 @@ def _explain(path: Path, error: sqlite3.Error, reading: bool) -> str:
     if reading and "readonly" in text:
         return (
             f"{path}: a write to it was interrupted: open it once with COLMAP or the sqlite3 "
-            "command, which undoes that write, and run again"
+            "command to roll the write back, then run again"
         )
     causes = {
-        "locked": "it is in use by another process: wait until that is done, or end it",
-        "busy": "it is in use by another process: wait until that is done, or end it",
-        "interrupted": "it is damaged, reading it comes to no end: restore it from a copy",
-        "decode": "it has text that is not UTF-8: rename its images so, or give another path",
+        "locked": "it is in use by another process: wait until that process ends, or end it",
+        "busy": "it is in use by another process: wait until that process ends, or end it",
+        "interrupted": "it is damaged, reading it never ends: restore it from a copy",
+        "decode": "it has text that is not UTF-8: rename its images, or give another path",
         "not a database": "it is not a COLMAP database: give another path",
         "malformed": "it is damaged: restore it from a copy, or give another path",
         "full": "the disk is full: free some space",
         "disk I/O error": "it cannot be read or written: free some space, or use another disk",
-        "readonly": "it may not be written: change its permissions, or give another path",
+        "readonly": "it is read-only: change its permissions, or give another path",
         "unable to open": "it cannot be opened: check the path and its permissions",
     }
     for sign, cause in causes.items():
         if sign in text:
             return f"{path}: {cause}"
-    return f"{path}: SQLite refuses: {text}: restore it from a copy, or give another path"
+    return f"{path}: SQLite reports: {text}: restore it from a copy, or give another path"
 
 
 def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
-    """Make a database under another name in the same folder, then give it its own."""
+    """Create a database under a temporary name in the same folder, then rename it."""
     target = _target(path)
     remove_leftovers(target.parent, target.name)
     try:
         with whole_file(target) as partial:
             with _connect(partial, "mode=rw", path) as connection:
-                connection.set_progress_handler(None, 0)  # there is nothing to read yet
-                # The file is thrown away on any failure: nothing needs to be rolled back.
+                connection.set_progress_handler(None, 0)  # The limit applies to reading only.
+                # The file is discarded on any failure, so a rollback journal is not needed.
                 connection.execute("PRAGMA journal_mode = OFF")
                 connection.execute("BEGIN EXCLUSIVE")
                 for statement in SCHEMA:
@@ -184,7 +188,7 @@ def write_new(path: Path, fill: Callable[[sqlite3.Connection], None]) -> None:
                 fill(connection)
                 connection.execute("COMMIT")
             if not is_new(path):
-                raise DatabaseError(f"{path} was made by another process meanwhile: run again")
+                raise DatabaseError(f"{path} was created by another process meanwhile: run again")
     except OSError as error:
         raise DatabaseError(cannot_write(path, error)) from error
 
@@ -195,7 +199,7 @@ def write_existing(path: Path, fill: Callable[[sqlite3.Connection], None]) -> No
         connection.execute("BEGIN IMMEDIATE")
         try:
             check_layout(connection, path)
-            connection.set_progress_handler(None, 0)  # what is written has no bound
+            connection.set_progress_handler(None, 0)  # The limit applies to reading only.
             fill(connection)
             connection.execute("COMMIT")
         except BaseException:

@@ -1,7 +1,7 @@
-"""The layout of a COLMAP database, and whether a file has it: its tables, and what they hold.
+"""The layout of a COLMAP database: its tables, columns and value ranges, and a check for them.
 
-A new file has the layout of COLMAP 3.8, the oldest still in use: later versions read it and
-migrate it, while older ones refuse what later ones make.
+A new database has the layout of COLMAP 3.8, the oldest version still in use. Later versions read
+and migrate it; older versions cannot read the layouts of later ones.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from colmap_av1.errors import DatabaseError
 
-# COLMAP's kMaxNumImages: image ids stay below it, and it spreads pair ids.
+# COLMAP's kMaxNumImages: image ids stay below it, and pair ids are multiples of it plus an id.
 MAX_NUM_IMAGES = 2147483647
 USER_VERSION = 3800
 
@@ -39,18 +39,18 @@ SCHEMA = (
     "F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB)",
 )
 
-# What the columns hold that are read: SQLite stores anything in any column.
+# Type or range of each column that is read. SQLite itself stores any value in any column.
 _COUNT = (0, (1 << 31) - 1)
-_ID = (0, (1 << 32) - 2)  # COLMAP's are unsigned, of 32 bits, the last one invalid
+_ID = (0, (1 << 32) - 2)  # COLMAP's ids are uint32; the largest value means "invalid".
 _ANY = (-(1 << 31), (1 << 31) - 1)
 _IMAGE_ID = (0, MAX_NUM_IMAGES - 1)
 _PAIR_ID = (0, MAX_NUM_IMAGES * MAX_NUM_IMAGES - 1)
 _SIZE = (0, (1 << 63) - 1)
-_TEXT, _BLOB = "text", "blob"  # a blob may be missing
+_TEXT, _BLOB = "text", "blob"  # A blob may be NULL.
 _Kind = tuple[int, int] | str
 
-# The first column of each table is its key. Without these tables a file is no COLMAP database;
-# of the others, columns are looked at where they are present.
+# The first column of each table is its key. A COLMAP database has all required tables and columns.
+# Optional columns are checked if they are present.
 _REQUIRED: dict[str, dict[str, _Kind]] = {
     "cameras": {
         "camera_id": _ID,
@@ -83,19 +83,19 @@ _OPTIONAL: dict[str, dict[str, _Kind]] = {
 
 
 def columns(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Names of a table's columns; none where the file has no such table."""
+    """Names of a table's columns; empty if the file has no such table."""
     return {row[1] for row in connection.execute(f"PRAGMA table_info({table})")}
 
 
 def has_rows(connection: sqlite3.Connection, table: str) -> bool:
-    """Whether a table of the file has any row."""
+    """Whether a table has at least one row."""
     return connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None
 
 
 def check_layout(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse a file that is not a COLMAP database, or whose rows no COLMAP wrote.
+    """Refuse a file that is not a COLMAP database, or that has damaged rows.
 
-    Afterwards every value that this package reads is of its column's type, and counts and ids
+    Afterwards every value that this package reads has its column's type, and counts and ids
     are in their ranges. Blobs are not read, so their lengths may still contradict the counts.
 
     Args:
@@ -103,15 +103,15 @@ def check_layout(connection: sqlite3.Connection, path: Path) -> None:
         path: its path, for messages.
 
     Raises:
-        DatabaseError: it is no COLMAP database, has triggers, or a view in a table's place, or
-            a row is damaged.
+        DatabaseError: the file is not a COLMAP database, has triggers, has a view instead of a
+            table, or has a damaged row.
     """
     try:
         _check_tables(connection, path)
         for table in {**_REQUIRED, **_OPTIONAL}:
             _check_values(connection, path, table)
         _check_names(connection, path)
-    except UnicodeDecodeError as error:  # in what SQLite says of a damaged layout
+    except UnicodeDecodeError as error:  # SQLite's text for a damaged layout may be invalid.
         raise DatabaseError(
             f"{path}: its layout is damaged: restore it from a copy, or give another path"
         ) from error
@@ -121,7 +121,7 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
     no_database = f"{path}: it is not a COLMAP database"
     for table in {**_REQUIRED, **_OPTIONAL}:
         required = _REQUIRED.get(table, {})
-        # A virtual table has no page of its own.
+        # A virtual table has root page 0.
         made = connection.execute(
             "SELECT type = 'table' AND rootpage > 0 FROM sqlite_master WHERE type <> 'trigger' "
             "AND LOWER(name) = ?",
@@ -133,7 +133,7 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
             what = "table" if len(missing) == len(required) else f"{missing[0]!r} in table"
             raise DatabaseError(f"{no_database} (no {what} {table!r}): give another path")
         if made not in ([], [(1,)]):
-            raise DatabaseError(f"{no_database} ({table!r} is no table): give another path")
+            raise DatabaseError(f"{no_database} ({table!r} is not a table): give another path")
         if required and present[next(iter(required))] != 1:
             raise DatabaseError(
                 f"{no_database} ({next(iter(required))!r} is not the key of table {table!r}): "
@@ -141,8 +141,8 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
             )
     if connection.execute("SELECT 1 FROM sqlite_master WHERE type = 'trigger'").fetchone():
         raise DatabaseError(
-            f"{path}: has triggers, which COLMAP never makes and which alter what is written: "
-            "drop them, or give another path"
+            f"{path}: has triggers, which COLMAP never creates and which could change written "
+            "rows: drop them, or give another path"
         )
 
 
@@ -164,13 +164,13 @@ def _check_values(connection: sqlite3.Connection, path: Path, table: str) -> Non
     ).fetchone()
     if row is not None:
         raise DatabaseError(
-            f"{path}: table '{table}' is damaged ({row[0]!r} of row {row[1]!r} holds no such "
-            "value): restore the file from a copy"
+            f"{path}: table '{table}' is damaged ({row[0]!r} of row {row[1]!r} is "
+            "invalid): restore the file from a copy"
         )
 
 
 def _holds(column: str, kind: _Kind) -> str:
-    """SQL: whether a column holds a value of its kind."""
+    """SQL expression that tests whether a column's value has the given type or range."""
     if kind == _BLOB:
         return f"TYPEOF({column}) IN ('blob', 'null')"
     if isinstance(kind, str):
@@ -179,7 +179,7 @@ def _holds(column: str, kind: _Kind) -> str:
 
 
 def _check_names(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse images that share a name, which the layout forbids but a damaged index lets in."""
+    """Refuse images with the same name, which are possible if the index of names is damaged."""
     row = connection.execute(
         "SELECT name FROM images NOT INDEXED GROUP BY name HAVING COUNT(*) > 1 LIMIT 1"
     ).fetchone()

@@ -1,4 +1,4 @@
-"""Images that a database lists already: of which video they are, and their cameras."""
+"""Images that already exist in a database: the video that each belongs to, and their cameras."""
 
 from __future__ import annotations
 
@@ -17,24 +17,32 @@ from colmap_av1.options import CameraOptions
 def listed_of_videos(
     database: Path, listed: Sequence[DatabaseImage], inputs: Inputs
 ) -> list[Mapping[str, tuple[int, int]]]:
-    """(width, height) of the images of each video that a database lists, by name in its folder.
+    """(width, height) of the images that a database lists, for each video.
+
+    Args:
+        database: path of the database, for messages.
+        listed: its images.
+        inputs: the videos and photos.
+
+    Returns:
+        For each video, the sizes by image name relative to the video's folder.
 
     Raises:
-        DatabaseError: it lists images, but none of a video or not each photo, or others, or an
-            image without its camera.
+        DatabaseError: the database lists images, but none of a video, not every photo, images of no
+            given video, or an image whose camera is missing.
     """
     lone = next((image for image in listed if 0 in {image.width, image.height}), None)
     if lone is not None:
         raise DatabaseError(
-            f"{database}: lacks camera {lone.camera_id} of image '{lone.name}', or its size: "
-            "import the image anew, or use a new database"
+            f"{database}: camera {lone.camera_id} of image '{lone.name}' is missing or has no "
+            "size: import the image again, or use a new database"
         )
     sizes = {image.name: (image.width, image.height) for image in listed}
     of_videos: list[dict[str, tuple[int, int]]] = [{} for _ in inputs.labels]
     for photo in inputs.photos if listed else ():
         if sizes.pop(photo.name, None) is None:
             raise DatabaseError(
-                f"{database}: lists images, but not '{photo.name}': import that, too, or use a new "
+                f"{database}: lists images, but not '{photo.name}': import it too, or use a new "
                 "database"
             )
     if inputs.labels == ("",):
@@ -43,16 +51,16 @@ def listed_of_videos(
         label, _, own = name.partition("/")
         if label not in inputs.labels:
             raise DatabaseError(
-                f"{database}: lists image '{name}', which is in no folder of a video, "
-                f"{', '.join(inputs.labels)}: import the images by such names, or use a new "
+                f"{database}: lists image '{name}', which is not in the folder of a video "
+                f"({', '.join(inputs.labels)}): import the images under such names, or use a new "
                 "database"
             )
         of_videos[inputs.labels.index(label)][own] = size
     for label, found in zip(inputs.labels, of_videos, strict=True):
         if sizes and not found:
             raise DatabaseError(
-                f"{database}: lists images, but none in folder '{label}': import those of the "
-                "video, or use a new database"
+                f"{database}: lists images, but none in folder '{label}': import that video's "
+                "images, or use a new database"
             )
     return [*of_videos]
 
@@ -60,10 +68,10 @@ def listed_of_videos(
 def listed_cameras(
     database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
 ) -> list[pycolmap.Camera]:
-    """The cameras that the database has of its images, one for each name.
+    """The cameras that the database holds for its images, one for each name.
 
     Raises:
-        DatabaseError: an image has none.
+        DatabaseError: the camera of an image is missing.
     """
     cameras = read_cameras(database)
     camera_id = {image.name: image.camera_id for image in listed}
@@ -74,16 +82,16 @@ def listed_cameras(
 
 
 def check_no_camera(database: Path, options: CameraOptions) -> None:
-    """Refuse options of new cameras where the images have theirs.
+    """Refuse camera options if the existing images already have cameras.
 
     Raises:
-        OptionError: one differs from its default.
+        OptionError: an option differs from its default.
     """
     default = CameraOptions()
     of_camera = [f.name for f in fields(options) if f.name != "rolling_shutter"]
     changed = [name for name in of_camera if getattr(options, name) != getattr(default, name)]
     if changed:
         raise OptionError(
-            f"{database}: its images have cameras, so {changed[0]} would change nothing: leave it "
-            "out, or import the images with that camera"
+            f"{database}: its images already have cameras, so {changed[0]} would have no effect: "
+            "omit the option, or import the images with that camera"
         )

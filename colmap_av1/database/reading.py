@@ -1,4 +1,4 @@
-"""Reading a COLMAP database: images, cameras, rows of keypoints and matches."""
+"""Reading images, cameras, pose priors, keypoints and matches from a COLMAP database."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from colmap_av1.database.layout import MAX_NUM_IMAGES, columns
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import camera_fault
 
-# A keypoint's columns after x and y where it has no shape of its own: scale and orientation,
-# or a 2x2 affine shape.
+# Neutral values of a keypoint's columns after x and y, by the number of columns: scale and
+# orientation for 4, a 2x2 affine shape for 6.
 SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
-# COLMAP's PosePriorCoordinateSystem: latitude, longitude and altitude, or metres.
+# COLMAP's PosePriorCoordinateSystem: latitude, longitude and altitude, or Cartesian coordinates.
 _WGS84, _CARTESIAN = 0, 1
 _POSITION_BYTES = 24
 
@@ -37,8 +37,8 @@ class DatabaseImage:
         camera_id: id of its camera.
         width: width of the camera in pixels.
         height: height of the camera in pixels.
-        num_keypoints: keypoints stored for it.
-        num_matches: matches stored with other images, verified or not.
+        num_keypoints: number of stored keypoints.
+        num_matches: number of stored matches with other images, verified or not.
     """
 
     image_id: int
@@ -51,20 +51,20 @@ class DatabaseImage:
 
 
 def pair_id_from_image_ids(image_id1: int, image_id2: int) -> int:
-    """Id of the pair of two images; their order does not matter."""
+    """Pair id of two images, in either order."""
     return MAX_NUM_IMAGES * min(image_id1, image_id2) + max(image_id1, image_id2)
 
 
 def image_ids_from_pair_id(pair_id: int) -> tuple[int, int]:
-    """Ids of a pair's images, the smaller one first."""
+    """Image ids of a pair, the smaller one first."""
     return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
 def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
-    """List the images of a database, by id.
+    """List the images of a database, ordered by id.
 
     Returns:
-        The images; none for a file that is absent, empty, or lists none.
+        The images; an empty list if the file is absent or empty.
 
     Raises:
         DatabaseError: the file is locked, unreadable, or not a COLMAP database.
@@ -78,7 +78,7 @@ def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
             "COALESCE(keypoints.rows, 0) FROM images LEFT JOIN cameras USING (camera_id) "
             "LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
         ).fetchall()
-        # A pair is counted once, though it has its matches in one table or in both.
+        # Count a pair once, whether its matches are in one table or in both.
         pair_rows = connection.execute(
             "SELECT pair_id, MAX(rows) FROM (SELECT pair_id, rows FROM matches UNION ALL "
             "SELECT pair_id, rows FROM two_view_geometries) WHERE rows > 0 GROUP BY pair_id"
@@ -99,8 +99,8 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
     """Read the cameras of a database, by id.
 
     Raises:
-        DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a
-            camera of a model that the installed pycolmap does not know, or that is none.
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a camera
+            with invalid parameters or of a model that the installed pycolmap does not know.
     """
     path = Path(database)
     if is_new(path):
@@ -116,12 +116,12 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Where an image was taken, as a database says.
+    """Position prior of an image.
 
     Attributes:
-        position: float64 [3] latitude and longitude in degrees and altitude in metres, or
+        position: float64 [3] latitude and longitude in degrees and altitude in metres (WGS 84), or
             Cartesian coordinates.
-        is_cartesian: which of both.
+        is_cartesian: whether the position is Cartesian.
     """
 
     position: NDArray[np.float64]
@@ -129,14 +129,14 @@ class PosePrior:
 
 
 def read_pose_priors(database: str | os.PathLike[str]) -> dict[str, PosePrior]:
-    """Where the images of a database were taken, by name, for those of which it says so.
+    """Read the position priors of a database, by image name, for the images that have one.
 
     Raises:
         DatabaseError: the file is locked, unreadable, or not a COLMAP database.
     """
     with open_unaltered(Path(database)) as connection:
         rows: list[tuple[Any, ...]] = []
-        if "prior_tx" in columns(connection, "images"):  # of COLMAP 3.8 and 3.9
+        if "prior_tx" in columns(connection, "images"):  # COLMAP 3.8 and 3.9
             rows += connection.execute(
                 f"SELECT name, {_WGS84}, prior_tx, prior_ty, prior_tz FROM images ORDER BY image_id"
             ).fetchall()
@@ -161,7 +161,7 @@ def _is_position(blob: object) -> bool:
 
 
 def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap.Camera]:
-    """Cameras of an open database, by id, whatever their sizes and parameters are.
+    """Cameras of an open database, by id. Sizes and parameter values are not checked.
 
     Raises:
         DatabaseError: a camera is of a model that the installed pycolmap does not know.
@@ -194,16 +194,16 @@ def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap
 def keypoints_from_row(
     path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
 ) -> NDArray[np.float32]:
-    """Decode a row of keypoints: float32 [n, 2, 4 or 6], x and y first.
+    """Decode a row of keypoints: float32 [n, 2], [n, 4] or [n, 6], x and y first.
 
     Raises:
-        DatabaseError: the row contradicts itself, or a keypoint's place is not a number.
+        DatabaseError: the row's size contradicts its counts, or a position is not finite.
     """
     keypoints = stored_keypoints(path, image_id, num_rows, num_cols, data)
     if not np.isfinite(keypoints[:, :2]).all():
         raise DatabaseError(
-            f"{path}: image {image_id} has keypoints that are not numbers: "
-            "'colmap-av1 check' says what else is wrong"
+            f"{path}: image {image_id} has keypoints that are not finite numbers: "
+            "run 'colmap-av1 check' for a full list of problems"
         )
     return keypoints
 
@@ -211,7 +211,7 @@ def keypoints_from_row(
 def stored_keypoints(
     path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
 ) -> NDArray[np.float32]:
-    """As `keypoints_from_row`, but places may be anything."""
+    """Like `keypoints_from_row`, without checking that positions are finite."""
     if num_cols not in SHAPES or len(data or b"") != 4 * num_rows * num_cols:
         raise DatabaseError(
             f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "
@@ -226,7 +226,7 @@ def matches_from_row(
     """Decode a row of matches or inliers: uint32 [n, 2], the smaller image id's column first.
 
     Raises:
-        DatabaseError: the row contradicts itself.
+        DatabaseError: the row's size contradicts its count.
     """
     if len(data or b"") != 8 * num_rows:
         i, j = image_ids_from_pair_id(pair_id)

@@ -31,7 +31,7 @@ from colmap_av1.options import OnExisting
 _CAMERA_SENSOR = 0
 # COLMAP's PosePriorCoordinateSystem of latitude, longitude and altitude.
 WGS84 = 0
-# The layout of COLMAP 3.10 to 3.13. Later versions migrate it, earlier ones ignore the table.
+# The layout of COLMAP 3.10 to 3.13. Later versions migrate it; earlier versions ignore the table.
 _POSE_PRIORS = (
     "CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL, position BLOB, "
     "coordinate_system INTEGER NOT NULL, position_covariance BLOB, "
@@ -77,53 +77,55 @@ def write_matches(
 ) -> None:
     """Write keypoints, matches and two-view geometries: all rows, or none.
 
-    A file that is absent or empty is made; where it lists no images, cameras and images are
-    inserted. Where it lists images, the rows go to those of the given names, and their
-    cameras stay as they are. Rows of these images that hold nothing, as matchers leave them
-    for pairs they could not match, are replaced. A file with frames, as COLMAP 3.12 and later
-    write them, gets one for every image that has none: the mappers refuse a mixture.
+    A file that is absent or empty is created. If the database lists no images, cameras and images
+    are inserted. If it lists images, the rows are added to the images of the given names, whose
+    cameras do not change. Empty rows of these images, which matchers leave for pairs that they
+    could not match, are replaced. If the database has frames (COLMAP 3.12 and later), every image
+    without a frame gets one, because the mappers refuse a mixture.
 
-    What becomes of keypoints and matches that the images have already, `on_existing` says:
+    `on_existing` determines what happens to the existing keypoints and matches of the images:
 
-    - "error": the file is refused.
-    - "append": the new keypoints follow the present ones, which keep their numbers, columns
-      and matches. They have no shape of their own, and where the present ones have
-      descriptors, theirs are zero, which SIFT's matchers match with nothing. A pair that has
-      rows gets both sets of matches and of inliers; its models are those of the geometry with
-      more inliers. Matches that were never verified stay unverified.
+    - "error": the database is refused.
+    - "append": the new keypoints follow the existing ones, which keep their indices, columns
+      and matches. New keypoints get a neutral shape; if the existing ones have descriptors, the
+      new ones get zero descriptors, which SIFT matchers never match. An existing pair gets both
+      sets of matches and of inliers, and the models of the geometry with more inliers. Matches
+      that were never verified stay unverified.
     - "replace": keypoints, descriptors, matches and geometries of these images are removed,
-      with all pairs they are part of. Other images keep theirs.
+      including all their pairs. Other images keep theirs.
 
-    Other than with "error", named images that the file does not list are inserted.
+    With "append" and "replace", named images that the database does not list are inserted.
 
     Args:
         database: path of the file.
         names: name of each image, its path relative to the image folder.
-        cameras: the camera of all inserted images, or one for each image, of which several may
-            be the same object; may be None where the database lists the images.
+        cameras: the camera of all inserted images, or one for each image, where images may share
+            the same object; may be None if the database lists the images.
         keypoints: keypoints of each image.
         pairs: int32 [m, 2] indices of images.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
-        geometries: for each pair, its verified geometry.
-        on_existing: what becomes of rows that the images have already.
-        places: float64 [num_images, 3] latitude and longitude in degrees and altitude of each
-            image, NaN where unknown, for those that have no pose prior; None: none is known.
+        geometries: the verified geometry of each pair.
+        on_existing: what happens to existing keypoints and matches of the images.
+        places: float64 [num_images, 3] latitude and longitude in degrees and altitude in metres of
+            each image, NaN where unknown. They become pose priors of images that have none. None:
+            no place is known.
 
     Raises:
         DatabaseError: the file is locked, not a COLMAP database, lists other images, already
-            has keypoints or matches of these images and must not, has these very keypoints,
-            or cannot be written (no space, no permission). The file is then as it was.
+            has keypoints or matches of these images although `on_existing` is "error", already has
+            these very keypoints, or cannot be written (no space, no permission). The file is then
+            unchanged.
     """
     path = Path(database)
     if not (len(names) == len(keypoints) and len(pairs) == len(matches) == len(geometries)):
         raise ValueError("give one name for each image, and matches and geometry for each pair")
     if len(set(names)) != len(names) or "" in names:
-        raise DatabaseError("two images have the same name, or one has none: name each by itself")
+        raise DatabaseError("two images have the same name, or one has none: give unique names")
 
     for (i, j), pair_matches in zip(pairs, matches, strict=True):
         limits = (len(keypoints[i].xy), len(keypoints[j].xy))
         if len(pair_matches) and np.any(pair_matches.max(axis=0) >= limits):
-            raise ValueError(f"matches of images {i} and {j} name keypoints that are not there")
+            raise ValueError(f"matches of images {i} and {j} refer to keypoints that do not exist")
 
     def fill(connection: sqlite3.Connection) -> None:
         image_ids = _place_images(connection, path, names, cameras, on_existing)
@@ -159,13 +161,13 @@ def _place_images(
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
     on_existing: OnExisting,
 ) -> list[int]:
-    """Ids of the named images, inserted where the database does not list them and may."""
+    """Ids of the named images; images that the database does not list are inserted."""
     listed = dict(connection.execute("SELECT name, image_id FROM images").fetchall())
     absent = [name for name in names if name not in listed]
     if listed and absent and (on_existing == "error" or cameras is None):
         raise DatabaseError(
-            f"{path} lists {len(listed)} images, but not {absent[0]!r}: use images by the names "
-            "it lists, or a new database"
+            f"{path} lists {len(listed)} images, but not {absent[0]!r}: use images with the names "
+            "that it lists, or a new database"
         )
     if not listed:
         for table in ("rigs", "frames"):
@@ -191,7 +193,7 @@ def _insert_images(
     names: Sequence[str],
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
 ) -> dict[str, int]:
-    """Insert images with a camera for all or one for each; returns the ids of the names."""
+    """Insert images with one shared camera or one each; returns the image id of each name."""
     each = [cameras] * len(names) if isinstance(cameras, pycolmap.Camera) else list(cameras)
     rows = list({id(camera): camera for camera in each}.values())
     row_of = {id(camera): row for row, camera in enumerate(rows)}
@@ -229,7 +231,7 @@ def _insert_images(
 def _check_nothing_lost(
     connection: sqlite3.Connection, path: Path, name_of_id: dict[int, str]
 ) -> None:
-    """Refuse to replace keypoints, or matches that refer to them."""
+    """Refuse images that already have keypoints or matches."""
     way_out = "use a database without them, or on_existing append or replace"
     for (image_id,) in connection.execute("SELECT image_id FROM keypoints WHERE rows > 0"):
         if image_id in name_of_id:
@@ -248,7 +250,7 @@ def _check_nothing_lost(
 
 
 def _clear_images(connection: sqlite3.Connection, image_ids: set[int]) -> None:
-    """Remove all features and matches of some images, and of no others."""
+    """Remove all features and matches of the given images."""
     for table in ("keypoints", "descriptors"):
         if columns(connection, table):
             connection.executemany(
@@ -268,7 +270,7 @@ def _append_keypoints(
     image_ids: Sequence[int],
     keypoints: Sequence[ImageKeypoints],
 ) -> list[int]:
-    """Append keypoints to those that the images have; returns where each image's begin."""
+    """Append keypoints to existing ones; returns the index of each image's first new keypoint."""
     firsts = [0] * len(image_ids)
     all_present = any(len(k.xy) for k in keypoints)
     for index in np.argsort(np.asarray(image_ids, dtype=np.int64)):
@@ -285,8 +287,8 @@ def _append_keypoints(
         _append_descriptors(connection, image_id, len(present), len(xy))
     if all_present:
         raise DatabaseError(
-            f"{path} has these very keypoints already: they were appended before, so there is "
-            "nothing to do; on_existing replace writes them anew"
+            f"{path} already has these very keypoints, from an earlier run: there is nothing to "
+            "append, or use on_existing replace to write them again"
         )
     return firsts
 
@@ -294,7 +296,7 @@ def _append_keypoints(
 def _read_present_keypoints(
     connection: sqlite3.Connection, path: Path, image_id: int
 ) -> NDArray[np.float32]:
-    """An image's keypoints with all their columns; [0, 2] where it has none."""
+    """An image's existing keypoints with all columns; float32 [0, 2] if it has none."""
     row = connection.execute(
         "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
     ).fetchone()
@@ -306,11 +308,12 @@ def _read_present_keypoints(
 def _append_descriptors(
     connection: sqlite3.Connection, image_id: int, num_present: int, num_new: int
 ) -> None:
-    """Keep an image's descriptors, where it has any, as many as its keypoints.
+    """Append zero descriptors, if the image has descriptors, to match its number of keypoints.
 
-    COLMAP's guided matching and vocabulary trees refuse other numbers. A zero descriptor lies
-    at a right angle to every other and as near to one other zero descriptor as to the next,
-    so neither the limit of the distance nor that of its ratio lets it match.
+    COLMAP's guided matching and vocabulary trees refuse images whose numbers of descriptors and
+    keypoints differ. A zero descriptor never matches: it is orthogonal to every other descriptor,
+    beyond the distance threshold, and equally distant from all zero descriptors, so it fails the
+    ratio test.
     """
     if not columns(connection, "descriptors"):
         return
@@ -327,9 +330,9 @@ def _append_descriptors(
 
 
 def _order_pairs(image_ids: Sequence[int], pairs: NDArray[np.int32]) -> list[tuple[int, int, bool]]:
-    """Rows (pair id, index of the pair, whether its images swap), by pair id.
+    """(pair id, index of the pair, whether its images are swapped), ordered by pair id.
 
-    COLMAP's columns follow the smaller image id, whatever the order of the images.
+    COLMAP stores the column of the smaller image id first.
     """
     rows = []
     for index, (i, j) in enumerate(pairs):
@@ -350,15 +353,15 @@ def _append_pairs(
     matches: Sequence[NDArray[np.uint32]],
     geometries: Sequence[TwoViewGeometry],
 ) -> None:
-    """Write pairs; those that have rows get the new matches and inliers after their own.
+    """Write pairs; the matches and inliers of existing pairs are extended.
 
     Args:
         connection: the database.
         path: its path, for messages.
-        order: the pairs' ids and indices, see `_order_pairs`.
-        shifts: for each pair, uint32 [2] number of its images' first new keypoints.
-        matches: for each pair, uint32 [n, 2] matches, counted from these.
-        geometries: for each pair, its geometry, likewise.
+        order: the ids and indices of the pairs, see `_order_pairs`.
+        shifts: for each pair, uint32 [2] index of the first new keypoint of its two images.
+        matches: for each pair, uint32 [n, 2] matches, counted from these first keypoints.
+        geometries: for each pair, its geometry, with inliers counted in the same way.
     """
     present = {
         row[0]
@@ -413,10 +416,10 @@ def _append_pairs(
 def _read_pair(
     connection: sqlite3.Connection, path: Path, pair_id: int
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint32], int]:
-    """A pair's matches, its inliers, and how many inliers support its models.
+    """A pair's matches, its inliers, and the number of inliers that support its models.
 
-    A geometry that was never estimated, as importers write it, and one of several models are
-    supported by nothing. Inliers of a degenerate geometry or a watermark are none.
+    No inliers support a geometry that was never estimated, as importers write it, or one with
+    several models. The inliers of a degenerate geometry or a watermark are discarded.
     """
     row = connection.execute(
         "SELECT rows, data FROM matches WHERE pair_id = ?", (pair_id,)
@@ -444,9 +447,9 @@ def _float_blob(values: NDArray[np.float64] | None) -> bytes | None:
 
 
 def _swap_images(geometry: TwoViewGeometry) -> TwoViewGeometry:
-    """The models of the same geometry from the second image to the first.
+    """The geometry with its models inverted, from the second image to the first.
 
-    The columns of `inlier_matches` stay as they are.
+    The columns of `inlier_matches` are not swapped.
     """
     qvec = tvec = H = None
     if geometry.qvec is not None and geometry.tvec is not None:
@@ -473,9 +476,9 @@ def _rotation(qvec: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:
-    """Give every image a frame where the file has rigs or frames at all.
+    """Give every image a frame if the database has rigs or frames.
 
-    COLMAP makes rigs and frames by itself, but only where there are none.
+    COLMAP creates missing rigs and frames only if a database has none at all.
     """
     tables = ("rigs", "rig_sensors", "frames", "frame_data")
     if not all(columns(connection, table) for table in tables):
@@ -522,14 +525,15 @@ def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:
 def _write_places(
     connection: sqlite3.Connection, image_ids: Sequence[int], places: NDArray[np.float64]
 ) -> None:
-    """Write where images were taken as pose priors; images that have one keep it.
+    """Write pose priors for images that have none.
 
-    A file of COLMAP 3.8 or 3.9 gets them where these look for them, too.
+    A database of COLMAP 3.8 or 3.9 also gets them in the columns that these versions read.
 
     Args:
-        connection: the open file.
+        connection: the open database.
         image_ids: the images.
-        places: float64 [n, 3] latitude, longitude and altitude; NaN where unknown.
+        places: float64 [n, 3] latitude and longitude in degrees and altitude in metres; NaN where
+            unknown.
     """
     known = [(i, p) for i, p in zip(image_ids, places, strict=True) if np.isfinite(p).all()]
     if not known:
@@ -555,7 +559,7 @@ def _write_places(
 def _write_newer(
     connection: sqlite3.Connection, known: Sequence[tuple[int, NDArray[np.float64]]]
 ) -> None:
-    """The same in the layout of COLMAP 4.0 and later."""
+    """Write pose priors in the layout of COLMAP 4.0 and later."""
     camera_of = dict(connection.execute("SELECT image_id, camera_id FROM images").fetchall())
     connection.executemany(
         "INSERT OR IGNORE INTO pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type, "

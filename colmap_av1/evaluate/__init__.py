@@ -1,4 +1,4 @@
-"""Comparison of tracks, models and front-ends: one module for each family of metrics."""
+"""Metrics of tracks, models and renderings, and the front-ends that `compare` runs."""
 
 from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage, prepare_footage

@@ -1,4 +1,7 @@
-"""Programs in separate processes, as torch and pycolmap must not share one; their packages."""
+"""Running programs that need torch in separate processes, and checking for their packages.
+
+torch and pycolmap must not be loaded in the same process.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,17 @@ from colmap_av1.util.processes import bound
 
 
 def run_program(program: Path, task: Any) -> Any:
-    """Run a program that reads JSON from its standard input and writes JSON to its output.
+    """Run a program that reads JSON from standard input and writes JSON to standard output.
 
     Args:
         program: a Python file.
-        task: what it reads.
+        task: the program's input.
 
     Returns:
-        What it wrote.
+        The program's output.
 
     Raises:
-        EvaluationError: it failed; the message is the last line that it wrote on its errors.
+        EvaluationError: the program failed; the message is the last line of its standard error.
     """
     run = subprocess.run(
         bound([sys.executable, str(program)]),
@@ -34,31 +37,31 @@ def run_program(program: Path, task: Any) -> Any:
         check=False,
     )
     if run.returncode != 0:
-        said = run.stderr.strip().splitlines()
-        raise EvaluationError(said[-1] if said else f"{program.name} ended without a word")
+        lines = run.stderr.strip().splitlines()
+        raise EvaluationError(lines[-1] if lines else f"{program.name} failed without a message")
     return json.loads(run.stdout)
 
 
 def check_packages(what: str, packages: tuple[str, ...], extra: str) -> None:
-    """Check at the start that the packages of an extra, needed later, are installed.
+    """Check before any work that the packages of an extra are installed.
 
     Args:
-        what: what needs them.
-        packages: as they are imported.
+        what: the feature that needs them, for the message.
+        packages: their import names.
         extra: the extra of this package that installs them.
 
     Raises:
-        EvaluationError: one is missing.
+        EvaluationError: a package is missing.
     """
-    missing = next((name for name in packages if not _is_there(name)), None)
+    missing = next((name for name in packages if not _is_installed(name)), None)
     if missing is not None:
         raise EvaluationError(
             f"{what} needs the package {missing}: pip install 'colmap-av1[{extra}]'"
         )
 
 
-def _is_there(package: str) -> bool:
+def _is_installed(package: str) -> bool:
     try:
         return find_spec(package) is not None
-    except (ImportError, ValueError):  # it is blocked
+    except (ImportError, ValueError):  # Its import is blocked.
         return False

@@ -1,1 +1,1 @@
-"""Cameras, COLMAP models on disk, triangulation, resection, undistortion, alignment."""
+"""Cameras, COLMAP models on disk, triangulation, resection, undistortion and alignment."""

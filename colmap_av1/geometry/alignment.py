@@ -1,4 +1,4 @@
-"""Similarities, and the one that brings a camera path onto positions."""
+"""Similarity transforms, and alignment of a camera path with measured positions."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ from numpy.typing import NDArray
 
 _Floats = NDArray[np.float64]
 
-# Positions of receivers scatter by this much within minutes, in metres; others have jumped.
+# Inlier threshold of GPS positions in metres: their usual scatter within minutes. Positions with
+# larger errors are outliers.
 _MAX_ERROR = 3.0
-# A path that spans less, as a root mean square in metres, is one of a receiver at rest.
+# Positions with a smaller spread (RMS, metres) come from a receiver at rest.
 _LEAST_SPREAD = 1.0
 _LEAST_POSITIONS = 3
-# Share of positions that have not jumped, and error of the scale, that a path is placed with.
+# Smallest share of inliers, and largest relative error of the scale, of an accepted fit.
 _LEAST_SHARE = 0.6
 _LARGEST_SCALE_ERROR = 0.1
-# Length in metres of the posts that stand on the path for what is up: as one that is 10 degrees
-# off moves a post's end by less than an error, a wide path of good positions still decides.
+# Height in metres of the virtual points above the path that represent the up direction. An up
+# direction that is 10 degrees off moves such a point by less than _MAX_ERROR, so good positions of
+# a wide path still determine the rotation.
 _POST = 12.0
-# Of the scales that pairs of positions say, the one for the length of posts.
+# Quantile of the scales of pairs of positions that determines this height in the path's units.
 _ROUGH_QUANTILE = 0.25
 _NUM_TRIALS = 10_000
 _ITERATIONS = 10
-# Error of positions, in metres, that no agreement of them makes less.
+# Lower bound on the estimated error of positions, in metres.
 _LEAST_ERROR = 0.1
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """The map x -> scale * rotation @ x + translation.
+    """The transform x -> scale * rotation @ x + translation.
 
     Attributes:
-        scale: above 0.
+        scale: positive.
         rotation: float64 [3, 3].
         translation: float64 [3].
     """
@@ -46,11 +48,11 @@ class Similarity:
     translation: _Floats
 
     def apply(self, points: _Floats) -> _Floats:
-        """Where points [n, 3] come to lie."""
+        """Transform points [n, 3]."""
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
     def apply_to_poses(self, cam_from_world: _Floats) -> _Floats:
-        """Poses [n, 3, 4] of the same cameras in the world that it maps to."""
+        """Transform cam_from_world poses [n, 3, 4] to the target world."""
         rotation = cam_from_world[:, :, :3] @ self.rotation.T
         translation = self.scale * cam_from_world[:, :, 3] - rotation @ self.translation
         return np.concatenate([rotation, translation[:, :, None]], axis=2)
@@ -58,11 +60,11 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Up:
-    """What is up in a model.
+    """The up direction in a model.
 
     Attributes:
         direction: float64 [3] unit vector.
-        error: how far it may be off, in radians.
+        error: its standard error in radians.
     """
 
     direction: _Floats
@@ -71,13 +73,13 @@ class Up:
 
 @dataclass(frozen=True)
 class PathFit:
-    """A path that fits positions.
+    """A camera path aligned with positions.
 
     Attributes:
-        similarity: brings it there.
-        num_used: positions that agree.
-        error: root mean square of their distances to the path, in metres.
-        scale_error: standard error of the scale, as a fraction of it.
+        similarity: the transform from the path to the positions.
+        num_used: number of inlier positions.
+        error: RMS distance of the inliers to the path, in metres.
+        scale_error: relative standard error of the scale.
     """
 
     similarity: Similarity
@@ -87,19 +89,19 @@ class PathFit:
 
 
 def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | str:
-    """Bring a camera path onto positions, some of which may have jumped.
+    """Align a camera path with positions that may contain outliers.
 
-    A straight path leaves open how far it is turned around itself: posts that stand upright on it
-    say so, in the same estimation (LO-RANSAC, Chum et al. 2003).
+    A straight path does not determine the rotation about itself. Therefore virtual points above
+    the path, in the up direction, take part in the estimation (LO-RANSAC, Chum et al. 2003).
 
     Args:
         path: float64 [n, 3] camera centres.
-        positions: float64 [n, 3] where they were, in metres, z up.
-        up: what is roughly up in the path's world.
-        seed: of the random samples.
+        positions: float64 [n, 3] measured positions in metres, z up.
+        up: approximate up direction in the path's world.
+        seed: random seed of the samples.
 
     Returns:
-        The fit; in words why there is none.
+        The fit, or a text with the reason why there is none.
     """
     if len(path) < _LEAST_POSITIONS:
         return f"only {len(path)} images have one"
@@ -112,7 +114,7 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
         return "the camera does not move"
     post = _POST / rough
     pycolmap.set_random_seed(seed)
-    # A dictionary, although the stub says Sim3d.
+    # pycolmap returns a dictionary, although its stub declares Sim3d.
     found: Any = pycolmap.estimate_sim3d_robust(
         np.concatenate([path, path + post * up.direction]),
         np.concatenate([positions, positions + _POST * _UP]),
@@ -127,9 +129,9 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
     similarity, used = _refined(path, positions, up, rough_fit)
     away = np.linalg.norm(similarity.apply(path) - positions, axis=1)
     if used.mean() < _LEAST_SHARE:
-        return f"{np.mean(~used):.0%} of them are {_MAX_ERROR:.0f} m and more from the path"
+        return f"{np.mean(~used):.0%} of them are {_MAX_ERROR:.0f} m or more from the path"
     error = float(np.sqrt(np.mean(away[used] ** 2)))
-    # Images between two positions say nothing of their own.
+    # Interpolated positions of images between two measurements are not independent.
     num_distinct = len(np.unique(positions[used].round(2), axis=0))
     scale_error = error / (_spread(positions[used]) * np.sqrt(num_distinct))
     if scale_error > _LARGEST_SCALE_ERROR:
@@ -138,11 +140,11 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
 
 
 def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Floats:
-    """Metres east, north and up of an origin, in the plane that touches the ellipsoid there.
+    """Local tangent-plane coordinates: float64 [n, 3] metres east, north and up of an origin.
 
     Args:
         places: float64 [n, 3] latitude and longitude in degrees, altitude in metres (WGS 84).
-        origin: likewise.
+        origin: latitude, longitude and altitude of the origin.
     """
     to_ecef = pycolmap.GPSTransform().ellipsoid_to_ecef
     away = np.asarray(to_ecef(places)) - np.asarray(to_ecef(np.array([origin])))
@@ -162,13 +164,13 @@ def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Float
 def _refined(
     path: _Floats, positions: _Floats, up: Up, start: Similarity
 ) -> tuple[Similarity, NDArray[np.bool_]]:
-    """The similarity of least squares of the positions that agree and of what is up.
+    """Least-squares similarity of the inlier positions and the up direction.
 
-    Scale and translation come from the positions alone (Umeyama 1991); to the rotation what is up
-    adds one more direction, by its own accuracy.
+    Scale and translation depend on the positions only (Umeyama 1991). The up direction contributes
+    one direction to the rotation, weighted by its accuracy.
 
     Returns:
-        The similarity, and the positions that agree.
+        The similarity, and the inlier mask of the positions.
     """
     found = start
     for _ in range(_ITERATIONS):
@@ -177,7 +179,7 @@ def _refined(
         if used.sum() < _LEAST_POSITIONS:
             return found, used
         error = max(float(np.sqrt(np.mean(away[used] ** 2))), _LEAST_ERROR)
-        # Images between two positions say nothing of their own.
+        # Interpolated positions of images between two measurements are not independent.
         share = len(np.unique(positions[used].round(2), axis=0)) / int(used.sum())
         here, there = (
             path[used] - path[used].mean(axis=0),
@@ -200,10 +202,10 @@ def _spread(points: _Floats) -> float:
 
 
 def _rough_scale(path: _Floats, positions: _Floats) -> float | None:
-    """Metres to the path's unit, by pairs of images far apart.
+    """Metres per unit of the path, from pairs of distant images.
 
-    Not the median: of two positions, one in three of which has jumped, most often one has, and what
-    jumps makes distances larger.
+    A lower quantile than the median is used, because an outlier in a pair increases its distance,
+    and most pairs contain one if a third of the positions are outliers.
     """
     half = max(len(path) // 2, 1)
     there = np.linalg.norm(positions[half:] - positions[:-half], axis=1)

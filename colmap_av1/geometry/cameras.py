@@ -1,4 +1,4 @@
-"""The camera of images: its model, its parameters, its initial focal length."""
+"""Creating and checking pycolmap cameras: model, parameters, initial focal length."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from colmap_av1.options.camera import (
     parse_camera_params,
 )
 
-# Models that a pinhole camera is a first guess of, and those of them without distortion.
+# Models without distortion, and all models that a pinhole camera can initialize.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-# First guesses of the focal length, in longer sides of an image: for lenses of phones and drones,
-# which span about 60 degrees (COLMAP's own guess of 1.2, for 45 degrees, lets its mapper start with
-# models of garbage on their videos), and for fisheye lenses, which span 115.
+# Initial focal lengths, as a share of the longer image side: 0.9 for phones and drones with about
+# 60 degrees field of view, and 0.5 for fisheye lenses with about 115 degrees. COLMAP's default of
+# 1.2 (45 degrees) often makes its mapper fail on videos of phones.
 _GUESS, _FISHEYE_GUESS = 0.9, 0.5
-# Sides of an image in pixels that no camera and no image format has.
+# Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
-# Encoders that scale pictures round their display size: a few tenths of a percent.
+# Encoders round the display size of scaled pictures, by a few tenths of a percent.
 _SQUARE_TOLERANCE = 5e-3
 
 
@@ -36,21 +36,20 @@ def make_camera(
 ) -> pycolmap.Camera:
     """Make the camera of new images.
 
-    Without parameters it is a first guess, without a focal length prior: focal length
-    0.9 times the longer side (of fisheye models half of it), principal point in the centre, no
-    distortion. Where pixels are
-    not square, this holds for the picture as it is shown. Given parameters, and a focal length
-    that is known otherwise, count as a prior.
+    Without parameters, the focal length is 0.9 times the longer side (0.5 times for fisheye
+    models), the principal point is the image centre, and there is no distortion; the camera has no
+    focal length prior. If pixels are not square, this refers to the picture as it is displayed.
+    With given parameters or an estimated focal length, the camera has a focal length prior.
 
     Args:
         options: camera model and parameters.
         width: image width in pixels.
         height: image height in pixels.
         pixel_aspect: width of a pixel over its height.
-        focal_length: in heights of a pixel, as estimated; used where no parameters are given.
+        focal_length: estimated focal length in pixel heights; used if no parameters are given.
 
     Raises:
-        OptionError: parameters without a model do not fit that of such pixels.
+        OptionError: the parameters do not fit the model, or its default.
     """
     name = options.camera_model
     if name is None:
@@ -73,7 +72,7 @@ def make_camera(
 
 
 def camera_fault(camera: pycolmap.Camera) -> str | None:
-    """What makes a pycolmap.Camera none, in words that follow "has"; None where nothing does."""
+    """The fault of an invalid pycolmap.Camera, in words that follow "has"; None if it is valid."""
     if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
         return f"a size of {camera.width}x{camera.height}"
     if not np.isfinite(camera.params).all():
@@ -89,7 +88,7 @@ def is_undistorted(camera: pycolmap.Camera) -> bool:
 
 
 def is_nearly_pinhole(model: str | None) -> bool:
-    """Whether a pinhole camera can initialise the named model; so it is without a name."""
+    """Whether a pinhole camera can initialize the named model; True for None."""
     return model is None or model in _RECTILINEAR
 
 
@@ -104,21 +103,21 @@ def has_two_focal_lengths(camera: pycolmap.Camera) -> bool:
 
 
 def check_pixel_aspect(camera: pycolmap.Camera, pixel_aspect: float, what_to_do: str) -> list[str]:
-    """Warn of a camera with one focal length where pixels are not square.
+    """Warn of a camera with a single focal length if pixels are not square.
 
     Args:
         camera: a pycolmap.Camera.
         pixel_aspect: width of a pixel over its height.
-        what_to_do: how the user gets another model, for the message.
+        what_to_do: how to get another model, for the message.
     """
     if is_square(pixel_aspect) or has_two_focal_lengths(camera):
         return []
     return [
-        f"pixels are {pixel_aspect:.3f} times as wide as high, but {camera.model_name} has one "
-        f"focal length for both directions; OPENCV and PINHOLE have two: {what_to_do}"
+        f"pixels are {pixel_aspect:.3f} times as wide as high, but {camera.model_name} has a "
+        f"single focal length; OPENCV and PINHOLE have two: {what_to_do}"
     ]
 
 
 def is_square(pixel_aspect: float) -> bool:
-    """Whether pixels are square, up to rounding of their width."""
+    """Whether pixels are square, up to rounding of the display size."""
     return abs(pixel_aspect - 1) < _SQUARE_TOLERANCE

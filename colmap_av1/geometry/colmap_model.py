@@ -1,4 +1,4 @@
-"""COLMAP models on disk: read by pycolmap, written point by point without it."""
+"""COLMAP models on disk: reading with pycolmap, and fast writing of arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from colmap_av1.util.files import may_read
 from colmap_av1.util.texts import check_name
 
 _FILES = ("cameras", "images", "points3D")
-# Files of folders of models, as `map` and `densify` write them.
+# Files that `map` and `densify` write to their output.
 MODEL_FILES = re.compile(
     r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log|place\.json"
 )
@@ -34,14 +34,14 @@ _POINT = np.dtype(
 )
 _CAMERA_HEAD = 24
 _ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
-# What stands between the counts of these files, in bytes.
+# Sizes in bytes of the parts of COLMAP's binary files.
 _COUNT = struct.Struct("<Q")
 _SHORT_COUNT = struct.Struct("<I")
-_SMALLEST_CAMERA = _CAMERA_HEAD + 3 * 8  # of SIMPLE_PINHOLE
+_SMALLEST_CAMERA = _CAMERA_HEAD + 3 * 8  # SIMPLE_PINHOLE has the fewest parameters.
 _IMAGE_HEAD, _POINT_HEAD = 64, 43
 _RIG_HEAD, _SENSOR, _POSE = 8, 8, 56
 _FRAME_HEAD, _DATA_ID = 8 + _POSE, 16
-# Points written at a time; bounds memory.
+# Number of points written at a time, to limit memory.
 _CHUNK = 20_000
 
 
@@ -64,15 +64,18 @@ class ModelImage:
 
 @dataclass(frozen=True)
 class ModelPoints:
-    """Points of a model and where its images see them, in compressed sparse row form.
+    """Points of a model and their observations, in compressed sparse row form.
+
+    Point p has the observations offsets[p] to before offsets[p + 1].
 
     Attributes:
         xyz: float64 [num_points, 3].
         rgb: uint8 [num_points, 3].
-        error: float64 [num_points] mean reprojection error in pixels.
-        offsets: int64 [num_points + 1] observations of each point.
+        error: float64 [num_points] mean reprojection error in pixels; -1 if unknown.
+        offsets: int64 [num_points + 1].
         image: int64 [num_observations] index of the image.
-        xy: float64 [num_observations, 2] pixels, the first pixel's centre at (0.5, 0.5).
+        xy: float64 [num_observations, 2] position in pixels, the first pixel's centre at
+            (0.5, 0.5).
     """
 
     xyz: NDArray[np.float64]
@@ -84,7 +87,7 @@ class ModelPoints:
 
 
 def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
-    """All points of several sets, which the same images see."""
+    """Concatenate sets of points that refer to the same images."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
     return ModelPoints(
         xyz=np.concatenate([part.xyz for part in parts]),
@@ -99,14 +102,14 @@ def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
 def take_rows(
     offsets: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Some rows of data in compressed sparse row form.
+    """Select rows of data in compressed sparse row form.
 
     Args:
-        offsets: int64 [num_rows + 1] where the elements of each row begin.
-        rows: int64 [n] those wanted, in this order.
+        offsets: int64 [num_rows + 1] index of the first element of each row.
+        rows: int64 [n] the rows to select, in this order.
 
     Returns:
-        int64 [n + 1] their offsets, and int64 [offsets[-1]] the indices of their elements.
+        int64 [n + 1] offsets of the selected rows, and int64 [m] the indices of their elements.
     """
     lengths = np.diff(offsets)[rows]
     taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
@@ -114,7 +117,7 @@ def take_rows(
 
 
 def no_points() -> ModelPoints:
-    """The points of a model of poses alone: none."""
+    """An empty set of points."""
     return ModelPoints(
         np.empty((0, 3)),
         np.empty((0, 3), np.uint8),
@@ -126,13 +129,13 @@ def no_points() -> ModelPoints:
 
 
 def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Float64 [n, 3] centres in the world of poses [n, 3, 4]."""
+    """Camera centres in the world, float64 [n, 3], of cam_from_world poses [n, 3, 4]."""
     rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
 
 
 def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImage]:
-    """The images of a pycolmap.Reconstruction that have a pose, by name."""
+    """The registered images of a pycolmap.Reconstruction, by name."""
     return {
         image.name: ModelImage(
             int(image.image_id),
@@ -148,11 +151,11 @@ def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImag
 def model_points(
     reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
 ) -> ModelPoints:
-    """All points of a pycolmap.Reconstruction, by their ids, with the observations of some images.
+    """All points of a pycolmap.Reconstruction, ordered by id, with their observations in `images`.
 
     Args:
         reconstruction: the model.
-        images: those whose observations are kept, in the order of the points' images.
+        images: the images whose observations are kept; `ModelPoints.image` is an index into them.
     """
     index = {image.image_id: k for k, image in enumerate(images)}
     xy = {
@@ -180,13 +183,13 @@ def write_model(
     images: Sequence[ModelImage],
     points: ModelPoints,
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin, as all versions of COLMAP read them.
+    """Write cameras.bin, images.bin and points3D.bin, which all versions of COLMAP read.
 
     Args:
         folder: an existing folder.
         cameras: pycolmap.Camera by id.
         images: the images.
-        points: the points; their ids count from 1.
+        points: the points; they get ids from 1.
 
     Raises:
         OSError: a file cannot be written.
@@ -228,7 +231,7 @@ def write_model(
 
 
 def _point_records(points: ModelPoints, elements: NDArray[Any], first: int, last: int) -> bytes:
-    """The records of the points from `first` to before `last`, each with its track."""
+    """The binary records, including tracks, of the points from `first` to before `last`."""
     offsets = points.offsets[first : last + 1]
     lengths = np.diff(offsets)
     heads = np.empty(last - first, dtype=_POINT)
@@ -252,11 +255,11 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
         model: folder with cameras, images and points3D, all .bin or all .txt.
 
     Returns:
-        The pycolmap.Reconstruction, without points that have no finite position; a warning gives
+        The pycolmap.Reconstruction without points whose position is not finite; a warning gives
         their number.
 
     Raises:
-        ModelError: the folder holds no model, a damaged one, or one without poses.
+        ModelError: the folder has no model, or the model is damaged or has no registered images.
     """
     path = Path(model)
     if not any(
@@ -265,17 +268,17 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
         found = sorted(path.glob("**/cameras.bin"))
         inside = next((p for p in found if ".stages" not in p.parts), None)
         hint = f": did you mean {inside.parent}?" if inside else ": give a folder a mapper wrote"
-        raise ModelError(f"{path}: holds no COLMAP model (cameras, images, points3D){hint}")
+        raise ModelError(f"{path}: has no COLMAP model (cameras, images, points3D){hint}")
     for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):
         if not may_read(file):
-            raise ModelError(f"{file}: no permission to read it: change that")
+            raise ModelError(f"{file}: permission denied: change its permissions")
     is_binary = (path / "cameras.bin").is_file()
     unreadable = ModelError(
-        f"{path}: the model cannot be read, it is damaged or of a newer COLMAP: map again, or "
+        f"{path}: the model cannot be read, it is damaged or from a newer COLMAP: map again, or "
         "update pycolmap"
     )
     try:
-        # pycolmap ends the process at some of what such files can declare.
+        # pycolmap aborts the process if a damaged file declares a huge count.
         if is_binary and not are_whole(path):
             raise unreadable
         reconstruction = pycolmap.Reconstruction(path)
@@ -283,7 +286,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
         raise unreadable from error
     cameras = path / "cameras.bin"
     sizes = [_CAMERA_HEAD + 8 * len(c.params) for c in reconstruction.cameras.values()]
-    # pycolmap does not notice where this file ends early.
+    # pycolmap does not notice a truncated cameras.bin.
     if cameras.is_file() and cameras.stat().st_size < 8 + sum(sizes):
         raise unreadable
     if reconstruction.num_reg_images() == 0:
@@ -302,7 +305,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
 
 
 def _check_values(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
-    """Refuse what pycolmap reads without a look: names, poses and cameras."""
+    """Refuse invalid names, poses and cameras, which pycolmap does not check."""
     map_again = "map again, or give another model"
     for image_id, image in reconstruction.images.items():
         try:
@@ -315,7 +318,7 @@ def _check_values(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
             raise ModelError(f"{path}: {error}") from error
         if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
             raise ModelError(
-                f"{path}: image {image.name!r} has a pose that is not of numbers: {map_again}"
+                f"{path}: image {image.name!r} has a pose that is not finite: {map_again}"
             )
     for camera_id, camera in reconstruction.cameras.items():
         fault = camera_fault(camera)
@@ -324,11 +327,11 @@ def _check_values(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
 
 
 def are_whole(model: Path) -> bool:
-    """Whether every count in a model's binary files is of records that are there.
+    """Whether a model's binary files contain all records that their counts declare.
 
     Args:
         model: folder with cameras.bin, images.bin and points3D.bin; rigs.bin and frames.bin of
-            COLMAP 3.12 and later are looked at where they are.
+            COLMAP 3.12 and later are checked if they exist.
 
     Raises:
         OSError: a file cannot be read.
@@ -352,12 +355,12 @@ def _is_whole(path: Path, holds: Callable[[mmap.mmap], bool]) -> bool:
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             try:
                 return holds(data)
-            except struct.error:  # a count lies behind the end
+            except struct.error:  # The file ends before a count.
                 return False
 
 
 def _cameras(data: mmap.mmap) -> bool:
-    # Their lengths depend on their models, which pycolmap checks.
+    # The length of a record depends on the camera model; pycolmap checks it.
     (count,) = _COUNT.unpack_from(data)
     return bool(_COUNT.size + count * _SMALLEST_CAMERA <= len(data))
 
@@ -379,7 +382,7 @@ def _images(data: mmap.mmap) -> bool:
 def _points(data: mmap.mmap) -> bool:
     (count,) = _COUNT.unpack_from(data)
     position, end, each = _COUNT.size, len(data), _ELEMENT.itemsize
-    unpack = _COUNT.unpack_from  # there may be millions
+    unpack = _COUNT.unpack_from  # Saves the look-up for millions of points.
     for _ in range(count):
         (length,) = unpack(data, position + _POINT_HEAD)
         position += _POINT_HEAD + _COUNT.size + length * each

@@ -1,4 +1,4 @@
-"""Coverage: how much of its images a cloud of points fills."""
+"""Coverage: the share of image cells that a point cloud projects into."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# Width in pixels of the cells that are filled or empty.
+# Width of a cell in pixels.
 CELL = 16
-# A point is seen through a gap in what is before it where all but one of the cells around have
-# points that are nearer by this factor.
+# A point is hidden by a surface and only visible through its gaps if at least 7 of the 8
+# neighbouring cells have points that are nearer by this factor.
 _NEARER = 1.25
 _AROUND = 8
-# Images that are looked at, evenly spread; bounds the time of long videos.
+# Number of evenly spread images that coverage is measured in, to limit the time for long videos.
 _MOST_IMAGES = 64
-# Points of the picture's edge that tell which rays a camera sees.
+# Number of points on each side of the image that bound the camera's field of view.
 _EDGE_POINTS = 33
 
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera where an image was taken.
+    """The camera, pose and mask of an image.
 
     Attributes:
-        camera: its pycolmap.Camera.
+        camera: pycolmap.Camera.
         cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
-        mask: which pixels of the image count; None: all.
+        mask: the valid pixels of the image; None: all.
     """
 
     camera: pycolmap.Camera
@@ -50,12 +50,12 @@ class PosedCamera:
 
     @property
     def centre(self) -> _Floats:
-        """Float64 [3] place of the camera in the world."""
+        """Camera centre in the world, float64 [3]."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
 
     @property
     def counting_cells(self) -> NDArray[np.bool_]:
-        """Bool [rows, columns] the cells of the image that have pixels which count."""
+        """Bool [rows, columns]: cells of the image that have valid pixels."""
         width, height = self.size
         rows, columns = -(-height // CELL), -(-width // CELL)
         if self.mask is None:
@@ -70,23 +70,24 @@ class PosedCamera:
         return _seen_rays(self.camera)
 
     def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
-        """Whether pixels [n, 2] of the image count."""
+        """Whether pixels [n, 2] of the image are valid."""
         return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
 
     def rays(self, xy: _Floats) -> _Floats:
-        """Float64 [n, 3] the rays in the camera of pixels [n, 2], 1 deep."""
+        """Rays in camera coordinates of pixels [n, 2], float64 [n, 3] with z = 1."""
         rays = np.asarray(self.camera.cam_from_img(xy)).reshape(-1, 2)
         return np.column_stack([rays, np.ones(len(rays))])
 
     def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
-        """The points that lie in the picture.
+        """Project points, and keep those within the image.
 
         Args:
-            xyz: float64 [n, 3] in the world.
+            xyz: float64 [n, 3] points in the world.
 
         Returns:
-            int64 [m] their indices, ascending; float64 [m, 2] pixels, the first one's centre at
-            (0.5, 0.5); and float64 [m] depths along the camera's axis.
+            int64 [m] ascending indices of the points within the image; float64 [m, 2] their pixels,
+            the first pixel's centre at (0.5, 0.5); and float64 [m] their depths along the optical
+            axis.
         """
         xyz = np.ascontiguousarray(xyz, np.float64)
         pose = np.ascontiguousarray(self.cam_from_world, np.float64)
@@ -95,7 +96,7 @@ class PosedCamera:
             return _core.points_in_picture(
                 pose, np.asarray(self.camera.params), float(width), float(height), xyz
             )
-        # Beyond what a camera sees its distortion may fold back into the picture.
+        # Outside the field of view, the distortion model may project points into the image.
         index, own = _core.points_in_view(pose, *self._seen_rays, xyz)
         xy = np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
         x, y = xy[:, 0], xy[:, 1]
@@ -108,7 +109,7 @@ def views_of(
     cameras: Mapping[int, pycolmap.Camera],
     masks: Sequence[Mask | None],
 ) -> list[PosedCamera]:
-    """The cameras where images were taken, by the cameras' ids, and what of them counts."""
+    """The camera, pose and mask of each image; `cameras` is by camera id."""
     return [
         PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
         for image, mask in zip(images, masks, strict=True)
@@ -118,15 +119,15 @@ def views_of(
 def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     """Share of the images' cells of 16x16 pixels that a visible point projects into.
 
-    A point that is seen through a gap in the surface before it does not count, nor do cells that
-    masks leave out. Of long videos 64 images, evenly spread, are looked at.
+    A point that is visible only through a gap in a nearer surface does not count, and neither do
+    masked cells. At most 64 images, evenly spread, are measured.
 
     Args:
         views: the images.
         xyz: float64 [n, 3] the points.
 
     Returns:
-        From 0 to 1; 0 without images.
+        The share from 0 to 1; 0 without images.
     """
     filled = total = 0
     for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
@@ -147,28 +148,28 @@ def coverage_of_model(reconstruction: pycolmap.Reconstruction) -> float:
 
 
 def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
-    """Depth of the nearest point in each cell of an image, seen through a gap or not.
+    """Depth of the nearest point in each cell of an image, including points in gaps.
 
     Args:
         view: the image.
         xyz: float64 [n, 3] the points.
 
     Returns:
-        float64 [rows, columns]; inf where there is none.
+        float64 [rows, columns]; inf for cells without a point.
     """
     _, xy, depth = view.project(xyz)
     return nearest_in_cells(view.size, xy, depth)
 
 
 def nearest_in_cells(size: tuple[int, int], xy: _Floats, depth: _Floats) -> _Floats:
-    """Least of the depths [n] at pixels [n, 2] in each cell of a (width, height), see above."""
+    """Smallest depth in each cell of an image of `size`, of depths [n] at pixels [n, 2]."""
     columns, rows = (-(-length // CELL) for length in size)
-    # What is seen at the very edge is of the last cell.
+    # The core assigns pixels on the right and bottom edges to the last cell.
     return _core.nearest_in_cells(xy, depth, cell=CELL, columns=columns, rows=rows)
 
 
 def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_side: int) -> _Floats:
-    """Centres in pixels [n, 2] of the squares that cells are divided into, cell by cell."""
+    """Centres in pixels [n, 2] of the squares in cells, `per_side` ** 2 for each cell in turn."""
     places = (np.arange(per_side) + 0.5) * (CELL / per_side)
     x = columns[:, None] * CELL + np.tile(places, per_side)
     y = rows[:, None] * CELL + np.repeat(places, per_side)
@@ -176,7 +177,7 @@ def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_si
 
 
 def without_gaps(grid: _Floats) -> _Floats:
-    """Nearest depths without those that lie well behind nearly all around them: inf there."""
+    """Nearest depths, with inf for cells well behind at least 7 of their 8 neighbours."""
     rows, columns = grid.shape
     padded = np.pad(grid, 1, constant_values=np.inf)
     limit = grid / _NEARER
@@ -188,7 +189,7 @@ def without_gaps(grid: _Floats) -> _Floats:
 
 
 def _seen_rays(camera: pycolmap.Camera) -> tuple[_Floats, _Floats]:
-    """Least and largest (x / z, y / z) that a picture's edge shows, a little widened."""
+    """Smallest and largest (x / z, y / z) on the edge of the image, with a margin of 1 %."""
     width, height = float(camera.width), float(camera.height)
     along = np.linspace(0.0, 1.0, _EDGE_POINTS)
     none, all_ = np.zeros_like(along), np.ones_like(along)

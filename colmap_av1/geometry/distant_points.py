@@ -1,4 +1,4 @@
-"""Points for trainers of Gaussian splats: every track gets one, far ones at an honest distance."""
+"""Points of all tracks for training Gaussian splats, including distant ones."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ from colmap_av1.options import TriangulateOptions
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Uncertainty of a distance, as a share of it, up to which it tells how deep the scene is.
+# Distances with a smaller relative uncertainty determine the depth of the scene.
 _KNOWN = 0.3
-# The far field is at this many times nearly all known distances, or this many times the extent of
-# the camera's path where that is farther.
+# Distance of the far field: a multiple of this quantile of the known distances, or a multiple of
+# the extent of the camera path, whichever is larger.
 _NEARLY_ALL = 0.999
 _FAR = 2.0
 _FAR_EXTENTS = 10.0
-# Its distance where neither points nor a path tell one.
+# Distance of the far field if neither points nor the path determine it.
 _ANY_FAR = 100.0
-# A point hangs before its surroundings where it is nearer than this share of their distance in most
-# of its images, and fewer points than these are as near, within a factor.
+# A point is a floater if, in most of its images, it is nearer than this share of the distance of
+# its surroundings, and fewer than _SUPPORT points there have the same distance within a factor.
 _BEFORE = 0.5
 _AS_NEAR = 1.3
 _SUPPORT = 4
-# Width in pixels of the squares of an image that surroundings are, and points that they take.
+# Width in pixels of the square around a point that is its surroundings, and the smallest number of
+# points in it for a decision.
 _AROUND = 48.0
 _FEWEST_AROUND = 8
-# Least angle in radians that is divided by.
+# Lower bound on angles in radians, to avoid division by zero.
 _TINY = 1e-12
 
 
@@ -61,36 +62,36 @@ class _Points:
 
     @property
     def middle(self) -> _Ints:
-        """The observation in the middle of each point's."""
+        """The middle observation of each point."""
         return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
 
     def take(self, rows: _Ints) -> _Points:
-        """Some of the points, in the order of `rows`."""
+        """Select points, in the order of `rows`."""
         offsets, seen = take_rows(self.offsets, rows)
         return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The tracks, and how the views see them."""
+    """The observations of the tracks, and the views."""
 
     observations: Observations
     views: Views
     centres: _Floats
 
     def rays(self, rows: _Ints) -> _Floats:
-        """Unit vectors in the world towards some observations, float64 [n, 3]."""
+        """Unit viewing directions in the world of some observations, float64 [n, 3]."""
         rays = np.column_stack([self.observations.rays[rows], np.ones(len(rows))])
         rotation = self.views.cam_from_world[self.observations.view[rows], :, :3]
         rays = np.einsum("nji,nj->ni", rotation, rays)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def origins(self, rows: _Ints) -> _Floats:
-        """Float64 [n, 3] centres of the views of some observations."""
+        """Camera centres of some observations, float64 [n, 3]."""
         return self.centres[self.observations.view[rows]]
 
     def of_points(self, points: _Points) -> dict[str, Any]:
-        """What the core is given of points and the views that see them."""
+        """Arguments of the core for points and the views that observe them."""
         return {
             "cam_from_world": np.ascontiguousarray(self.views.cam_from_world),
             "focal": np.ascontiguousarray(self.views.focal),
@@ -102,7 +103,7 @@ class _Seen:
         }
 
     def errors(self, points: _Points) -> _Floats:
-        """Reprojection errors in pixels of the observations of points, inf behind the camera."""
+        """Reprojection errors in pixels of the points' observations; inf behind the camera."""
         return _core.reprojection_errors(**self.of_points(points))
 
 
@@ -114,25 +115,25 @@ def splat_points(
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> TriangulatedPoints:
-    """Points of all tracks that agree with the poses, however little parallax they have.
+    """Points of all tracks that agree with the poses, regardless of their parallax.
 
-    What is far away fills most of many images, and its exact distance matters little: a point stays
-    on the ray of the middle one of its images, and within the uncertainty of its distance it is
-    drawn to the scene's far field. Tracks whose rays meet nowhere, being parallel, get a point
-    there. Points that hang before all that is around them in their images are left out.
+    Distant surfaces fill a large part of many images, and their exact distance matters little. A
+    point with an uncertain distance stays on the ray of its middle image, and is moved towards the
+    far field of the scene within its uncertainty. Tracks with parallel rays get a point in the far
+    field. Floaters, which are much nearer than their surroundings in most images, are removed.
 
     Args:
         observations: the tracks.
         views: poses and focal lengths.
-        options: of these `max_reprojection_error` and `min_observations` apply.
-        num_threads: threads; None: one per CPU. The result does not depend on it.
+        options: only `max_reprojection_error` and `min_observations` apply.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of tracks done so far.
 
     Returns:
         The points, in the order of the tracks.
 
     Raises:
-        OptionError: an option has a value that cannot work.
+        OptionError: an option is out of range.
     """
     anywhere = replace(
         options, points="survey", max_points=None, min_angle=0.0, max_depth_error=None
@@ -166,13 +167,13 @@ def distance_uncertainty(
     view: _Ints,
     focal: _Floats,
 ) -> _Floats:
-    """Expected error of each point's distance from the cameras, as a share of it.
+    """Relative uncertainty of each point's distance from the cameras, float64 [n].
 
     Args:
         xyz: float64 [n, 3] the points.
         error: float64 [n] their mean reprojection errors in pixels.
-        offsets: int64 [n + 1] the observations of each, one at least.
-        centres: float64 [num_views, 3] places of the cameras.
+        offsets: int64 [n + 1] offsets of the points' observations; each has at least one.
+        centres: float64 [num_views, 3] camera centres.
         view: int64 [num_observations] view of each observation.
         focal: float64 [num_views] focal lengths in pixels.
     """
@@ -185,12 +186,12 @@ def distance_uncertainty(
 
 
 def _distance(points: _Points, seen: _Seen) -> _Floats:
-    """Distance of each point from the view in the middle of its observations."""
+    """Distance of each point from the view of its middle observation."""
     return np.asarray(np.linalg.norm(points.xyz - seen.origins(points.middle), axis=1))
 
 
 def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
-    """Where the far field of the scene is taken to be."""
+    """Assumed distance of the scene's far field."""
     extent = float(np.linalg.norm(seen.centres - seen.centres.mean(axis=0), axis=1).max())
     known = _distance(points, seen)[unsure < _KNOWN]
     deepest = float(np.quantile(known, _NEARLY_ALL)) if len(known) else 0.0
@@ -198,10 +199,11 @@ def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
 
 
 def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _Seen) -> _Points:
-    """The points moved along their middle ray, within what is known of their distance.
+    """Move points along their middle ray towards the far field, within their uncertainty.
 
-    The inverse of the distance is drawn to that of the far field, with the scene's usual one as its
-    spread beforehand; what lies beyond the far field comes as near to it as its uncertainty lets.
+    The inverse distance is combined with a prior at the far field, whose standard deviation is the
+    inverse of the median distance. Points beyond the far field move towards it as far as their
+    uncertainty permits.
     """
     if len(points.xyz) == 0:
         return points
@@ -211,7 +213,7 @@ def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _See
     drawn = (1.0 + pull) / (1.0 / distance + pull / far)
     within = np.maximum(far, distance / (1.0 + unsure))
     moved = np.where(distance > far, np.minimum(distance, within), np.minimum(drawn, far))
-    # A thousandth is no matter; where it stays a point keeps its best place.
+    # Changes below 0.1 % are ignored, so that well-determined points keep their optimal position.
     rows = np.flatnonzero(np.abs(moved / distance - 1.0) > 1e-3)
     middle = points.middle[rows]
     xyz = points.xyz.copy()
@@ -220,7 +222,7 @@ def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _See
 
 
 def _with_errors(points: _Points, seen: _Seen) -> _Points:
-    """The points with the mean errors that they have where they are; without blind ones."""
+    """The points with updated mean errors, without those behind one of their cameras."""
     if len(points.xyz) == 0:
         return points
     mean = np.add.reduceat(seen.errors(points), points.offsets[:-1]) / np.diff(points.offsets)
@@ -230,7 +232,7 @@ def _with_errors(points: _Points, seen: _Seen) -> _Points:
 def _points_far_away(
     points: _Points, far: float, seen: _Seen, options: TriangulateOptions
 ) -> _Points:
-    """Points in the far field of the tracks that have none and look like it in enough images."""
+    """Far-field points for the tracks without a point that fit one in enough images."""
     offsets = seen.observations.offsets
     track = np.searchsorted(offsets, points.observation[points.offsets[:-1]], side="right") - 1
     has_point = np.zeros(len(offsets) - 1, np.bool_)
@@ -256,7 +258,7 @@ def _points_far_away(
 
 
 def _in_order(one: _Points, two: _Points) -> _Points:
-    """The points of both in the order of their tracks."""
+    """Merge points, in the order of their tracks."""
     both = _Points(
         np.concatenate([one.xyz, two.xyz]),
         np.concatenate([one.error, two.error]),
@@ -267,7 +269,7 @@ def _in_order(one: _Points, two: _Points) -> _Points:
 
 
 def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
-    """Points that hang, nearly alone, before all that is around them in most of their images."""
+    """Whether each point is a floater: nearly alone far in front of its surroundings."""
     votes = _core.hanging_observations(
         **seen.of_points(points),
         before=_BEFORE,

@@ -1,7 +1,7 @@
-"""Cameras, image poses and points in one file of our own, which later steps go on from.
+"""Cameras, image poses and points of an intermediate model, in one .npz file.
 
-COLMAP's own files would mislead: programs that train on a folder search it for `cameras.bin`,
-hidden folders too, and may take an intermediate model for the finished one.
+COLMAP's format is not suitable: trainers search a folder, including hidden folders, for
+`cameras.bin`, and could take an intermediate model for the finished one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PosedModel:
     Attributes:
         cameras: pycolmap.Camera by camera id.
         images: the registered images.
-        points: the points; none where only the poses matter.
+        points: the points; empty if only the poses matter.
     """
 
     cameras: Mapping[int, pycolmap.Camera]
@@ -49,13 +49,15 @@ class PosedModel:
 def posed_model(
     reconstruction: pycolmap.Reconstruction, *, with_points: bool = False
 ) -> PosedModel:
-    """The cameras and registered images of a pycolmap.Reconstruction, and its points if asked.
+    """The cameras and registered images of a pycolmap.Reconstruction, ordered by id.
 
-    The images are in the order of their ids; pycolmap keeps them in none.
+    Args:
+        reconstruction: the model.
+        with_points: include the points.
     """
     images = sorted(posed_images(reconstruction).values(), key=lambda image: image.image_id)
     used = {image.camera_id for image in images}
-    # Copies: pycolmap's own would go with the reconstruction.
+    # Copied, because pycolmap's cameras are freed with the reconstruction.
     cameras = {i: copy.copy(reconstruction.cameras[i]) for i in sorted(used)}
     points = model_points(reconstruction, images) if with_points else no_points()
     return PosedModel(cameras, images, points)
@@ -65,8 +67,8 @@ def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
     """Reprojection error of each observation of a model's points, in pixels.
 
     Returns:
-        float64 [num_observations] in the order of the points' observations; infinite where a point
-        lies behind the camera.
+        float64 [num_observations] in the order of the points' observations; infinite for points
+        behind the camera.
     """
     points = model.points
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
@@ -83,7 +85,7 @@ def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
 
 
 def write_posed_model(path: Path, model: PosedModel) -> None:
-    """Write a model to a file, to the last bit.
+    """Write a model to a file without loss of precision.
 
     Args:
         path: the file, .npz.
@@ -116,7 +118,7 @@ def write_posed_model(path: Path, model: PosedModel) -> None:
 
 
 def read_posed_model(path: Path) -> PosedModel:
-    """Read what `write_posed_model` wrote.
+    """Read a model written by `write_posed_model`.
 
     Raises:
         ModelError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""Resection: poses of the images between those that a mapper placed, from the points these see."""
+"""Resection: poses of the images between key images, from the points that these observe."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from colmap_av1.util.digests import seed_of
 
 _Floats = NDArray[np.float64]
 
-# Error in pixels of an inlier, and number of inliers that a pose is believed with: COLMAP's mapper
-# asks for 30, too.
+# Largest error in pixels of an inlier, and smallest number of inliers of an accepted pose, as in
+# COLMAP's mapper.
 _MAX_ERROR = 4.0
 _MIN_INLIERS = 30
-# Error in pixels from which on an observation counts less when the pose is refined (Cauchy).
+# Scale in pixels of the Cauchy loss of the refinement.
 _LOSS_SCALE = 0.5
-# Most guesses are right to begin with: no more samples than prove it.
+# Most initial poses are already good, so a few RANSAC samples suffice.
 _MIN_SAMPLES = 10
 _MAX_SAMPLES = 1000
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Known points in images without a pose.
+    """Observations of 3D points in images without a pose.
 
     Attributes:
-        rays: float64 [n, 2] undistorted position (x / z, y / z) of each point in its image.
-        xyz: float64 [n, 3] the point.
-        bounds: int64 [num_images + 1]; image i has those from bounds[i] to before bounds[i + 1].
+        rays: float64 [n, 2] undistorted position (x / z, y / z) of each observation.
+        xyz: float64 [n, 3] the 3D point of each observation.
+        bounds: int64 [num_images + 1]; image i has the observations bounds[i] to before
+            bounds[i + 1].
     """
 
     rays: _Floats
@@ -52,20 +53,20 @@ def sightings_of(
     frames: NDArray[np.int32],
     camera: pycolmap.Camera,
 ) -> Sightings:
-    """The points of tracks where other frames see the same tracks.
+    """Observations, in frames without a pose, of the points of tracks.
 
     Args:
-        points: points of `seen`.
-        seen: the tracks in the frames of known poses, as `Tracks.keep_frames` leaves them.
+        points: triangulated points of `seen`.
+        seen: the tracks in the frames with known poses, from `Tracks.keep_frames`.
         tracks: the same tracks in all frames.
-        frames: int32 [num_images] frames whose poses are asked for, ascending.
+        frames: int32 [num_images] ascending frames without a pose.
         camera: their pycolmap.Camera.
     """
     number = tracks.track
     known = np.zeros(tracks.num_frames, dtype=np.bool_)
     known[seen.frame] = True
     in_seen = np.unique(number[known[tracks.frame]])
-    # A track that slid from one surface to another has two points: the first one counts.
+    # A track that slid from one surface to another may have two points: use the first.
     first = points.observation[points.offsets[:-1]]
     own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)
     point = np.full(tracks.num_tracks, -1, dtype=np.int64)
@@ -89,19 +90,19 @@ def resect(
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[_Floats | None]:
-    """Estimate the pose of each image from the points it sees, by PoseLib.
+    """Estimate the pose of each image from its observations, with PoseLib.
 
     Args:
-        sightings: the points in the images.
-        guesses: float64 [num_images, 3, 4] poses that may be right, x_cam = R x_world + t.
-        focal: focal length in pixels, which errors are measured in.
-        loss_scale: error in pixels from which on a point counts less (Cauchy's loss).
-        seed: of the samples.
-        num_threads: threads; None: one per CPU. The result does not depend on it.
+        sightings: the observations of points in the images.
+        guesses: float64 [num_images, 3, 4] initial poses, x_cam = R x_world + t.
+        focal: focal length in pixels, which converts errors to pixels.
+        loss_scale: scale in pixels of the Cauchy loss.
+        seed: random seed of the samples.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of images done so far.
 
     Returns:
-        For each image float64 [3, 4]; None where too few points agree on a pose.
+        The pose float64 [3, 4] of each image; None for images with fewer than 30 inliers.
     """
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 
@@ -153,16 +154,16 @@ def _resect_one(
 def interpolate_poses(
     cam_from_world: _Floats, frames: NDArray[np.int32], wanted: NDArray[np.int32]
 ) -> _Floats:
-    """Poses between known ones, as of a camera that moves and turns steadily between them.
+    """Interpolate poses: linear interpolation of camera centres, spherical of rotations.
 
     Args:
         cam_from_world: float64 [n, 3, 4] known poses.
         frames: int32 [n] their frames, ascending.
-        wanted: int32 [m] frames whose poses are asked for; those before the first and after the
-            last known one get the pose of that.
+        wanted: int32 [m] frames to interpolate; frames before the first and after the last known
+            pose get that pose.
 
     Returns:
-        float64 [m, 3, 4].
+        float64 [m, 3, 4] cam_from_world.
     """
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - slow to import
 

@@ -1,4 +1,4 @@
-"""All tracks triangulated on known poses, with colours."""
+"""Triangulating all tracks on known poses, and colouring the points."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ from colmap_av1.util.progress import Progress
 
 _Image = NDArray[np.uint8]
 
-# Share of the tracks that agree with the poses of a model of the same video, at least.
+# If fewer of the tracks agree with the poses, the model is not of the same video.
 LEAST_AGREEING = 0.5
-# Shown frames that a track is seen in at least which a point may come from: where rays meet at an
-# angle, points of three frames are as true as those of four and five.
+# Smallest number of frames of a track that may give a point. With sufficient parallax, points from
+# three frames are as accurate as points from four or five.
 _TRACK_LENGTH = 3
-# Weights of red, green and blue in what looks bright (BT.601), in thousandths.
+# Luma weights of red, green and blue (BT.601), in thousandths.
 _LUMA = np.array([299, 587, 114])
-# Width in pixels of the squares that hold one track each: tracks that come near each other show
-# two points as long as they do not come nearer than this.
+# Width in pixels of the squares with at most one track each. Tracks closer than this are assumed to
+# follow the same point.
 _CELL = 2
-# Observations worked on at a time; bounds memory.
+# Number of observations processed at a time, to limit memory.
 _CHUNK = 1 << 18
 
 
 def chaining_for_points(
     options: TrackOptions, triangulate: TriangulateOptions, *, is_downscaled: bool = False
 ) -> TrackOptions:
-    """The options with more tracks, for points: short ones, and those that lie near another.
+    """Options that give more tracks for points: shorter tracks, and tracks closer to each other.
 
     Args:
-        options: changed where they leave the choice.
-        triangulate: how many observations a point has.
-        is_downscaled: motion is searched in smaller pictures, whose tracks are corrected. There
-            the squares of motion are as fine in them as a trainer needs points: more tracks would
-            leave fewer of them corrected, at three times the time and twice the memory.
+        options: options of the user; values that are None are set.
+        triangulate: options with the smallest number of observations of a point.
+        is_downscaled: whether motion is estimated in downscaled pictures and the tracks are
+            corrected afterwards. Then the spacing is not changed: motion blocks are already as
+            fine as a trainer needs, and more tracks would leave fewer of them corrected, at three
+            times the time and twice the memory.
     """
     if options.min_length is None:
         min_length = min(_TRACK_LENGTH, triangulate.min_observations)
@@ -54,7 +55,7 @@ def chaining_for_points(
 
 
 def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:
-    """The tracks in some frames only, and the index into `frames` of each observation."""
+    """The tracks restricted to some frames, and the index into `frames` of each observation."""
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))
     seen = tracks.keep_frames(frames)
@@ -67,7 +68,7 @@ def tracks_of_points(
     """The observations of a model's points as tracks, one for each point.
 
     Args:
-        points: the points; an image sees each at most once.
+        points: the points, each with at most one observation in an image.
         frames: int32 [num_images] the frame of each image.
         num_frames: number of frames of all videos.
         size: (width, height) of the largest image.
@@ -97,10 +98,10 @@ def triangulate_tracks(
     progress: Progress,
     rays: NDArray[np.float64] | None = None,
 ) -> TriangulatedPoints:
-    """Points of all tracks, of the kind that the options say.
+    """Triangulate all tracks as `options.points` requests.
 
-    Errors are in pixels of each image's pinhole camera, else of its own. `rays` are those of
-    `rays_of`, where these are known already.
+    Errors are in pixels of the pinhole cameras if given, else of the images' own cameras. `rays` is
+    the result of `rays_of` if already known.
     """
     rays = rays_of(tracks, view, cameras) if rays is None else rays
     shown = cameras if pinholes is None else pinholes
@@ -128,7 +129,7 @@ def rays_of(
     by_id = {int(camera.camera_id): camera for camera in cameras}
     camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
     rays = np.empty(tracks.xy.shape)
-    # Part by part: what is made on the way is several times as large.
+    # In parts, because intermediate arrays are several times as large.
     for start in range(0, len(rays), _CHUNK):
         part = slice(start, start + _CHUNK)
         xy = tracks.xy[part].astype(np.float64)
@@ -143,10 +144,10 @@ def rays_of(
 
 
 class Colours:
-    """Colours of points as the middle one of the pictures shows them, picture by picture.
+    """Colours of points: for each point, the colour of median luma among its observations.
 
-    A blurred, bright or hidden view among several does not change them. `sizes` are the (width,
-    height) in pixels that each image has in the points.
+    The median is robust against single blurred, overexposed or occluded views. `sizes` gives the
+    (width, height) of each image, in the pixels of the points' observations.
     """
 
     def __init__(self, points: ModelPoints, sizes: Sequence[tuple[int, int]]) -> None:
@@ -157,9 +158,9 @@ class Colours:
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
     def add(self, image: int, picture: _Image, undistortion: Undistortion | None = None) -> None:
-        """Look at the picture (BGR, of any scale) of an image.
+        """Sample the picture (BGR, of any scale) of an image.
 
-        It is of its model's camera, or what `undistortion` makes of it is.
+        The picture has the camera of the model, after `undistortion` if given.
         """
         own = self._order[self._bounds[image] : self._bounds[image + 1]]
         size = np.array(undistortion.size if undistortion is not None else picture.shape[1::-1])
@@ -169,11 +170,11 @@ class Colours:
         self._seen[own] = shown[:, ::-1]
 
     def rgb(self) -> _Image:
-        """Colours uint8 [num_points, 3], red first."""
+        """Colours, uint8 [num_points, 3] RGB."""
         first, lengths = self._points.offsets[:-1], np.diff(self._points.offsets)
         most = int(lengths.max(initial=1))
-        # Point, brightness and place among the point's in one number: sorting such takes a third
-        # of the time of sorting by several.
+        # Point, luma and observation index in a single key: sorting by one key takes a third of the
+        # time of sorting by several.
         key = np.repeat(np.arange(len(lengths)), lengths) * (_LUMA.sum() * 255 + 1)
         key += self._seen.astype(np.int64) @ _LUMA
         key *= most
@@ -183,14 +184,14 @@ class Colours:
 
 
 def mean_error(cloud: ModelPoints) -> float:
-    """Mean reprojection error in pixels of the points that have one."""
+    """Mean reprojection error in pixels of the points whose error is known."""
     return float(cloud.error[cloud.error >= 0].mean())
 
 
 def to_model_points(
     points: TriangulatedPoints, view: NDArray[np.int64], xy: NDArray[np.float64]
 ) -> ModelPoints:
-    """The points as a model holds them, in black; `xy` are the pixels of their observations."""
+    """Model points in black; `xy` are the pixels of the points' observations."""
     black = np.zeros((len(points.xyz), 3), np.uint8)
     return ModelPoints(
         points.xyz, black, points.error, points.offsets, view[points.observation], xy

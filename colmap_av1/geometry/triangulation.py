@@ -1,4 +1,4 @@
-"""3D points of tracks on known poses: all tracks at once, robust and filtered."""
+"""Robust triangulation of all tracks on known poses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from colmap_av1.util.cpus import threads_or_cpus
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
-# What the core returns for some of the tracks, see `TriangulatedPoints`.
+# Result of the core for a range of tracks, see `TriangulatedPoints`.
 _Part = tuple[_Floats, _Floats, _Ints, _Ints, int, int]
 
-# Observations worked on at a time: few enough for progress and for all threads.
+# Number of observations in a unit of work, small enough to report progress and use all threads.
 _CHUNK = 65_536
-# Error in pixels that an observation has however accurate its motion is.
+# Lower bound on the expected error of an observation, in pixels.
 SIGMA_FLOOR = 0.3
-# Error of a ray, where a point is looked at for the wrong distance, to its mean reprojection error.
+# Assumed ratio of the error of a ray to the mean reprojection error of its point, for estimating
+# the uncertainty of the depth.
 ERROR_TO_SIGMA = 2.0
 
 
@@ -33,7 +34,7 @@ class Views:
 
     Attributes:
         cam_from_world: float64 [n, 3, 4] poses, x_cam = R x_world + t.
-        focal: float64 [n, 2] focal lengths along x and y in pixels; turns errors into pixels.
+        focal: float64 [n, 2] focal lengths along x and y, which convert errors to pixels.
     """
 
     cam_from_world: _Floats
@@ -69,9 +70,9 @@ class TriangulatedPoints:
         error: float64 [num_points] mean reprojection error in pixels.
         offsets: int64 [num_points + 1].
         observation: int64 indices into the observations that were triangulated.
-        num_agreeing: tracks of which enough observations agree with the poses, whether or not
-            they have the parallax that a point needs.
-        num_tracks: tracks that had enough observations.
+        num_agreeing: number of tracks of which enough observations agree with the poses,
+            including those without sufficient parallax for a point.
+        num_tracks: number of tracks with enough observations.
     """
 
     xyz: _Floats
@@ -92,19 +93,19 @@ def triangulate(
 ) -> TriangulatedPoints:
     """Triangulate tracks on known poses.
 
-    The first guess of a point is the best of several midpoints of two rays (Hartley and Sturm,
-    "Triangulation", 1997), judged by all observations; Gauss-Newton steps on the reprojection
-    error follow, weighted by the expected error of each observation and by how well it agrees.
-    Observations beyond `max_reprojection_error`, or behind the camera, are dropped. What is dropped
-    may be a separate point, where a track slid from one surface to another: it is tried once
-    more. Rays that meet at an angle a and are off by e give a distance to e / a of it; where that
-    is too much there is no point.
+    A point is initialized with the midpoint of two rays (Hartley and Sturm, "Triangulation", 1997)
+    that fits all observations best among several candidates. Gauss-Newton steps then minimize the
+    reprojection error, with a robust weight and the expected error of each observation.
+    Observations beyond `max_reprojection_error` or behind the camera are dropped. Because a track
+    may have slid from one surface to another, the dropped observations are triangulated once more
+    as a separate point. A point whose rays have error e and triangulation angle a has a relative
+    depth error of e / a; points beyond `max_depth_error` are rejected.
 
     Args:
         observations: the tracks.
         views: poses and focal lengths.
-        options: what makes a point; the defaults of TriangulateOptions if None.
-        num_threads: threads; None: one per CPU. The result does not depend on it.
+        options: criteria for points; the defaults of TriangulateOptions if None.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of tracks done so far.
 
     Returns:
@@ -137,7 +138,7 @@ def triangulate(
 
     none = np.empty(0, np.int64)
     parts: list[_Part] = [(np.empty((0, 3)), np.empty(0), none, none, 0, 0)]
-    # The core releases the interpreter lock.
+    # Threads run in parallel because the core releases the GIL.
     with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
         try:
             for index, part in enumerate(executor.map(work, range(len(bounds) - 1))):

@@ -1,4 +1,4 @@
-"""The undistorted pinhole camera of a distorted one, and its pictures."""
+"""Undistortion: the pinhole camera for a camera with distortion, and undistorted pictures."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from colmap_av1.geometry.masks import Mask, make_mask
 
 _Image = NDArray[np.uint8]
 
-# Zoom of the undistorted camera against the distorted one.
+# Range of the ratio of the focal lengths of the undistorted and the distorted camera.
 _ZOOM_RANGE = (0.25, 4.0)
 _BISECTIONS = 40
-# Of the tables in which single pixels are looked up.
+# Width of the table in which single pixels are sampled.
 _COLUMNS = 512
 
 
 def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """The undistorted camera of the same size, with the widest view without empty pixels.
+    """The pinhole camera of the same size with the widest field of view without empty pixels.
 
     Args:
         camera: pycolmap.Camera of any perspective model.
@@ -34,7 +34,7 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
         pycolmap.Camera, PINHOLE, with the id and the principal point of the given one.
 
     Raises:
-        ModelError: no such camera exists, as with a fisheye lens that sees to the side.
+        ModelError: there is no such camera, for example for a fisheye lens of 180 degrees.
     """
     size = {"width": int(camera.width), "height": int(camera.height)}
     centre = [camera.principal_point_x, camera.principal_point_y]
@@ -81,7 +81,7 @@ def on_pinholes(
     """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
     params = np.array([pinhole.params for pinhole in pinholes])
     if len(params) and (params == params[0]).all():
-        # Nothing to look up for each ray, which takes most of the time.
+        # With equal cameras, skip the look-up for each ray, which takes most of the time.
         return np.asarray(rays * params[0, :2] + params[0, 2:])
     xy = np.empty(rays.shape)
     for axis in range(2):
@@ -94,12 +94,12 @@ def undistorted_masks(
     cameras: Sequence[pycolmap.Camera],
     pinholes: Mapping[int, pycolmap.Camera],
 ) -> list[Mask | None]:
-    """The masks of images as their undistorted pictures have them, of the size of these.
+    """Undistort the masks of images, at the size of the undistorted images.
 
     Args:
-        masks: the mask of each image; None: it has none.
-        cameras: the camera of each.
-        pinholes: the undistorted camera of each camera, by its id.
+        masks: the mask of each image, or None.
+        cameras: the camera of each image.
+        pinholes: the pinhole camera for each camera, by camera id.
     """
 
     @functools.cache
@@ -125,12 +125,12 @@ def undistorted_masks(
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Undistorts pictures of a camera.
+    """Undistorts the pictures of a camera.
 
     Attributes:
-        source: float32 [height, width, 2] where each pixel of the undistorted picture is in the
-            distorted one, the centre of whose first pixel is (0, 0).
-        interpolation: OpenCV's flag for what lies between pixels.
+        source: float32 [height, width, 2] position in the distorted picture of each pixel of the
+            undistorted one, with the first pixel's centre at (0, 0).
+        interpolation: OpenCV's interpolation flag.
     """
 
     source: NDArray[np.float32]
@@ -138,17 +138,17 @@ class Undistortion:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of undistorted pictures."""
+        """(width, height) of undistorted pictures in pixels."""
         height, width = self.source.shape[:2]
         return width, height
 
     def __call__(self, picture: _Image) -> _Image:
-        """The undistorted picture of a picture, uint8 [height, width, ...]."""
+        """Undistort a picture, uint8 [height, width, ...]."""
         return self._looked_up(picture, self.source)
 
     def pixels(self, picture: _Image, x: NDArray[np.int64], y: NDArray[np.int64]) -> _Image:
-        """Some pixels [n, ...] of the undistorted picture, by their columns and rows [n]."""
-        # As a table: OpenCV takes no row or column as long as that.
+        """Pixels [n, ...] of the undistorted picture at columns x [n] and rows y [n]."""
+        # Arranged as a table, because cv2.remap limits the length of rows and columns.
         rows = -(-len(x) // _COLUMNS)
         source = np.resize(self.source[y, x], (rows, _COLUMNS, 2))
         found = self._looked_up(picture, source) if rows else picture[:0]
@@ -163,13 +163,13 @@ class Undistortion:
 def undistortion(
     camera: pycolmap.Camera, pinhole: pycolmap.Camera, interpolation: int = cv2.INTER_CUBIC
 ) -> Undistortion | None:
-    """What undistorts the pictures of a camera; None without distortion."""
+    """The undistortion of a camera's pictures; None without distortion."""
     if is_undistorted(camera):
         return None
     fx, fy, cx, cy = pinhole.params
     width, height = int(pinhole.width), int(pinhole.height)
     y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
     source = _project(camera, np.column_stack([(x - cx) / fx, (y - cy) / fy]))
-    # OpenCV counts from the centre of the first pixel.
+    # In OpenCV, the first pixel's centre is (0, 0).
     at = (source - 0.5).reshape(height, width, 2).astype(np.float32)
     return Undistortion(at, interpolation)

@@ -1,1 +1,1 @@
-"""Other programs' files."""
+"""Files of other programs."""

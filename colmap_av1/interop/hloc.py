@@ -2,8 +2,8 @@
 
 The layout is that of hloc (Sarlin et al., "From Coarse to Fine: Robust Hierarchical
 Localization at Large Scale", CVPR 2019; https://github.com/cvg/Hierarchical-Localization):
-`extract_features.py` and `match_features.py` write it, `utils/io.py` reads it. hloc's pixel
-centres are whole numbers; where it fills COLMAP's databases it adds 0.5.
+`extract_features.py` and `match_features.py` write it, `utils/io.py` reads it. In hloc, pixel
+centres have integer coordinates; it adds 0.5 when it writes a COLMAP database.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from colmap_av1.util.progress import Progress, no_progress
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 
-# What lies between the names of hloc's pairs: groups within groups, or one group for both in
-# files of its first versions.
+# Separator of the two image names of a pair. Nested groups use the first; files of hloc's first
+# versions have one group for both names, with the second.
 _SEPARATOR, _OLD_SEPARATOR = "/", "_"
 _NO_MATCH = -1
-# HDF5's filters pack zeros to a thousandth of their size, and nothing further.
+# Upper bound on the compression ratio of HDF5's filters, which zeros reach.
 _DENSEST = 1100
-# What h5py raises where a file is damaged.
+# Exceptions that h5py raises for a damaged file.
 _HDF5_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError)
-# Writes a dataset of a file.
+# Writes a dataset, by its name, to an open file.
 _Write = Callable[..., h5py.Dataset]
 
 
 @dataclass(frozen=True)
 class HlocMatches:
-    """What hloc's files hold, as plain arrays.
+    """Features and matches of hloc's files, as plain arrays.
 
     Attributes:
         names: names of the images, in alphabetical order.
-        sizes: int64 [n, 2] width and height of each image in pixels; 0 where not stored.
+        sizes: int64 [n, 2] width and height of each image in pixels; 0 if not stored.
         keypoints: float32 [k, 2] for each image, positions in pixels (x right, y down), origin
             at the top-left corner: the first pixel's centre is (0.5, 0.5), as in COLMAP.
         pairs: int32 [m, 2] indices of images.
         matches: uint32 [k, 2] for each pair, indices of matching keypoints.
-        scores: float32 [k] for each pair, the score of each match; 1 where not stored.
+        scores: float32 [k] for each pair, the score of each match; 1 if not stored.
     """
 
     names: list[str]
@@ -71,28 +71,28 @@ def export_hloc(
     *,
     overwrite: bool = False,
 ) -> tuple[int, int]:
-    """Write keypoints and matches of a COLMAP database as hloc lays them out.
+    """Export keypoints and matches of a COLMAP database to hloc's files.
 
     `features.h5` has a group for each image, named after it, with `keypoints` and
-    `image_size`. `matches.h5` has a group for each pair with `matches0`, the keypoint of the
-    second image that each one of the first matches or -1, and `matching_scores0`, 1 for each
-    match. `pairs.txt` lists the pairs. The database is read without altering it; the files
-    appear under their names only when all are complete.
+    `image_size`. `matches.h5` has a group for each pair. Its `matches0` gives, for each keypoint of
+    the first image, the index of the matching keypoint of the second image or -1;
+    `matching_scores0` is 1 for each match. `pairs.txt` lists the pairs. The database is not
+    changed, and the files appear only when all of them are complete.
 
     Args:
         database: the database file.
-        output: folder of the files; made where it is missing.
+        output: folder of the files; created if it is missing.
         options: which matches are written.
-        progress: called with a stage's name, what is done, and of how much.
-        overwrite: replace files of these names that exist.
+        progress: called with the stage's name, the number of items done and their total.
+        overwrite: replace existing files of these names.
 
     Returns:
         The numbers of images and of pairs.
 
     Raises:
-        DatabaseError: the file is missing, unreadable, not a COLMAP database, holds no
-            keypoints, or something that hloc's layout has no place for.
-        OptionError: the folder cannot be written, or must not.
+        DatabaseError: the file is missing, unreadable, not a COLMAP database, has no keypoints, or
+            holds something that hloc's layout cannot represent.
+        OptionError: the folder cannot be written, or a file exists and `overwrite` is not set.
     """
     options = options if options is not None else ExportOptions()
     path, folder = Path(database), Path(output)
@@ -107,7 +107,7 @@ def export_hloc(
         with _complete_files(folder) as (features, matches, pairs):
             counts = _write_features(connection, path, features, report)
             if not any(counts.values()):
-                raise DatabaseError(f"{path}: holds no keypoints: match its images first")
+                raise DatabaseError(f"{path}: has no keypoints: match its images first")
             num_pairs = _write_pairs(
                 connection, path, matches, pairs, names=names, counts=counts,
                 options=options, report=report,
@@ -120,8 +120,8 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
     for name in names:
         if len(name.split()) != 1:
             raise DatabaseError(
-                f"{path}: image name {name!r} has a space, which hloc's lists of pairs cannot "
-                "hold: rename the image"
+                f"{path}: image name {name!r} has a space, which hloc's pairs.txt cannot "
+                "represent: rename the image"
             )
         other = seen.setdefault(_pair_part(name), name)
         if other != name:
@@ -132,13 +132,13 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 
 
 def _pair_part(name: str) -> str:
-    """An image's name as it stands in the name of a pair."""
+    """An image's name as hloc writes it in the name of a pair."""
     return name.replace("/", "-")
 
 
 @contextlib.contextmanager
 def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
-    """Open the three files, each a `whole_file`."""
+    """Open the three files for writing; they appear under their names only if all succeed."""
     made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     names = (FEATURES, MATCHES, PAIRS)
     complete = False
@@ -165,7 +165,7 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
 
 
 def _write_features(connection: Any, path: Path, write: _Write, report: Progress) -> dict[int, int]:
-    """Write all images, with or without keypoints; returns how many each has."""
+    """Write all images; returns the number of keypoints of each image, by its id."""
     rows = connection.execute(
         "SELECT image_id, name, COALESCE(width, 0), COALESCE(height, 0) FROM images "
         "LEFT JOIN cameras USING (camera_id) ORDER BY name"
@@ -186,7 +186,10 @@ def _write_features(connection: Any, path: Path, write: _Write, report: Progress
 
 
 def _to_hloc(xy: NDArray[np.float32]) -> NDArray[Any]:
-    """Positions from which hloc gets the same ones back; float32 but near the left or top edge."""
+    """Positions in hloc's convention, which convert back to exactly the same ones.
+
+    They are float32 unless that would lose precision, close to the left or top edge.
+    """
     half = np.float32(0.5)
     moved: NDArray[Any] = xy - half
     if not np.array_equal(moved + half, xy):
@@ -217,13 +220,13 @@ def _write_pairs(
         found = matches_from_row(path, pair_id, num_rows, data)
         if (found >= [counts.get(i, 0), counts.get(j, 0)]).any():
             raise DatabaseError(
-                f"{path}: images {i} and {j} match keypoints that are not there: "
-                "'colmap-av1 check' says what else is wrong"
+                f"{path}: images {i} and {j} match keypoints that do not exist: "
+                "run 'colmap-av1 check' for a full list of problems"
             )
         if len(np.unique(found[:, 0])) != len(found):
             raise DatabaseError(
-                f"{path}: a keypoint of {names[i]!r} matches several of {names[j]!r}, for which "
-                "hloc's layout has no place: match these images again"
+                f"{path}: a keypoint of {names[i]!r} matches several of {names[j]!r}, which "
+                "hloc's layout cannot represent: match these images again"
             )
         narrow = counts[j] <= np.iinfo(np.int16).max
         matches0 = np.full(counts[i], _NO_MATCH, dtype=np.int16 if narrow else np.int32)
@@ -237,24 +240,24 @@ def _write_pairs(
 
 
 def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str]) -> HlocMatches:
-    """Read features and matches from files that hloc, or a program like it, wrote.
+    """Read features and matches from files in hloc's layout.
 
-    Pairs are found under the names of hloc's present and of its first versions. A pair that is
-    stored in both directions is read once, in the order of the names.
+    The pair names of current and of the first versions of hloc are supported. A pair that is
+    stored in both directions is read once, in the alphabetical order of the names.
 
     Args:
         features: file with `keypoints` in the group of each image.
         matches: file with `matches0` in the group of each pair.
 
     Raises:
-        HlocError: a file is missing, is not an HDF5 file, holds no keypoints or no matches, or
-            its pairs do not fit its images.
+        HlocError: a file is missing, is not an HDF5 file, has no keypoints or no matches, or the
+            pairs do not fit the images.
     """
     features, matches = Path(features), Path(matches)
     with _open_hloc(features) as file:
         names = sorted(_groups_with(file, "keypoints"))
         if not names:
-            raise HlocError(f"{features}: holds no keypoints: give the features file of hloc")
+            raise HlocError(f"{features}: has no keypoints: give the features file of hloc")
         keypoints = [_from_hloc(features, name, file[name]["keypoints"]) for name in names]
         sizes = np.array([_size_of(features, name, file[name]) for name in names], dtype=np.int64)
     rows: dict[tuple[int, int], tuple[NDArray[np.uint32], NDArray[np.float32]]] = {}
@@ -262,7 +265,7 @@ def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str])
         index = _index_of_pair_parts(features, names)
         groups = sorted(_groups_with(file, "matches0"))
         if not groups:
-            raise HlocError(f"{matches}: holds no matches: give the matches file of hloc")
+            raise HlocError(f"{matches}: has no matches: give the matches file of hloc")
         for group in groups:
             i, j = _split_pair(matches, group, index)
             if (j, i) in rows:
@@ -287,22 +290,22 @@ def _open_hloc(path: Path) -> Iterator[h5py.File]:
         with h5py.File(path, "r", libver="latest") as file:
             yield file
     except PermissionError as error:
-        raise HlocError(f"{path}: no permission to read it: change that") from error
+        raise HlocError(f"{path}: permission denied: change its permissions") from error
     except _HDF5_ERRORS as error:
-        raise HlocError(f"{path}: not an HDF5 file, or damaged: write it anew") from error
+        raise HlocError(f"{path}: not an HDF5 file, or damaged: create it again") from error
 
 
 def _values(path: Path, group: h5py.Group, name: str) -> NDArray[Any]:
-    """A dataset of a group, as an array of numbers, read where the file holds what it declares."""
+    """A numeric dataset of a group; refused if its declared size is impossible for the file."""
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
-        raise HlocError(f"{path}: '{name}' of {group.name!r} holds no numbers: write it anew")
-    # A few bytes can declare any size, or another file's content.
+        raise HlocError(f"{path}: '{name}' of {group.name!r} is not numeric: create it again")
+    # A damaged or malicious file can declare any size, or refer to another file's content.
     held = dataset.id.get_storage_size() * _DENSEST
     if dataset.nbytes > held or dataset.is_virtual or dataset.external:
         raise HlocError(
             f"{path}: '{name}' of {group.name!r} declares {dataset.nbytes} bytes, which the file "
-            "does not hold: write it anew"
+            "does not hold: create it again"
         )
     return np.asarray(dataset[()])
 
@@ -320,12 +323,14 @@ def _groups_with(file: h5py.File, dataset: str) -> list[str]:
 
 
 def _size_of(path: Path, name: str, group: h5py.Group) -> tuple[int, int]:
-    """Width and height of an image; 0 where the file does not say, or says nothing sensible."""
+    """Width and height of an image; 0 if not stored."""
     if "image_size" not in group:
         return (0, 0)
     size = _values(path, group, "image_size")
     if size.shape != (2,) or not ((size >= 0) & (size <= np.iinfo(np.int32).max)).all():
-        raise HlocError(f"{path}: the image_size of {name!r} is no width and height: write it anew")
+        raise HlocError(
+            f"{path}: the image_size of {name!r} is not a width and height: create it again"
+        )
     return int(size[0]), int(size[1])
 
 
@@ -333,14 +338,15 @@ def _from_hloc(path: Path, name: str, dataset: h5py.Dataset) -> NDArray[np.float
     if dataset.ndim != 2 or dataset.shape[1] < 2 or dataset.dtype.kind not in "fiu":
         raise HlocError(
             f"{path}: the keypoints of {name!r} are {dataset.dtype} {list(dataset.shape)}, not "
-            "one row of x and y for each: give the features file of hloc"
+            "rows of x and y: give the features file of hloc"
         )
-    # Half precision, as hloc stores it, is widened before anything is added.
+    # hloc stores half precision: convert before adding, to keep the fraction.
     xy = _values(path, dataset.parent, "keypoints")[:, :2].astype(np.float64) + 0.5
     found = xy.astype(np.float32)
     if not np.isfinite(found).all():
         raise HlocError(
-            f"{path}: image {name!r} has keypoints that are not numbers: extract its features anew"
+            f"{path}: image {name!r} has keypoints that are not finite numbers: extract its "
+            "features again"
         )
     return found
 
@@ -358,7 +364,7 @@ def _index_of_pair_parts(path: Path, names: Sequence[str]) -> dict[str, int]:
 
 
 def _split_pair(path: Path, group: str, index: dict[str, int]) -> tuple[int, int]:
-    """Indices of the images of a pair's group."""
+    """Indices of the two images that the name of a pair's group refers to."""
     splits = []
     for separator in (_SEPARATOR, _OLD_SEPARATOR):
         words = group.split(separator)
@@ -367,8 +373,8 @@ def _split_pair(path: Path, group: str, index: dict[str, int]) -> tuple[int, int
             if ends[0] in index and ends[1] in index:
                 splits.append((index[ends[0]], index[ends[1]]))
     if len(splits) != 1:
-        fault = "is of no two images" if not splits else "can be read in several ways"
-        raise HlocError(f"{path}: pair {group!r} {fault} of the features file: match it anew")
+        fault = "names no two images" if not splits else "is ambiguous for the images"
+        raise HlocError(f"{path}: pair {group!r} {fault} of the features file: match it again")
     return splits[0]
 
 
@@ -379,13 +385,13 @@ def _read_pair(
     if matches0.shape != (counts[0],) or matches0.dtype.kind not in "iu":
         raise HlocError(
             f"{path}: pair {name!r} has {matches0.dtype} {list(matches0.shape)} matches for "
-            f"{counts[0]} keypoints: match it anew"
+            f"{counts[0]} keypoints: match it again"
         )
     first = np.flatnonzero(matches0 != _NO_MATCH)
     second = matches0[first].astype(np.int64)
     if np.any((second < 0) | (second >= counts[1])):
         raise HlocError(
-            f"{path}: pair {name!r} matches keypoints that are not there: match it anew"
+            f"{path}: pair {name!r} matches keypoints that do not exist: match it again"
         )
     scores = np.ones(len(first), dtype=np.float32)
     if "matching_scores0" in group:
@@ -393,7 +399,7 @@ def _read_pair(
         if stored.shape != matches0.shape:
             raise HlocError(
                 f"{path}: pair {name!r} has {list(stored.shape)} scores for {len(matches0)} "
-                "matches: match it anew"
+                "matches: match it again"
             )
         scores = stored[first].astype(np.float32)
     return np.stack([first, second], axis=1).astype(np.uint32), scores

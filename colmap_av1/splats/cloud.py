@@ -1,4 +1,4 @@
-"""A cloud that trainers of Gaussian splats start well from: even in the images, without holes."""
+"""A point cloud for training Gaussian splats: evenly spread in the images, with holes filled."""
 
 from __future__ import annotations
 
@@ -21,65 +21,67 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Images, evenly spread, that the cloud is made even in: at least and at most so many, and between
-# these every so many-th; and those at most that it is made whole in.
+# Points are thinned in evenly spread key images: at least 32, at most 128, in between every 6th
+# image. Holes are filled in at most _WHOLE_IMAGES key images.
 _EVEN_IMAGES = (32, 128, 6)
 _WHOLE_IMAGES = 128
-# Widths in pixels of the cells of these that one point each is wanted in, coarse ones first. Points
-# nearer than the last cost a trainer time and keep it from placing its own.
+# Widths in pixels of the image cells that should contain one point each, from coarse to fine.
+# Closer points cost training time and prevent the trainer from placing its own.
 _SPACINGS = (32, 16, 8)
-# Points whose depths differ by more than a half are of different surfaces; this many steps apart
-# they are no more told apart.
+# Points in the same cell whose depths differ by more than half an octave belong to different
+# surfaces. Depths are quantized to at most _MOST_STEPS such steps.
 _STEPS_PER_OCTAVE = 2.0
 _MOST_STEPS = 64
-# Share of a bound on the number that holes do not get.
+# Share of `max_points` reserved for points of tracks; the rest may fill holes.
 _FOR_SURFACES = 0.75
-# Width in pixels of the squares that get a point each where a cell of the coverage is empty.
+# Width in pixels of the squares that get one point each in an empty cell.
 _FILLING = 8
-# Points before what an image shows through a gap hide it: looking at all images again finds that.
+# Added points may hide what another image shows through a gap. A second pass over all images finds
+# such cells.
 _ROUNDS = 2
-# Of the depths at the edge of a hole, those that are nearer than this quantile of them by more than
-# a factor are not what it shows; and how many of the others each of its cells follows.
+# A hole shows the background. Depths at its edge that are nearer than this quantile by more than a
+# factor are ignored, and each cell of the hole is interpolated from the nearest remaining ones.
 _FARTHER = 0.75
 _TOO_NEAR = 2.0
 _NEAREST = 8
-# Distances that are tried for a point which hides others by more than a factor in the key images
-# beside its own: as that of the surroundings, times these, then the largest around.
+# An added point must not be nearer, by more than a factor, than the surfaces of neighbouring key
+# images. Multiples of the surrounding depth are tried in turn, then the largest depth.
 _HIDES = 1.25
 _PUSHED = (1.0, 1.5, 3.0)
 _BESIDE = 2
-# COLMAP's word for an error that is not known.
+# COLMAP's value for an unknown error.
 _UNKNOWN_ERROR = -1.0
 
 
 def splat_cloud(
     points: ModelPoints, images: Sequence[PosedCamera], max_points: int | None
 ) -> ModelPoints:
-    """The points that a trainer needs: evenly spread in the images, holes filled, no more.
+    """Thin points of tracks evenly in the images, and fill holes.
 
-    Of the points that come close to each other in an image the one that most images see stays,
-    where they are of one surface. Where an image has none they are added as far away as what is
-    around; these are seen by that image and those beside it. What masks leave out is no hole.
+    Of nearby points on the same surface, the one with the most observations is kept. Empty cells of
+    an image get points at the depth of their surroundings, observed by that image and its
+    neighbours. Masked pixels are not holes.
 
     Args:
         points: points of tracks.
         images: the images.
-        max_points: points at most, the finest ones left out first; None: any number.
+        max_points: largest number of points, where the finest spacing is dropped first; None: no
+            limit.
 
     Returns:
-        Those of `points` that stay, in their order, then those that are added, in black.
+        The kept points in their order, then the added points in black.
     """
     fewest, most, step = _EVEN_IMAGES
     even = evenly_spread(len(images), min(max(len(images) // step, fewest), most))
     stage = _stages(points, [images[i] for i in even])
     keys = evenly_spread(len(images), _WHOLE_IMAGES)
-    # Without an order within a stage its last ones would be of the last part of the video.
+    # Shuffle within a stage: a limit would otherwise drop points at the end of the video.
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
         kept = take_points(points, np.sort(order))
         return joined_points([kept, _filling(kept, images, keys)])
-    # Holes come before detail, but not before the surfaces that tell how deep they are.
+    # Filling holes has priority over detail, but needs surfaces that determine their depth.
     kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
     filled = _filling(kept, images, keys)
     filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
@@ -88,7 +90,7 @@ def splat_cloud(
 
 
 def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
-    """Some of the points, in the order of `rows`."""
+    """Select points, in the order of `rows`."""
     offsets, seen = take_rows(points.offsets, rows)
     return ModelPoints(
         points.xyz[rows],
@@ -101,11 +103,11 @@ def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
 
 
 def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
-    """Index of the widest spacing at which each point is wanted in a key image, int64 [n].
+    """Index of the widest spacing at which each point is kept in a key image, int64 [n].
 
-    Points that are wanted at none have the number of spacings.
+    Points that are not kept at any spacing get the number of spacings.
     """
-    # The point that most images see comes first, in all of them alike.
+    # Prefer points with many observations, in the same order in all images.
     first = np.lexsort((points.error, -np.diff(points.offsets)))
     rank = np.empty(len(first), np.int64)
     rank[first] = np.arange(len(first))
@@ -127,7 +129,7 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
 
 
 def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) -> ModelPoints:
-    """Points in the holes that the kept ones leave in the key images, first one in each cell."""
+    """Points that fill the holes of the key images, one point of each cell first."""
     nearest = [nearest_depth(images[key], kept.xyz) for key in keys]
     surfaces = [without_gaps(grid) for grid in nearest]
     usual = _usual_depth(surfaces)
@@ -160,23 +162,23 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) 
 
 
 def _spread_order(count: int) -> list[int]:
-    """0 to before `count`, halfway points first."""
+    """0 to before `count` in bit-reversed order, which spreads the first ones evenly."""
     size = max(count - 1, 1).bit_length()
     order = (int(format(i, f"0{size}b")[::-1], 2) for i in range(1 << size))
     return [i for i in order if i < count]
 
 
 def _usual_depth(surfaces: list[_Floats]) -> float:
-    """Depth of an image without any point."""
+    """Depth assumed in an image without points."""
     known = np.concatenate([grid[np.isfinite(grid)] for grid in surfaces])
     return float(np.quantile(known, _FARTHER)) if len(known) else 1.0
 
 
 def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
-    """The grid with depths in all cells: those of a hole follow from the cells at its edge.
+    """Fill the grid's holes with depths interpolated from the cells at their edges.
 
-    Where these are near on one side and far on another the hole shows what is far: sky between
-    roofs, and a point too far away hides nothing.
+    If one side of a hole is near and another far, the hole is assumed to show the background, for
+    example sky between roofs. A point that is too far away hides nothing.
     """
     from scipy.ndimage import binary_dilation, find_objects, label  # noqa: PLC0415 - slow to import
     from scipy.spatial import KDTree  # noqa: PLC0415
@@ -184,7 +186,7 @@ def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
     depth = grid.copy()
     holes, count = label(np.isinf(grid), structure=np.ones((3, 3)))
     for number, place in enumerate(find_objects(holes, count), start=1):
-        # With the cells around it.
+        # The bounding box of the hole and its neighbouring cells.
         box = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in place)
         hole = holes[box] == number
         edge = np.argwhere(binary_dilation(hole, np.ones((3, 3))) & np.isfinite(grid[box]))
@@ -204,14 +206,14 @@ def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
 def _squares(
     view: PosedCamera, rows: _Ints, columns: _Ints
 ) -> tuple[_Floats, _Ints, NDArray[np.bool_]]:
-    """Centres in pixels of the squares in cells, the cell of each, and whether it is its first."""
+    """Squares in cells: centres in pixels, cells, and whether each is the first of its cell."""
     per_cell = CELL // _FILLING
     xy = squares_of_cells(rows, columns, per_cell)
     cell = np.repeat(np.arange(len(rows)), per_cell**2)
-    # Cells at the edge may reach beyond it; one square of each lies within.
+    # Cells at the image edge may extend beyond it: move their first square inside.
     first = np.arange(len(xy)) % per_cell**2 == 0
     xy[first] = np.minimum(xy[first], np.array(view.size) - 0.5)
-    # Centres of squares are corners of pixels: all four around count.
+    # The centre of a square is a corner of four pixels, which must all be valid.
     around = [xy + np.array([dx, dy]) for dx in (-0.5, 0.5) for dy in (-0.5, 0.5)]
     inside = (xy < view.size).all(axis=1) & np.all([view.keeps(at) for at in around], axis=0)
     return xy[inside], cell[inside], first[inside]
@@ -224,7 +226,7 @@ def _behind(
     farthest: float,
     others: Sequence[tuple[PosedCamera, _Floats]],
 ) -> _Floats:
-    """Points at pixels and depths of an image, farther where they would hide what others see."""
+    """Points at pixels and depths of an image, moved back if they would hide others' surfaces."""
     rays = view.rays(xy) @ view.cam_from_world[:, :3]
     xyz = view.centre + rays * np.maximum(depth, farthest)[:, None]
     left = np.arange(len(xy))
@@ -246,7 +248,10 @@ def _behind(
 def _with_observations(
     xyz: _Floats, images: Sequence[PosedCamera], seen_by: Sequence[int], own: int
 ) -> ModelPoints:
-    """Points as images have them that they project into, in their own one wherever they are."""
+    """Points with observations in the images that they project into.
+
+    The image `own`, which they were created for, observes all of them, even on masked pixels.
+    """
     seen = []
     for i in seen_by:
         index, at, _ = images[i].project(xyz)

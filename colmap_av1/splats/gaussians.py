@@ -1,4 +1,4 @@
-"""Initial 3D Gaussians for trainers that take more than points: sizes, directions, opacity."""
+"""Initial 3D Gaussians, with scales, rotations and opacities, for trainers that accept them."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# Images, evenly spread, that tell how far points are from each other.
+# Number of evenly spread images in which the spacing of points is measured.
 _IMAGES = 32
-# Neighbours in an image whose distances are a point's spacing, and how many pixels apart points
-# count whose depths differ by a factor of e: those of other surfaces are no neighbours.
+# Number of neighbours that determine a point's spacing, and the distance in pixels that a depth
+# ratio of e adds, so that points on other surfaces are not neighbours.
 _NEAREST = 4
 _PER_DEPTH = 100.0
-# Standard deviation across the surface as a share of the spacing: what lies between points is
-# covered, and detail is not blurred.
+# Standard deviation in the tangent plane as a share of the spacing. Larger Gaussians blur detail,
+# smaller ones leave gaps between points.
 _ACROSS = 0.5
-# That along the normal is the error of the depth, within these shares of the one across: training
-# starts better from discs than from balls, even where depth is not known.
+# Bounds on the standard deviation along the normal, as shares of that in the tangent plane. Discs
+# are a better initialization than spheres, even if the depth is uncertain.
 _THICKNESS = (0.2, 0.5)
-# Spacings of points that nearly coincide, in pixels, are not below this.
+# Lower bound on the spacing in pixels, for nearly coincident points.
 _LEAST_SPACING = 0.25
-# Nearest points in space whose plane gives the normal.
+# Number of nearest points whose plane gives the normal.
 _AROUND = 8
-# Trainers find what is hidden only through what does not hide it all.
+# Training recovers hidden surfaces only if the Gaussians in front are not opaque.
 _OPACITY = 0.5
-# First coefficient of spherical harmonics.
+# Value of the spherical harmonic of degree 0.
 _SH0 = 0.28209479177387814
-# Further coefficients, of degrees 1 to 3: readers of the reference implementation insist on them.
+# Number of coefficients of degrees 1 to 3, which readers of the reference format require.
 _REST = 45
-# Points worked on at a time; bounds memory.
+# Number of points processed at a time, to limit memory.
 _CHUNK = 100_000
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """3D Gaussians of one colour from all sides.
+    """3D Gaussians with view-independent colours.
 
     Attributes:
         xyz: float64 [n, 3] centres.
-        normal: float64 [n, 3] unit normals of the surfaces that they lie on, their third axes.
-        scale: float64 [n, 3] standard deviations along their axes.
+        normal: float64 [n, 3] unit normals of their surfaces, which are their third axes.
+        scale: float64 [n, 3] standard deviations along the axes.
         rotation: float64 [n, 4] unit quaternions (w, x, y, z) of the axes in the world.
         opacity: float64 [n] from 0 to 1.
         rgb: uint8 [n, 3] colours.
@@ -74,15 +74,15 @@ class Gaussians:
 
 
 def initial_gaussians(points: ModelPoints, images: Sequence[PosedCamera]) -> Gaussians:
-    """A Gaussian for each point, as wide as its neighbours in the images leave room for.
+    """A Gaussian for each point, sized by the spacing of points in the images.
 
-    Trainers that get points alone take the distance to others in space for the size, which noise
-    of the depth and other surfaces nearby make wrong. Here a Gaussian is a disc on its surface, the
-    thicker the less its depth is known.
+    Trainers that get only points use the distance between points in space as the size, which depth
+    noise and other nearby surfaces falsify. Here a Gaussian is a disc on its surface, and its
+    thickness is the uncertainty of the depth.
 
     Args:
         points: the points, with colours.
-        images: the images, by the index that the points' observations have.
+        images: the images, which the points' observations refer to.
     """
     across = _ACROSS * _spacing(points.xyz, images)
     rotation, normal = _on_surfaces(points.xyz)
@@ -98,7 +98,7 @@ def initial_gaussians(points: ModelPoints, images: Sequence[PosedCamera]) -> Gau
 
 
 def _spacing(xyz: _Floats, images: Sequence[PosedCamera]) -> _Floats:
-    """Distance of each point to its neighbours of the same surface, as images show it."""
+    """Distance of each point to its neighbours on the same surface, measured in the images."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
 
     total, count = np.zeros(len(xyz)), np.zeros(len(xyz))
@@ -119,7 +119,7 @@ def _spacing(xyz: _Floats, images: Sequence[PosedCamera]) -> _Floats:
 
 
 def _on_surfaces(xyz: _Floats) -> tuple[_Floats, _Floats]:
-    """Quaternions [n, 4] of axes whose third is normal to the points around, and normals [n, 3]."""
+    """Quaternions [n, 4] of local axes, and normals [n, 3], which are the third axes."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
@@ -140,7 +140,7 @@ def _on_surfaces(xyz: _Floats) -> tuple[_Floats, _Floats]:
 
 
 def _depth_error(points: ModelPoints, images: Sequence[PosedCamera]) -> _Floats:
-    """Expected error of each point's distance; inf where its observations tell none."""
+    """Expected error of each point's distance; inf if its observations do not determine one."""
     lengths = np.diff(points.offsets)
     error = np.full(len(lengths), np.inf)
     rows = np.flatnonzero((lengths >= 2) & (points.error >= 0))
@@ -163,22 +163,22 @@ def check_gaussians_path(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Refuse a file, where one is given, that `write_gaussians` must not or could not write.
+    """Check before any work that `write_gaussians` can write a file.
 
     Args:
-        given: the file.
-        inputs: files that are read; None: not given.
-        overwrite: replace a file that exists.
+        given: the file; None: nothing to check.
+        inputs: input files, which must not be overwritten; None entries are ignored.
+        overwrite: replace an existing file.
 
     Raises:
-        OptionError: its name does not end in .ply, it is an input or exists, or nothing can be made
-            there.
+        OptionError: its name does not end in .ply, it is an input or exists, or it cannot be
+            written.
     """
     if given is None:
         return
     path = Path(given)
     if path.suffix.lower() != ".ply":
-        raise OptionError(f"{path}: trainers know Gaussians by .ply: give a name that ends so")
+        raise OptionError(f"{path}: Gaussians are written as .ply: give a name that ends in .ply")
     check_new_file(path, inputs, overwrite=overwrite)
     above = next(p for p in path.absolute().parents if p.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
@@ -186,17 +186,17 @@ def check_gaussians_path(
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians in the layout of the reference implementation's point_cloud.ply.
+    """Write Gaussians in the format of point_cloud.ply of the reference implementation.
 
-    That is, scales as logarithms, opacity as logit, colours as coefficients of spherical harmonics;
-    of degrees 1 to 3 all are 0.
+    Scales are stored as logarithms, opacities as logits and colours as coefficients of spherical
+    harmonics, where those of degrees 1 to 3 are 0.
 
     Args:
-        path: the file; it appears when it is complete, and replaces one that is there.
+        path: the file; it appears when it is complete, and replaces an existing one.
         gaussians: the Gaussians.
 
     Raises:
-        ModelError: it cannot be written.
+        ModelError: the file cannot be written.
     """
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(_REST)]
@@ -215,14 +215,14 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:
-    """Write initial Gaussians of the points of a COLMAP model.
+    """Write initial Gaussians for the points of a COLMAP model.
 
     Args:
         path: the file, see `write_gaussians`.
         model: folder of the model.
 
     Raises:
-        ModelError: the model cannot be read, or the file not written.
+        ModelError: the model cannot be read, or the file cannot be written.
     """
     reconstruction = read_model(model)
     posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)

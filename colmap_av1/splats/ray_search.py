@@ -1,7 +1,6 @@
-"""How far away what one picture shows is, by looking for it along its rays in others.
+"""Depths of pixels by a space sweep: patches are compared with other pictures at many depths.
 
-Patches are compared at all depths in turn (Collins, "A space-sweep approach to true multi-image
-matching", 1996).
+Collins, "A space-sweep approach to true multi-image matching", 1996.
 """
 
 from __future__ import annotations
@@ -21,34 +20,35 @@ from colmap_av1.geometry.coverage import PosedCamera
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Pictures are compared at the largest whole fraction of their size with at most so many pixels.
+# Pictures are reduced by an integer factor to at most this number of pixels.
 _MOST_PIXELS = 250_000
-# Depths that are tried, at least and at most: one for each pixel that a patch moves by.
+# Smallest and largest number of depths that are tried; in between one for each pixel of parallax.
 _DEPTHS = (16, 160)
-# Standard deviation in grey values that a patch has at least.
+# Smallest standard deviation of a patch in grey values; flatter patches cannot be compared.
 _LEAST_DEVIATION = 6.0
-# Pictures that a point is compared with, at least; the best two of them count.
+# Smallest number of other pictures; the mean of the best two correlations counts.
 LEAST_OTHERS = 2
-# Correlation with the best two pictures, in the mean, and how much less the next best depth has
-# that is not beside the best.
+# Smallest mean correlation with the best two pictures, and its margin over all depths that are more
+# than _BESIDE steps away.
 _LEAST_CORRELATION = 0.7
 _MARGIN = 0.07
 _BESIDE = 3
-# A picture sees a point where it shows a patch that correlates at least so well.
+# Smallest correlation at which another picture counts as observing a point.
 _SEES = 0.6
 _CHUNK = 256
 
 
 @dataclass(frozen=True)
 class Swept:
-    """Points that one image found.
+    """Points found by the sweep of one image.
 
     Attributes:
         image: index of the image.
-        xy: float64 [n, 2] its pixels.
-        depth: float64 [n] along its camera's axis.
-        others: the images that were compared with it.
-        seen: float64 [m, n, 2] pixels where each of these shows it best; NaN where it does not.
+        xy: float64 [n, 2] pixels of the points.
+        depth: float64 [n] depths along the optical axis.
+        others: indices of the m images that were compared with it.
+        seen: float64 [m, n, 2] pixels with the best correlation in each of these; NaN for images
+            that do not observe the point.
     """
 
     image: int
@@ -58,7 +58,7 @@ class Swept:
     seen: _Floats
 
     def take(self, kept: NDArray[np.bool_]) -> Swept:
-        """Some of the points."""
+        """Select points."""
         return Swept(self.image, self.xy[kept], self.depth[kept], self.others, self.seen[:, kept])
 
     def xyz(self, view: PosedCamera) -> _Floats:
@@ -69,27 +69,27 @@ class Swept:
 
 @dataclass(frozen=True)
 class Grey:
-    """A picture made smaller, by a factor."""
+    """A grey picture reduced by a factor."""
 
     pixels: NDArray[np.uint8]
     factor: int
 
     def place(self, xy: _Floats) -> NDArray[np.float32]:
-        """Where pixels of the picture are in the smaller one."""
+        """Convert pixels of the picture to pixels of the reduced picture."""
         return (xy / self.factor).astype(np.float32)
 
 
 def shrinking(size: tuple[int, int]) -> int:
-    """How much smaller pictures of a (width, height) are made."""
+    """The factor by which pictures of a (width, height) are reduced."""
     return math.ceil(math.sqrt(math.prod(size) / _MOST_PIXELS))
 
 
 def smaller(picture: NDArray[np.uint8]) -> Grey:
-    """A picture, uint8 [height, width, 3] BGR, as it is compared."""
+    """Convert a picture, uint8 [height, width, 3] BGR, to a reduced grey picture."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     factor = shrinking(grey.shape[::-1])
     height, width = (length // factor for length in grey.shape)
-    # Cut to whole squares, or all of it would be drawn closer by a fraction of a pixel.
+    # Crop to a multiple of the factor; cv2.resize would otherwise scale by a different factor.
     grey = np.ascontiguousarray(grey[: height * factor, : width * factor])
     if factor > 1:
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
@@ -105,19 +105,19 @@ def sweep_image(
     *,
     threads: Executor,
 ) -> Swept:
-    """Those of an image's pixels that its other pictures show at one depth, and that depth.
+    """Find the depths of an image's pixels for which other pictures agree on a unique depth.
 
     Args:
         views: the images.
         key: index of the image.
-        greys: its picture and the others, by their indices.
+        greys: reduced pictures of this and the other images, by index.
         xy: float64 [n, 2] pixels of the image.
-        least_depth: the nearest depth that is tried; the farthest is without end.
-        threads: compare.
+        least_depth: smallest depth to try; the largest is infinity.
+        threads: executor for the comparisons.
     """
     view, grey = views[key], greys[key]
     others = [image for image in greys if image != key]
-    # What is flat, or at the edge, cannot be compared.
+    # Skip patches that are flat or cross the image edge.
     xy = xy[_correlate(grey, xy, grey, xy[:, None])[:, 0] > 0]
     focal = view.camera.mean_focal_length() / grey.factor
     apart = max(float(np.linalg.norm(views[i].centre - view.centre)) for i in others)
@@ -157,20 +157,20 @@ def sweep_image(
 
 
 def _correlate(one: Grey, xy: _Floats, two: Grey, at: _Floats) -> NDArray[np.float32]:
-    """Correlations [n, d] of what is at pixels [n, 2] of an image, and at [n, d, 2] of another."""
+    """Correlations [n, d] of patches at [n, 2] of one image and at [n, d, 2] of another."""
     return _core.correlate_patches(
         one.pixels, one.place(xy), two.pixels, two.place(at), min_deviation=_LEAST_DEVIATION
     )
 
 
 def _seen_at(view: PosedCamera, other: PosedCamera, rays: _Floats, inverse: _Floats) -> _Floats:
-    """Pixels [n, d, 2] of another image for rays [n, 3] at inverse depths [n or 1, d].
+    """Project points on rays [n, 3] at inverse depths [n or 1, d] to pixels [n, d, 2].
 
-    They are NaN behind that image's camera.
+    The pixels are in the image `other`, and NaN behind its camera.
     """
     turn = other.cam_from_world[:, :3] @ view.cam_from_world[:, :3].T
     way = other.cam_from_world[:, 3] - turn @ view.cam_from_world[:, 3]
-    # By coordinates: NumPy's loops over rows of three take several times as long.
+    # Coordinate by coordinate: NumPy is several times slower on rows of three elements.
     seen = (turn @ rays.T)[:, :, None] + way[:, None, None] * inverse
     seen[:, seen[2] <= 0] = np.nan
     at = np.asarray(other.camera.img_from_cam(seen.reshape(3, -1).T))
@@ -178,7 +178,7 @@ def _seen_at(view: PosedCamera, other: PosedCamera, rays: _Floats, inverse: _Flo
 
 
 def _mean_of_best(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean of the best two along the first axis, which is short: sorting it takes far longer."""
+    """Mean of the largest two along the first axis, without sorting, which takes far longer."""
     best, second = np.maximum(*found[:2]), np.minimum(*found[:2])
     for other in found[2:]:
         np.maximum(second, np.minimum(best, other), out=second)
@@ -187,10 +187,9 @@ def _mean_of_best(found: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _is_clear(found: NDArray[np.float32], best: _Ints) -> NDArray[np.bool_]:
-    """Whether the best step of each row is good, and none but those beside it about as good.
+    """Whether the best step of each row is good, and clearly better than all distant steps.
 
-    The first step, which is endlessly far away, and the last do not count: what is best may lie
-    beyond them.
+    The first step (infinity) and the last are rejected, because the true depth may lie beyond them.
     """
     score = np.take_along_axis(found, best[:, None], axis=1)
     beside = np.abs(np.arange(found.shape[1]) - best[:, None]) <= _BESIDE
@@ -201,7 +200,7 @@ def _is_clear(found: NDArray[np.float32], best: _Ints) -> NDArray[np.bool_]:
 
 
 def _top(found: NDArray[np.float32], best: _Ints) -> _Floats:
-    """The steps, with fractions, of the tops of parabolas through the best and those beside it."""
+    """Steps with subpixel refinement: maximum of a parabola through the best and adjacent steps."""
     beside = np.clip(best[:, None] + np.arange(-1, 2), 0, found.shape[1] - 1)
     left, middle, right = np.take_along_axis(found, beside, axis=1).astype(np.float64).T
     bend = left - 2 * middle + right
@@ -212,11 +211,11 @@ def _top(found: NDArray[np.float32], best: _Ints) -> _Floats:
 
 
 def _own_best(found: NDArray[np.float32], best: _Ints) -> tuple[_Floats, NDArray[np.bool_]]:
-    """The step, near the best one of all pictures, that one picture finds best, and if it is good.
+    """One picture's best step near the common best step, and whether it observes the point.
 
     Args:
-        found: float32 [n, d] what this picture finds.
-        best: int64 [n] the step that is best for all.
+        found: float32 [n, d] correlations of this picture.
+        best: int64 [n] best steps of all pictures.
     """
     around = np.clip(best[:, None] + np.arange(-_BESIDE, _BESIDE + 1), 0, found.shape[1] - 1)
     own = np.take_along_axis(found, around, axis=1)

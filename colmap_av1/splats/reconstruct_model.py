@@ -1,4 +1,4 @@
-"""The last stage of `reconstruct`: all tracks on the poses, undistorted images, the model."""
+"""The last stage of `reconstruct`: points of all tracks, undistorted images, and the model."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ from colmap_av1.video.unchanged import check_unchanged
 
 _Image = NDArray[np.uint8]
 
-# Folder of the masks, where there are any.
+# Folder of the masks, if there are any.
 _MASKS = "masks"
 
 
 def _tracked_points(
     run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
 ) -> tuple[ModelPoints, float]:
-    """Points of all tracks, as a model of the undistorted images has them, in black.
+    """Points of all tracks in a model of the undistorted images, in black.
 
     Returns:
         The points, and the share of the tracks that agree with the poses.
@@ -80,12 +80,12 @@ def _tracked_points(
 
 
 def _pinholes(views: Sequence[PosedCamera]) -> dict[int, pycolmap.Camera]:
-    """The undistorted cameras by their ids."""
+    """The undistorted cameras by id."""
     return {int(view.camera.camera_id): view.camera for view in views}
 
 
 def _undistortions(placed: PosedImages, views: Sequence[PosedCamera]) -> list[Undistortion | None]:
-    """What undistorts the picture of each image; None: it has no distortion."""
+    """The undistortion of each image; None for images without distortion."""
     pinholes = _pinholes(views)
     of_camera = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
     return [of_camera[image.camera_id] for image in placed.images]
@@ -102,7 +102,7 @@ def _written_images(
     undistort: Sequence[Undistortion | None],
     look: Look,
 ) -> None:
-    """Write the images, undistorted, and look at those of videos on the way."""
+    """Write the undistorted images, and pass those of videos to `look`."""
     options, progress = run.options, run.progress
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
@@ -151,7 +151,7 @@ def _written_cloud(
     *,
     undistort: Sequence[Undistortion | None],
 ) -> ModelPoints:
-    """Write the images; those points, in black, that the options want of tracks and pictures."""
+    """Write the images; returns the points, in black, that `points` of the options requests."""
     options, clock = run.options.triangulate, run.clock
 
     def show(look: Look) -> None:
@@ -181,9 +181,9 @@ def _coloured(
     *,
     undistort: Sequence[Undistortion | None],
 ) -> ModelPoints:
-    """The points in the colours of the pictures.
+    """Colour the points from the decoded video.
 
-    The images themselves are not read: decompressing them takes several times as long.
+    Reading the written images instead would take several times as long.
     """
     colours = Colours(cloud, [view.size for view in views])
     places = np.searchsorted(image_set.images.frames, placed.frames).tolist()
@@ -202,9 +202,9 @@ def _write_masks(
     cameras: Mapping[int, pycolmap.Camera],
     masks: Sequence[Mask | None],
 ) -> None:
-    """Write a mask for each image, white where there is none.
+    """Write a mask for each image, all white for images without a mask.
 
-    Trainers look for `masks/NAME.png` beside `images/NAME.jpg`, and so does COLMAP where images
+    Trainers search for `masks/NAME.png` next to `images/NAME.jpg`, and so does COLMAP if images
     are PNG.
     """
     for image, mask in zip(images, masks, strict=True):
@@ -218,14 +218,14 @@ def _write_masks(
 
 @dataclass(frozen=True)
 class ModelResult:
-    """What `model_stage` found beside the model and the images it writes.
+    """Figures of the model that `model_stage` writes.
 
     Attributes:
-        num_points: 3D points.
-        num_observations: observations of all points.
+        num_points: number of 3D points.
+        num_observations: number of observations of all points.
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean reprojection error of the points in pixels.
-        focal_length: of the first camera, in pixels.
+        focal_length: focal length of the first camera in pixels.
         agreeing: share of the tracks that agree with the poses.
     """
 
@@ -244,14 +244,14 @@ def model_stage(
     moving: Mapping[str, Mask],
     posed: Kept[PosesResult],
 ) -> Kept[ModelResult]:
-    """Triangulate all tracks and write the images and the model that trainers open.
+    """Triangulate all tracks, and write the undistorted images and the model.
 
     Args:
-        run: what every stage is given.
-        tracks: the tracks of all sequences, without those of what moves by itself.
+        run: context of the run.
+        tracks: the tracks of all sequences, without those on dynamic objects.
         image_set: all images.
-        moving: by the names of images, masks that leave out what moves.
-        posed: the stage that holds the poses.
+        moving: masks of static pixels, by image name.
+        posed: the stage with the poses.
     """
     options, clock = run.options, run.clock
     masked = run.inputs.masks is not None or options.moving == "mask"
@@ -302,6 +302,6 @@ def model_stage(
         make=make,
     )
     if not masked:
-        # Those of an earlier run are of other images.
+        # Remove masks of an earlier run with other options.
         shutil.rmtree(run.output / _MASKS, ignore_errors=True)
     return kept

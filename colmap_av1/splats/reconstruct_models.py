@@ -1,4 +1,4 @@
-"""The models that `reconstruct` writes: the largest, and those that nothing connects with it."""
+"""The models that `reconstruct` writes: the largest, and further disconnected models."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _FOLDER = "model_"
 
 @dataclass(frozen=True)
 class FurtherModel:
-    """A model of images that nothing connects with those of the largest.
+    """A model that is not connected with the largest model.
 
     Attributes:
-        output: its folder, with `images/` and `sparse/0/` as the largest one's.
-        num_registered: images with a pose.
-        first: name of the first of them, in the order of their frames.
-        last: name of the last one.
-        num_points: 3D points.
+        output: its folder, with `images/` and `sparse/0/` like that of the largest model.
+        num_registered: number of registered images.
+        first: name of the first registered image, in the order of frames.
+        last: name of the last registered image.
+        num_points: number of 3D points.
         mean_error: mean reprojection error of the points in pixels.
     """
 
@@ -57,7 +57,7 @@ class FurtherModel:
 def written_model(
     run: Run, posed: Posed, image_set: ImageSet
 ) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
-    """Place the model in the world, and write it with all points."""
+    """Place the model in the world, and write it with the points of all tracks."""
     assert run.positions is not None
     placed = place_stage(run, image_set, posed.last, run.positions)
     tracks = Tracks.concatenate(posed.tracks, posed.links)
@@ -67,14 +67,15 @@ def written_model(
 def further_models(
     run: Run, first: Posed, image_set: ImageSet
 ) -> tuple[tuple[FurtherModel, ...], list[str]]:
-    """Write the models of images that nothing connects with those of the first, in a folder each.
+    """Write the models that are not connected with the first, each in a separate folder.
 
-    The mapper may place an image in several models. It is written in the first of these only:
-    trainers that search the whole output folder would take one model's picture or mask for
-    another's.
+    The mapper may register an image in several models. It is written for the first of these only,
+    because trainers that search the whole output folder would confuse images and masks of different
+    models.
 
     Returns:
-        The models, and the names of the images that are in none, in the order of their frames.
+        The models, and the names of the images that are not registered in any model, in the order
+        of frames.
     """
     placed = read_posed_images(run, first.last, image_set).images
     left = set(image_set.images.names) - {image.name for image in placed}
@@ -126,12 +127,12 @@ def further_models(
 
 
 def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:
-    """The images of some names."""
+    """The images with the given names."""
     return image_set.some([i for i, name in enumerate(image_set.images.names) if name in names])
 
 
 def _run_of_model(run: Run, number: int) -> Run:
-    """What the stages of a further model are given: it has a folder as the first one has."""
+    """The run context of a further model, with a separate output folder."""
     output = run.output / f"{_FOLDER}{number}"
     own = replace(run, output=output, stages=output / run.stages.name)
     try:
@@ -146,13 +147,13 @@ def _run_of_model(run: Run, number: int) -> Run:
 def _poses_of_model(
     run: Run, own: Run, posed: Kept[MappedResult], poses: str
 ) -> Kept[MappedResult]:
-    """Hand the poses of a further model of the mapper to that model's own stages.
+    """Copy the mapped poses of a further model to its own stages.
 
     Args:
-        run: the run that mapped.
-        own: that of the further model, see `_run_of_model`.
-        posed: the stage that mapped.
-        poses: folder of the model among what that stage made.
+        run: the run of the first model, which includes the mapping.
+        own: the run of the further model, see `_run_of_model`.
+        posed: the mapping stage.
+        poses: file of the further model among the products of that stage.
     """
 
     def make(partial: Path) -> MappedResult:
@@ -172,7 +173,7 @@ def _poses_of_model(
 
 
 def _remove_further_models(run: Run, first: int) -> None:
-    """Remove further models, from a number on, that an earlier run made."""
+    """Remove further models of an earlier run, from a number on."""
     for folder in run.output.glob(f"{_FOLDER}*"):
         number = folder.name.removeprefix(_FOLDER)
         if number.isdecimal() and int(number) >= first and (folder / run.stages.name).is_dir():

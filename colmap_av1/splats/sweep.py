@@ -1,8 +1,7 @@
-"""Points where no track is: what a picture shows there is looked for along its rays in others.
+"""Points in image areas without tracks, found by a space sweep in the pictures.
 
-An encoder finds no motion of what is near and passes fast, of thin leaves, or of what only a few
-frames show; such places would be filled as far away as what is around. With poses known the
-pictures tell more.
+Encoders find no motion for close objects that pass fast, for thin leaves, or for objects that only
+a few frames show. Without this step, such areas would be filled at the depth of their surroundings.
 """
 
 from __future__ import annotations
@@ -37,44 +36,48 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Images that are looked at: every so many-th, and at most.
+# Every second image is swept, but at most _MOST_IMAGES, evenly spread.
 _EVERY = 2
 _MOST_IMAGES = 128
-# The pictures that each is compared with, by how many steps they come after it. Steps are as long
-# as makes what is near move by so many pixels of the smaller picture, and at most so many images.
+# Each image is compared with the images at these numbers of steps. The step, in images, is large
+# enough that near points move by _NEAR_MOTION pixels of the reduced picture, up to a limit.
 _OTHERS = (-2, -1, 1, 2)
 _NEAR_MOTION = 8.0
 _LONGEST_STEP = 8
-# What is near is nearer than all but this share of the points; this share of that is tried at most.
+# The near depth of an image is this quantile of the depths of points; the smallest depth that is
+# tried is this share of it.
 _NEAREST = 0.005
 _NEARER = 0.25
 _MOST_POINTS = 20_000
-# Width in pixels of the smaller picture of a square that is looked at, at least.
+# Smallest width, in pixels of the reduced picture, of the squares in which one pixel is swept.
 _LEAST_SQUARE = 4
-# Error in pixels of the smaller picture that a point has at most: where each picture by itself
-# finds it is off by more, the depth that is best in the mean is often wrong.
+# Largest reprojection error of a point in pixels of the reduced picture. If the best positions of
+# the individual pictures deviate more, the common depth is often wrong.
 _MOST_ERROR = 0.25
-# Others of the same image within so many pixels have a depth that differs by at most this factor.
+# A point needs another point of the same image within this distance in pixels, whose depth differs
+# by at most this factor.
 _AROUND = 1.6 * CELL
 _SAME_DEPTH = 1.15
-# Of so many images before and after this share may show what is farther by this factor instead.
+# A point is a floater if more than a share of this many images before and after it show, in the
+# same place, a surface that is farther by this factor.
 _HIDES_IN = 8
 _HIDES = 1.25
 _MAY_HIDE = 0.25
 
 
 class Sweep:
-    """Looks for points in those cells of the images that no point of a track is seen in.
+    """Finds points in the image cells without points of tracks.
 
-    A point is kept where pictures before or after show the same as clearly at no other depth, each
-    by itself at nearly that depth, where one beside it is as far away, and where it hides nothing
-    that tracks show. Pictures are given one by one, and let go as soon as no other needs them.
+    A point is kept if other pictures agree on a unique depth, both together and individually, if a
+    neighbouring point has a similar depth, and if it does not hide points of tracks. Pictures are
+    added one by one, and released as soon as no longer needed.
 
     Args:
         points: points of tracks.
-        views: the images, by the index that observations have.
-        sequence: int32 [num_images] sequence of each image; pictures of one are compared.
-        num_threads: threads that compare; they are there as long as the context.
+        views: the images, which the points' observations refer to.
+        sequence: int32 [num_images] sequence of each image; only pictures of the same sequence are
+            compared.
+        num_threads: number of threads, which run until the context is left.
     """
 
     def __init__(
@@ -104,9 +107,9 @@ class Sweep:
         self._threads.shutdown(cancel_futures=True)
 
     def add(self, image: int, picture: NDArray[np.uint8]) -> None:
-        """Look at the picture of an image, uint8 [height, width, 3] BGR, as its camera says.
+        """Add the picture of an image, uint8 [height, width, 3] BGR, of the view's camera.
 
-        They come in ascending order; those that are missing are not looked at.
+        Pictures must be added in ascending order of images; missing pictures are skipped.
         """
         if image in self._needed:
             self._greys[image] = smaller(picture)
@@ -116,14 +119,14 @@ class Sweep:
         self._greys = {i: grey for i, grey in self._greys.items() if i >= first}
 
     def result(self) -> ModelPoints:
-        """The points, in black; all pictures that there are have been added."""
+        """The points, in black. Call this after all pictures have been added."""
         for key in self._left:
             self._look(key)
         self._left = []
         return joined_points(self._found)
 
     def _look(self, key: int) -> None:
-        """Find the points of an image, where its picture and enough of the others are there."""
+        """Sweep an image, if its picture and enough of the others were added."""
         greys = {i: self._greys[i] for i in (key, *self._others[key]) if i in self._greys}
         if key not in greys or len(greys) <= LEAST_OTHERS:
             return
@@ -140,7 +143,7 @@ class Sweep:
 
 
 def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[_Floats]:
-    """Depth of the nearest point that is seen in each cell of each image; inf where none is."""
+    """Depth of the nearest observed point in each cell of each image; inf without one."""
     owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
     by_image = np.argsort(points.image, kind="stable")
     bounds = np.searchsorted(points.image[by_image], np.arange(len(views) + 1))
@@ -154,7 +157,7 @@ def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list
 
 
 def _near_depth(view: PosedCamera, xyz: _Floats) -> float:
-    """Depth of what is near a camera, in its picture or beside it; inf where nothing is."""
+    """Depth of the nearest points in front of a camera, in its picture or not; inf without any."""
     depth = xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
     depth = depth[depth > 0]
     return float(np.quantile(depth, _NEAREST)) if len(depth) else math.inf
@@ -163,7 +166,7 @@ def _near_depth(view: PosedCamera, xyz: _Floats) -> float:
 def _others(
     key: int, near: float, views: Sequence[PosedCamera], sequence: NDArray[np.int32]
 ) -> list[int]:
-    """The images that one is compared with: of its video, and apart enough to tell depths."""
+    """The images that one is compared with: of the same sequence, with a sufficient baseline."""
 
     def there(steps: int) -> bool:
         return 0 <= key + steps < len(views) and sequence[key + steps] == sequence[key]
@@ -181,10 +184,10 @@ def _others(
 
 
 def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
-    """The cells of an image that no masked pixel is in or beside.
+    """The cells of an image without masked pixels in them or in adjacent cells.
 
-    What a mask leaves out moves, as a rule, and moves by little from one picture to the next: where
-    its edge shows, these agree on a depth that it does not have.
+    Masked objects are mostly dynamic and move little between pictures. At their edges, pictures
+    would agree on a wrong depth.
     """
     from scipy.ndimage import binary_dilation  # noqa: PLC0415 - slow to import
 
@@ -195,7 +198,7 @@ def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
 
 
 def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Floats:
-    """Centres in pixels of the squares of cells that are looked at, four or one in each."""
+    """Centres in pixels of the squares to sweep, four or one in each cell."""
     rows, columns = np.nonzero(cells)
     per_cell = 2 if factor <= CELL // _LEAST_SQUARE // 2 else 1
     xy = squares_of_cells(rows, columns, per_cell)
@@ -204,7 +207,7 @@ def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Float
 
 
 def _is_supported(xy: _Floats, depth: _Floats) -> NDArray[np.bool_]:
-    """Whether another one around has the same depth."""
+    """Whether each point has a nearby point of similar depth."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
 
     supported = np.zeros(len(xy), np.bool_)
@@ -221,7 +224,7 @@ def _hides(
     sequence: NDArray[np.int32],
     observed: Sequence[_Floats],
 ) -> NDArray[np.bool_]:
-    """Whether points would hide what tracks show in the images before and after."""
+    """Whether points would hide points of tracks in the images before and after."""
     xyz = swept.xyz(views[swept.image])
     hides, seen = np.zeros(len(xyz)), np.zeros(len(xyz))
     first, last = swept.image - _HIDES_IN, swept.image + _HIDES_IN
@@ -237,7 +240,7 @@ def _hides(
 
 
 def _as_points(swept: Swept, views: Sequence[PosedCamera]) -> ModelPoints:
-    """The points with their observations, in black."""
+    """Convert points to model points with observations, in black."""
     xyz = swept.xyz(views[swept.image])
     all_seen = np.concatenate([swept.xy[None], swept.seen])
     images = np.array([swept.image, *swept.others])
@@ -246,7 +249,7 @@ def _as_points(swept: Swept, views: Sequence[PosedCamera]) -> ModelPoints:
         pose = views[image].cam_from_world
         expected = views[image].camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3])
         apart[row] = np.linalg.norm(all_seen[row] - np.reshape(expected, (-1, 2)), axis=1)
-    # By points, and within these by images.
+    # Ordered by point, then by image.
     rows = np.argsort(images)
     sees = np.isfinite(apart[rows]).T
     error = np.nansum(apart, axis=0) / sees.sum(axis=1)

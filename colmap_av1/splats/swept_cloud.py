@@ -1,4 +1,4 @@
-"""The cloud that trainers start from, of tracks and of what pictures show beside these."""
+"""The point cloud for splatting, from tracks and from a sweep of the pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_av1.splats.sweep import Sweep
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.progress import Clock
 
-# Takes the picture of an image, by its index, see `Sweep.add`.
+# Accepts the index and the picture of an image, see `Sweep.add`.
 Look = Callable[[int, NDArray[np.uint8]], None]
 
 
@@ -28,16 +28,16 @@ def swept_cloud(
     num_threads: int | None,
     clock: Clock,
 ) -> ModelPoints:
-    """The points that a trainer needs, in black; see `Sweep` and `splat_cloud`.
+    """The point cloud for splatting, in black; see `Sweep` and `splat_cloud`.
 
     Args:
         tracked: points of tracks.
-        views: the images, by the index that observations have.
-        sequence: int32 [num_images] the video of each.
-        show: gives the pictures of videos to what looks at them, in their order.
-        max_points: points at most; None: any number.
+        views: the images, which the points' observations refer to.
+        sequence: int32 [num_images] sequence of each image.
+        show: calls its argument with the pictures of videos, in their order.
+        max_points: largest number of points; None: no limit.
         num_threads: see `RunOptions`.
-        clock: measures the stages "sweep", but for what `show` measures itself, and "cloud".
+        clock: measures the stages "sweep" and "cloud"; time within `show` is not included.
     """
     with Sweep(tracked, views, sequence, num_threads=threads_or_cpus(num_threads)) as sweep:
         show(sweep.add)

@@ -1,4 +1,4 @@
-"""The clips that benchmarks measure on: their videos, known cameras and reference models."""
+"""Clips of the benchmarks: videos, known cameras and reference models."""
 
 from __future__ import annotations
 
@@ -35,11 +35,10 @@ from colmap_av1.util.stages import run_stage_in
 EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
-# Matches of SIFT between images that lie far apart, held against the poses; not part of this
-# project.
+# External tool that compares SIFT matches between images far apart with the poses.
 FAR_VIEWS = SEQUENCES.parent / "tools" / "loop_consistency.py"
 FAR = 10
-# As `colmap-av1 encode --encoder libaom --speed 6` does, so that figures stay comparable.
+# The settings of `colmap-av1 encode --encoder libaom --speed 6`.
 ENCODING = (
     "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -crf 20 -b:v 0 -g 9999 "
     "-pix_fmt yuv420p -an"
@@ -50,7 +49,7 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A sequence and how it is used; `image_step` as `every` in ImageOptions."""
+    """A sequence and its settings; `image_step` is `every` of ImageOptions."""
 
     name: str
     image_step: int = 1
@@ -70,10 +69,10 @@ CASES = (
 
 @dataclass(frozen=True)
 class Material:
-    """What a case is measured on.
+    """The video and the ground truth of a case.
 
-    `transfer` is the rendered clip's exact ground truth; `source` is ffmpeg's input of the pictures
-    the video was made from, where these are not rendered.
+    `transfer` is the ground-truth correspondence of the rendered clip; `source` are ffmpeg's input
+    options for the original pictures of a sequence that is not rendered.
     """
 
     video: Path
@@ -85,13 +84,13 @@ class Material:
 
     @property
     def intrinsics(self) -> CameraOptions:
-        """The camera where it is known; no camera options where it is not."""
+        """Options for the known camera, or default options if it is unknown."""
         return CameraOptions() if self.camera is None else camera_options(self.camera)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The ground truth of epipolar errors and of poses, and a description of both."""
+    """Ground truth for epipolar errors and for poses, and a description."""
 
     geometry: tuple[Poses, Any] | None
     poses: Poses | None
@@ -99,13 +98,13 @@ class Truth:
 
 
 def camera_options(camera: Any) -> CameraOptions:
-    """The options for a known camera of pycolmap."""
+    """The options for a known pycolmap.Camera."""
     params = ",".join(map(str, camera.params))
     return CameraOptions(camera_model=camera.model.name, camera_params=params)
 
 
 def is_there(name: str) -> bool:
-    """Whether a clip can be measured here; sequences may be absent, the rendered clip is not."""
+    """Whether a clip is available: the rendered clip always, sequences only with ../shared."""
     return name == "scene" or (SEQUENCES / name).is_dir()
 
 
@@ -140,7 +139,7 @@ def rendered_clip() -> Material:
 
 
 def real_sequence(case: Case, folder: Path, console: Console) -> Material:
-    """A sequence of ../shared, encoded as AV1."""
+    """A sequence of ../shared, encoded as AV1 in `folder`."""
     sequence = read_sequence(SEQUENCES / case.name)
     source = sequence.source
     words = ffmpeg_input(source, sequence.fps)
@@ -160,7 +159,7 @@ def real_sequence(case: Case, folder: Path, console: Console) -> Material:
 
 
 def material_of(case: Case, folder: Path, console: Console) -> Material:
-    """The rendered clip, or a sequence that `folder` keeps encoded."""
+    """The rendered clip, or a sequence whose encoded video is kept in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     return rendered_clip() if case.name == "scene" else real_sequence(case, folder, console)
 
@@ -168,7 +167,7 @@ def material_of(case: Case, folder: Path, console: Console) -> Material:
 def footage_of(
     case: Case, material: Material, folder: Path, camera: CameraOptions | None = None
 ) -> Footage:
-    """The images that all front-ends get; `camera` where it is not that of the material."""
+    """The images that all front-ends get, with the material's camera unless `camera` is given."""
     return prepare_footage(
         material.video,
         folder / "footage",
@@ -179,12 +178,12 @@ def footage_of(
 
 
 def mapper_options(case: Case, material: Material) -> MapOptions:
-    """How the mapper treats the case: known intrinsics are kept."""
+    """Options of the mapper, which keeps known intrinsics fixed."""
     return MapOptions(refine_intrinsics=material.camera is None, forward_motion=case.forward_motion)
 
 
 def ffmpeg_input(source: Path, fps: float) -> tuple[str, ...]:
-    """How ffmpeg opens a clip, or a folder of images with consecutive numbers as names."""
+    """Input options of ffmpeg for a clip, or for images named by consecutive numbers."""
     if not source.is_dir():
         return ("-i", str(source))
     first = min(source.iterdir())
@@ -199,7 +198,7 @@ def ffmpeg(*words: str) -> None:
 
 
 def as_shot(sequence: Sequence, folder: Path) -> Path:
-    """The clip as it was shot, or its frames as H.264 of such a rate that nothing is lost."""
+    """The original video of a sequence, or its frames as nearly lossless H.264."""
     if sequence.source.is_file():
         return sequence.source
     video = folder / "video.mp4"
@@ -215,27 +214,27 @@ def as_shot(sequence: Sequence, folder: Path) -> Path:
 
 
 def far_views(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
-    """How well views far apart agree with a model's poses: the columns of a row.
+    """Long-range epipolar error of a model: columns of a row.
 
     Args:
-        model: folder of a model with straight lines.
+        model: folder of a model without distortion.
         images: folder of its images.
-        apart: images that lie between those of a pair at least.
+        apart: smallest number of images between the images of a pair.
 
     Returns:
-        Median and 90 % quantile over pairs of images in pixels; nothing where the program that
+        Median and 90th percentile over pairs of images in pixels; empty if the program that
         measures it is absent.
     """
     if not FAR_VIEWS.is_file():
         return {}
     command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(apart)]
-    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
-    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", said)
+    printed = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    found = re.search(r"median ([\d.]+), 90% ([\d.]+)", printed)
     return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
 
 
 def known_truth(material: Material) -> Truth:
-    """What is truly known of the cameras."""
+    """The known ground truth of the cameras."""
     if material.poses is None:
         return Truth(None, None, "no poses known")
     if material.camera is None:
@@ -244,7 +243,7 @@ def known_truth(material: Material) -> Truth:
 
 
 def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
-    """The same, with the reference's model for what is not known."""
+    """The ground truth, completed by the reference model."""
     poses = model_poses(model, num_frames)
     geometry = (poses, next(iter(model.cameras.values())))
     if truth.poses is None:
@@ -253,21 +252,21 @@ def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
 
 
 def reference_model(footage: Footage, folder: Path, settings: MapOptions, console: Console) -> Any:
-    """The model that stands for the ground truth where that is not known."""
+    """The model that replaces unknown ground truth."""
     console.print(f"{folder.name}: {REFERENCE} as the reference", markup=False)
     run = run_frontend(REFERENCE, footage, folder / REFERENCE)
     where = folder / f"{REFERENCE}-model"
     mapper = measure_mapper(run.database, footage.image_path, where, settings)
     if mapper.model is None:
-        raise ColmapAv1Error(f"{REFERENCE} makes no model, so there is no reference: see {where}")
+        raise ColmapAv1Error(f"{REFERENCE} gives no model, so there is no reference: see {where}")
     return read_model(mapper.model)
 
 
 def median(values: NDArray[np.float64]) -> float:
-    """The median; NaN where there is nothing."""
+    """The median; NaN without values."""
     return quantile(values, 0.5)
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile; NaN where there is nothing."""
+    """A quantile; NaN without values."""
     return float(np.quantile(values, share)) if len(values) else float("nan")

@@ -1,11 +1,11 @@
-"""Measure the points of a dense model: how many, and how far their depths are from the truth.
+"""Measure the number of points of dense models and the errors of their depths.
 
 python examples/benchmarks/dense_points.py
 python examples/benchmarks/dense_points.py --model sift_model --video OUT.mp4
 
-Without arguments the rendered clip is densified on its true poses, and its surfaces are the truth.
-Else it is the points of the model that lie near others in an image: not many, but from another
-front-end. Each row adds to the one before an option that gives more or more accurate points.
+Without arguments, the rendered clip is densified on its true poses, and its surfaces are the ground
+truth. With arguments, depths are compared with nearby points of the given model: few points, but
+from another front-end. Each row adds an option that gives more or more accurate points.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from colmap_av1.options import TriangulateOptions
 
 @dataclass(frozen=True)
 class Tracking:
-    """Options that points come from."""
+    """A row of the table: options of tracks and points."""
 
     name: str
     tracks: TrackOptions
@@ -49,11 +49,11 @@ TRACKINGS = (
 
 
 def main() -> int:
-    """Densify with all options and print a table."""
+    """Densify with each set of options, and print a table."""
     parser = argparse.ArgumentParser(description="Measure the points of dense models.")
     parser.add_argument("--model", type=Path, help="COLMAP model of the video's frames")
     parser.add_argument("--video", type=Path, help="AV1 video")
-    parser.add_argument("--name", help="name of the clip; without, that of the video")
+    parser.add_argument("--name", help="name of the clip [name of the video]")
     add_results(parser, "dense_points")
     arguments = parser.parse_args()
     if (arguments.model is None) != (arguments.video is None):
@@ -91,12 +91,12 @@ def main() -> int:
 
 
 def make(model: Path, video: Path, output: Path, options: DensifyOptions) -> None:
-    """Densify, in a process of its own."""
+    """Densify; called in a separate process."""
     densify(model, video, output, options=options)
 
 
 def figures(dense: Any, off: NDArray[np.float64], given: int | None) -> dict[str, Value]:
-    """Figures of a model, the relative errors of its depths, the given model's number of points."""
+    """Figures of a model, given the relative errors of its depths."""
     checked = off[np.isfinite(off)]
     return {
         "points": dense.num_points3D(),
@@ -111,7 +111,7 @@ def figures(dense: Any, off: NDArray[np.float64], given: int | None) -> dict[str
 
 
 def surface_errors(dense: Any, script: Any, scene: Any) -> NDArray[np.float64]:
-    """Distances of points to the nearest surface, as shares of those from the first camera."""
+    """Distances of points to the nearest surface, relative to those from the first camera."""
     xyz = point_cloud(dense)
     first = [
         min(e.image_id for e in dense.points3D[i].track.elements) for i in sorted(dense.points3D)
@@ -122,7 +122,7 @@ def surface_errors(dense: Any, script: Any, scene: Any) -> NDArray[np.float64]:
 
 
 def true_model(scene: Any, folder: Path) -> Path:
-    """A model without points that has the rendered clip's poses."""
+    """A model with the true poses of the rendered clip, without points."""
     folder.mkdir()
     size = {"width": scene.width, "height": scene.height}
     params = [scene.fx, scene.fy, scene.cx, scene.cy]

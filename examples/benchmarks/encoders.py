@@ -1,10 +1,10 @@
-"""Measure what encoders, their speeds and qualities are worth for the model at the end.
+"""Measure the effect of encoders, speeds and qualities on the tracks and the model.
 
 python examples/benchmarks/encoders.py --cache benchmark_encoders
 
-Each clip is converted with each setting; the tracks of the stream are counted and, where cameras
-are known, measured against them; `reconstruct` makes a model of the stream's motion and the clip's
-own pictures. Hardware encoders are measured where they work.
+Each clip is converted with each setting. The tracks of the stream are counted and, if cameras are
+known, compared with them; `reconstruct` creates a model from the motion of the stream and the
+original pictures of the clip. Hardware encoders are measured if available.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ SETTINGS = (
     EncodeOptions("libaom", 32, 8),
     *(EncodeOptions("svt", 20, speed) for speed in (8, 10, 12)),
 )
-# Every n-th frame is an image.
+# Every n-th frame is an image, by clip.
 CLIPS = {
     "log_building": 1,
     "ditch": 1,
@@ -63,11 +63,11 @@ CLIPS = {
 
 @dataclass(frozen=True)
 class Row:
-    """What one setting gives on one clip; empty where it is not known.
+    """Figures of one setting on one clip; None if unknown.
 
-    CPU seconds are those of ffmpeg for a megapixel of one frame, decoding of the source included;
-    tracks those of so many frames and more; epipolar errors medians in pixels after so many frames;
-    far views medians in pixels over pairs of images, see `clips.far_views`.
+    CPU seconds are those of ffmpeg for each megapixel of a frame, including decoding the source.
+    Tracks are counted from a length in frames on. Epipolar errors are medians in pixels after a
+    number of frames. Long-range epipolar errors are described at `clips.far_views`.
     """
 
     clip: str
@@ -93,11 +93,11 @@ class Row:
 def main() -> int:
     """Measure every setting on every clip, and keep and print the tables."""
     parser = argparse.ArgumentParser(
-        description="Measure what encoders are worth for the model at the end.",
+        description="Measure the effect of encoders on the tracks and the model.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
-        "--cache", type=Path, help="folder that keeps all results; without, a temporary one"
+        "--cache", type=Path, help="folder that keeps all results [a temporary one]"
     )
     parser.add_argument("--clips", nargs="+", choices=CLIPS, default=list(CLIPS), metavar="NAME")
     names = [name_of(setting) for setting in SETTINGS]
@@ -126,12 +126,12 @@ def main() -> int:
 
 
 def name_of(setting: EncodeOptions) -> str:
-    """How a setting is called on the command line."""
+    """Name of a setting, by its command-line options."""
     return f"{setting.encoder}-{setting.speed}-{setting.quality}"
 
 
 def works(setting: EncodeOptions) -> bool:
-    """Whether an encoder works here."""
+    """Whether an encoder works on this machine."""
     try:
         find_encoder(setting)
     except EncodeError:
@@ -140,7 +140,7 @@ def works(setting: EncodeOptions) -> bool:
 
 
 def measure(clip: str, folder: Path, setting: EncodeOptions) -> Row:
-    """Convert a clip with a setting and make a model of it."""
+    """Convert a clip with a setting, and reconstruct it."""
     sequence = read_sequence(ruler.SEQUENCES / clip)
     source = ruler.as_shot(sequence, folder / "source")
     where = folder / name_of(setting)
@@ -186,7 +186,7 @@ def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path,
 def modelled(
     sequence: Sequence, source: Path, stream: Path, folder: Path, setting: EncodeOptions
 ) -> dict[str, Any]:
-    """The figures of the model, those of Row; none where there is no model."""
+    """Fields of Row for the model; empty without a model."""
     camera = CameraOptions()
     if sequence.camera is not None:
         params = ",".join(map(str, sequence.camera.params))
@@ -219,7 +219,7 @@ def modelled(
 
 
 def reconstructed(source: Path, output: Path, options: ReconstructOptions) -> dict[str, Any]:
-    """Make a model, in a process that is measured."""
+    """Reconstruct; called in a separate process."""
     report = reconstruct(source, output, options=options)
     return {
         "registered": report.num_registered,

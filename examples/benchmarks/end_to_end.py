@@ -1,13 +1,13 @@
-"""Measure each way from a video to a database and to a dense model, beside SIFT.
+"""Measure the ways from an AV1 video to a database and to a dense model, compared with SIFT.
 
 python examples/benchmarks/end_to_end.py --cache benchmark_end_to_end
 
-In turn, for each sequence and round: `reconstruct` makes the folder that trainers open from the
-AV1 stream; pycolmap extracts SIFT, matches sequentially and maps the same frames; `match` fills a
-database with the default preset and the same mapper maps that; `densify` puts the tracks on the
-poses of SIFT's model. Every step has a process of its own; medians over the rounds, and their
-ratios to SIFT's. Poses are compared with the ground truth, where none is known with SIFT's
-exhaustive model.
+For each sequence and round: `reconstruct` creates the folder for trainers from the AV1 stream;
+pycolmap extracts SIFT features, matches sequentially and maps the same frames; `match` fills a
+database with the default preset, which the same mapper maps; `densify` triangulates tracks on the
+poses of SIFT's model. Every step runs in a separate process. The table has medians over the rounds,
+and their ratios to SIFT. Poses are compared with the ground truth if known, else with the model
+from SIFT with exhaustive matching.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ from colmap_av1.evaluate import (
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import TriangulateOptions
 
-# All points of accurate depth, as other programs count theirs.
+# Only points with accurate depth, for a fair comparison of numbers of points.
 SURVEY = TriangulateOptions(points="survey")
-# The ways, in the order of the table.
+# The steps, in the order of the table.
 WAYS = (
     render.SIFT_DATABASE,
     render.SIFT_MAPPER,
@@ -73,14 +73,14 @@ WAYS = (
 
 @dataclass(frozen=True)
 class Step:
-    """What a step took: wall and CPU seconds, peak memory in bytes."""
+    """Cost of a step: wall and CPU seconds, peak memory in bytes."""
 
     seconds: float
     cpu_seconds: float
     peak_memory: int
 
     def __add__(self, other: Step) -> Step:
-        """This step and then another one."""
+        """The cost of both steps, one after the other."""
         return Step(
             self.seconds + other.seconds,
             self.cpu_seconds + other.cpu_seconds,
@@ -90,7 +90,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Figures:
-    """What one way took in one round and, where it ends with a model, what came out."""
+    """Cost of one way in one round and, if it gives a model, figures of the model."""
 
     seconds: float
     cpu_seconds: float
@@ -176,17 +176,17 @@ def measure_case(
 
 
 def step_of(run: Measured | MapperRun) -> Step:
-    """What a process took."""
+    """Cost of a measured process."""
     return Step(run.seconds, run.cpu_seconds, run.peak_memory or 0)
 
 
 def step_of_frontend(run: FrontendRun) -> Step:
-    """What a front-end took; its process does nothing but its stages."""
+    """Cost of a front-end, whose process runs only its stages."""
     return Step(sum(run.seconds.values()), run.cpu_seconds, run.peak_memory or 0)
 
 
 def run_reconstruct(footage: Footage, case: Case, output: Path) -> None:
-    """From the stream to the dense model, as the command line does it."""
+    """Reconstruct a dense model from the stream, like the command."""
     options = MatchOptions(camera=footage.camera, images=ImageOptions(every=case.image_step))
     reconstruct(
         footage.video, output, options=ReconstructOptions(match=options, triangulate=SURVEY)
@@ -194,13 +194,13 @@ def run_reconstruct(footage: Footage, case: Case, output: Path) -> None:
 
 
 def run_densify(model: Path, footage: Footage, case: Case, output: Path) -> None:
-    """Tracks on the poses of a model."""
+    """Triangulate all tracks on the poses of a model."""
     options = MatchOptions(images=ImageOptions(first_number=0))
     densify(model, footage.video, output, options=DensifyOptions(match=options, triangulate=SURVEY))
 
 
 def figures(step: Step, model: Path | None, material: Material, truth: Truth) -> Figures:
-    """What a way took, and the figures of its model."""
+    """Cost of a way and figures of its model."""
     taken = (step.seconds, step.cpu_seconds, step.peak_memory)
     if model is None:
         return Figures(*taken)
@@ -219,7 +219,7 @@ def figures(step: Step, model: Path | None, material: Material, truth: Truth) ->
 
 
 def medians(name: str, measured: dict[str, list[Figures]]) -> list[dict[str, Value]]:
-    """Medians over the rounds, a row for each way."""
+    """Medians over the rounds, one row for each way."""
 
     def median(values: list[float | None]) -> float | None:
         known = [value for value in values if value is not None]

@@ -1,12 +1,12 @@
-"""Fit the expected errors of motion and of matches to clips with known cameras.
+"""Fit the model of expected errors of motion and matches to clips with known cameras.
 
 python examples/benchmarks/fit_trust.py --fit street=street.mp4:street_model \
     ditch=ditch.mp4:ditch_model --hold_out log=log_building.mp4:log_model
 
-The rendered clip counts with its exact truth, the others against the epipolar geometry of a COLMAP
-model, which may come from any other matches. Prints the constants of `csrc/tracks/trust.cc` and
-`refine.py`, and how large the errors are beside the expected ones: of the clips fitted to, and of
-those held out.
+The rendered clip has exact ground truth; the others are compared with the epipolar geometry of a
+COLMAP model, which may come from any other matches. The script prints the constants of
+`csrc/tracks/trust.cc` and `refine.py`, and compares expected with actual errors, both on the
+training clips and on the held-out clips.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from colmap_av1.evaluate import model_poses
 from colmap_av1.tracks.refine import match_tracks
 from colmap_av1.video.decoding import decode_frames
 
-SAMPLES = 40_000  # of each clip
-# Larger errors, in pixels, are wrong matches, whatever their size.
+SAMPLES = 40_000  # Number of samples of each clip.
+# Larger errors in pixels are wrong matches and are clipped to this value.
 LARGEST_ERROR = {"steps": 3.0, "matches": 4.0}
 NEW_VECTOR = (16, 24)  # NEWMV, NEW_NEWMV
-# By MiSize, in pixels (AV1 specification, 9.3)
+# Block sizes in pixels by MiSize (AV1 specification, section 9.3)
 BLOCK_WIDTH = np.array(
     [4, 4, 8, 8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64, 128, 128, 4, 16, 8, 32, 16, 64]
 )
@@ -42,13 +42,13 @@ BLOCK_HEIGHT = np.array(
 )
 
 Floats = NDArray[np.float64]
-# Errors [n] or [n, 2] in pixels of positions against those that other observations lead to.
+# Returns the errors [n] or [n, 2] in pixels between positions and their ground truth.
 Errors = Callable[[Tracks, NDArray[np.int64], NDArray[np.int64]], Floats]
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A video and its truth; clips of one truth share what that is wrong by."""
+    """A video and its ground truth; clips with the same ground truth share its error."""
 
     name: str
     video: Path
@@ -58,7 +58,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Samples:
-    """What could predict errors [n, number of traits], and the errors [n, 1 or 2]."""
+    """Features that may predict errors, [n, number of features], and the errors [n, 1 or 2]."""
 
     clip: Clip
     traits: Floats
@@ -67,7 +67,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Fit:
-    """Logarithm of the variance by traits, and the variance of each truth itself."""
+    """Coefficients of the logarithm of the variance, and the variance of each ground truth."""
 
     slopes: Floats
     truths: dict[str, float]
@@ -81,7 +81,7 @@ MATCH_TRAITS = ("_MATCH_CONSTANT", "_MATCH_NOISE", "_MATCH_PRIOR")
 
 
 def main() -> int:
-    """Fit both models and print them with what they are worth."""
+    """Fit both models, and print their coefficients and calibration."""
     parser = argparse.ArgumentParser(description="Fit the expected errors of tracks.")
     clip = "NAME=VIDEO:MODEL"
     parser.add_argument("--fit", nargs="*", default=[], metavar=clip, help="clips to fit to")
@@ -107,8 +107,8 @@ def main() -> int:
         for name, slope in zip(names, fit.slopes, strict=True):
             print(f"  {name} = {slope:.2f}")
         for truth, variance in fit.truths.items():
-            print(f"  the truth of {truth} is wrong by {np.sqrt(variance):.2f} px")
-        print("  expected / actual error in px, by eighths of the expected one:")
+            print(f"  error of the ground truth of {truth}: {np.sqrt(variance):.2f} px")
+        print("  expected / actual error in px, in 8 groups by expected error:")
         for number, sample in enumerate(bounded):
             label = "" if number < len(fitted) else ", held out"
             print(f"  {sample.clip.name}{label}: {calibration(fit, sample)}")
@@ -116,7 +116,7 @@ def main() -> int:
 
 
 def rendered_clip() -> Clip:
-    """The example clip, of which every point's true path is known."""
+    """The example clip, with exact ground truth."""
     render_scene = load_render_scene()
     scene = render_scene.build_scene()
 
@@ -132,7 +132,7 @@ def rendered_clip() -> Clip:
 
 
 def real_clip(words: str) -> Clip:
-    """A clip of which a model knows the cameras: errors across the epipolar lines."""
+    """A clip with a COLMAP model: errors perpendicular to the epipolar lines."""
     name, _, files = words.partition("=")
     video, _, folder = files.rpartition(":")
     if not name or not video or not folder:
@@ -160,7 +160,7 @@ def real_clip(words: str) -> Clip:
 def by_frames(
     tracks: Tracks, source: NDArray[np.int64], target: NDArray[np.int64]
 ) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """The rows of each pair of frames."""
+    """The indices of the samples of each pair of frames."""
     key = tracks.frame[source].astype(np.int64) * tracks.num_frames + tracks.frame[target]
     order = np.argsort(key, kind="stable")
     values, first = np.unique(key[order], return_index=True)
@@ -177,13 +177,13 @@ def rays(camera: Any, xy: NDArray[np.float32]) -> Floats:
 
 
 def draw(count: int) -> NDArray[np.int64]:
-    """Some of `count` rows."""
+    """A random sample of `count` rows."""
     rows = np.random.default_rng(0).permutation(count)[:SAMPLES]
     return np.asarray(np.sort(rows), np.int64)
 
 
 def step_samples(clip: Clip, tracks: Tracks, motion: list[FrameMotion]) -> Samples:
-    """Steps to the frame before, by what the bitstream says of the unit that made them."""
+    """Steps to the previous frame, with features of their units in the bitstream."""
     first = np.zeros(tracks.num_observations, bool)
     first[tracks.offsets[:-1]] = True
     later = np.flatnonzero(~first)
@@ -203,7 +203,7 @@ def step_samples(clip: Clip, tracks: Tracks, motion: list[FrameMotion]) -> Sampl
 
 
 def unit_traits(frame: FrameMotion) -> Floats:
-    """[mi_rows, mi_cols, traits] of the displacement into the frame before; NaN without one."""
+    """[mi_rows, mi_cols, features] of the displacement to the previous frame; NaN without one."""
     width, height = BLOCK_WIDTH[frame.mi_size], BLOCK_HEIGHT[frame.mi_size]
     rows, cols = np.mgrid[: width.shape[0], : width.shape[1]]
     block = (rows // (height // 4) * (height // 4)) * width.shape[1]
@@ -212,7 +212,7 @@ def unit_traits(frame: FrameMotion) -> Floats:
     interval = frame.ref_display_index[np.maximum(frame.ref_frame[..., 0], 0)]
     interval = np.where(frame.ref_frame[..., 0] > 0, interval - frame.display_index, 0)
 
-    # The units around a block, each held against the unit of the block that it touches.
+    # Compare each unit next to a block with the adjacent unit of the block.
     total, count = np.zeros(block.size), np.zeros(block.size)
     for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         row, col = rows + down, cols + right
@@ -244,7 +244,7 @@ def unit_traits(frame: FrameMotion) -> Floats:
 
 
 def match_samples(clip: Clip, tracks: Tracks) -> Samples:
-    """Matches of decoded pictures, by how well these fit and by the bitstream's own error."""
+    """Matches of decoded pictures, with their residual and the bitstream's error as features."""
     refined = match_tracks(tracks, decode_frames(clip.video), RefineOptions(refine="lk"))
     target = np.flatnonzero(refined.source >= 0)
     target = target[draw(len(target))]
@@ -266,19 +266,19 @@ def match_samples(clip: Clip, tracks: Tracks) -> Samples:
 
 
 def known(samples: Samples) -> Samples:
-    """Those with a truth and all traits."""
+    """The samples with ground truth and all features."""
     rows = np.isfinite(samples.errors).all(axis=1) & np.isfinite(samples.traits).all(axis=1)
     return Samples(samples.clip, samples.traits[rows], samples.errors[rows])
 
 
 def clipped(samples: Samples, largest: float) -> Samples:
-    """The same with no error larger than `largest`."""
+    """The samples with errors clipped to `largest`."""
     errors = np.clip(samples.errors, -largest, largest)
     return Samples(samples.clip, samples.traits, errors)
 
 
 def fit_variance(samples: list[Samples]) -> Fit:
-    """Fit the variance of normal errors; every clip has the same weight."""
+    """Fit the variance of normally distributed errors, with the same weight for every clip."""
     truths = sorted({s.clip.truth for s in samples if s.clip.truth is not None})
     axes = [s.errors.shape[1] for s in samples]
     traits = np.concatenate([np.repeat(s.traits, n, 0) for s, n in zip(samples, axes, strict=True)])
@@ -310,7 +310,7 @@ def fit_variance(samples: list[Samples]) -> Fit:
 
 
 def calibration(fit: Fit, samples: Samples, parts: int = 8) -> str:
-    """Expected and actual error in equal parts, surest first."""
+    """Expected and actual error in groups of equal size, smallest expected error first."""
     expected = np.exp(samples.traits @ fit.slopes)
     square = (samples.errors**2).mean(axis=1)
     return " ".join(

@@ -1,13 +1,14 @@
-"""Leave out frames where the camera then jerks, and measure whether models stay straight.
+"""Simulate jerks of the camera by removing frames, and measure whether models stay accurate.
 
 python examples/benchmarks/jerks.py --cache benchmark_jerks --places 50
 
-Each place is a clip of its own: up to three gaps are cut into a sequence, at each of which 60 to
-200 px and at most 12 degrees lie between two frames; in every second clip the frames on either side
-are blurred along the motion. `reconstruct` maps the clip as it does any, and `match` fills a
-database that COLMAP's mapper maps. Camera centres are compared with those of the whole
-sequence: the true ones, or those of SIFT's model of it. A model is bent whose centres are off by
-more than half a per cent of their extent; what is said of it, and images left out, are counted.
+Each place is a separate clip: up to three gaps are cut into a sequence, each with a motion of 60 to
+200 px and at most 12 degrees between two frames. In every second clip, the frames on either side
+are blurred along the motion. `reconstruct` maps the clip with its defaults, and `match` fills a
+database for COLMAP's mapper. Camera centres are compared with the ground truth of the whole
+sequence, or with SIFT's model of it. A model is bent if its centres have an error of more than 0.5
+% of their extent. The table counts bent models, whether a warning reports them, and images that are
+not registered.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.video.decoding import decode_frames
 
-# A rendered clip, its pictures at half their size, among sequences of ../shared.
+# The rendered clip at half size; all other clips are sequences of ../shared.
 RENDERED = "orbit"
 RENDERED_SECONDS = 4
 SEQUENCES = ("log_building", "ditch", "street", "holiday_display", RENDERED)
@@ -62,12 +63,12 @@ WAYS = ("reconstruct", "match, mapper")
 PIXELS = (60.0, 200.0)
 DEGREES = 12.0
 MOST_GAPS = 3
-# Frames that stay at either end and between two gaps: a model of each part can be made.
+# Number of frames kept at either end and between two gaps, so that each part can be mapped.
 ROOM = 10
-# Lengths in pixels of the blur, of every second clip.
+# Lengths in pixels of the motion blur in every second clip.
 BLURS = (9, 17, 25)
 EVERY_FRAME = ImageOptions(every=1)
-# Points of an image that say how far the picture moves.
+# Smallest number of points of an image that determine the motion of the picture.
 POINTS = 3000
 
 Image = NDArray[np.uint8]
@@ -75,15 +76,16 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Whole:
-    """A sequence as it is.
+    """A complete sequence.
 
     Attributes:
-        name: its name.
-        pictures: its frames.
-        camera: what is known of its camera.
+        name: name of the sequence.
+        pictures: all frames.
+        camera: options for the known camera.
         forward_motion: see `MapOptions`.
-        model: SIFT's model of it, of the rendered clip ours, by which places are chosen.
-        poses: float64 [num_frames, 3, 4] true poses, or SIFT's model's; NaN where there is none.
+        model: model that the places are chosen by, from SIFT, or from `reconstruct` for the
+            rendered clip.
+        poses: float64 [num_frames, 3, 4] true poses, or those of SIFT's model; NaN where unknown.
     """
 
     name: str
@@ -96,13 +98,13 @@ class Whole:
 
 @dataclass(frozen=True)
 class Gap:
-    """Frames that are left out between two others.
+    """Removed frames between two others.
 
     Attributes:
-        before: the last frame before them.
-        after: the first frame after them.
-        pixels: how far the picture moves between these, by the median of the points.
-        degrees: how far the camera turns.
+        before: the last frame before the gap.
+        after: the first frame after the gap.
+        pixels: motion of the picture across the gap, the median over points.
+        degrees: rotation of the camera across the gap.
     """
 
     before: int
@@ -116,7 +118,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Row:
-    """What one way made of one clip; `ate` in per cent of the extent, None without a model."""
+    """Result of one way on one clip; `ate` is in per cent of the extent, None without a model."""
 
     place: int
     sequence: str
@@ -132,13 +134,13 @@ class Row:
 
 
 def main() -> int:
-    """Try the places, and keep and print the table."""
+    """Measure the places, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cache", type=Path, required=True, help="folder for models and clips")
-    parser.add_argument("--places", type=int, default=50, help="how many are tried")
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--places", type=int, default=50, help="number of places")
+    parser.add_argument("--first", type=int, default=0, help="number of the first place")
     parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     add_results(parser, "jerks")
@@ -147,7 +149,7 @@ def main() -> int:
     cache = arguments.cache.resolve()
     whole: Whole | None = None
     places = range(arguments.first, arguments.first + arguments.places)
-    # By sequence, so that the pictures of one are held at a time.
+    # Ordered by sequence, so that only the pictures of one are in memory.
     for place in sorted(places, key=lambda place: (place % len(SEQUENCES), place)):
         name = SEQUENCES[place % len(SEQUENCES)]
         if name not in arguments.sequences or not (name == RENDERED or ruler.is_there(name)):
@@ -161,7 +163,7 @@ def main() -> int:
 
 
 def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
-    """A clip with a model of it, and what models are held to."""
+    """A complete sequence with a model and reference poses."""
     if name == RENDERED:
         return whole_orbit(folder, console)
     sequence = read_sequence(ruler.SEQUENCES / name)
@@ -181,7 +183,7 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
     settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
     mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
     if mapped.model is None:
-        raise ColmapAv1Error(f"{name}: SIFT makes no model: see {folder / 'model'}")
+        raise ColmapAv1Error(f"{name}: SIFT gives no model: see {folder / 'model'}")
     model = read_model(mapped.model)
     poses = sequence.cam_from_world
     if poses is None:
@@ -191,7 +193,7 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
 
 
 def whole_orbit(folder: Path, console: Console) -> Whole:
-    """The rendered clip, with the model that `reconstruct` makes of it."""
+    """The rendered clip, with a model from `reconstruct`."""
     full = phone_clip.phone_clip(folder / "clips", RENDERED_SECONDS)
     pictures = [
         np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -210,7 +212,7 @@ def whole_orbit(folder: Path, console: Console) -> Whole:
 def try_place(
     whole: Whole, place: int, ways: Sequence[str], folder: Path, console: Console
 ) -> list[Row]:
-    """A clip with gaps by some ways."""
+    """Rows of a clip with gaps, one for each way."""
     rng = np.random.default_rng(place)
     gaps = gaps_of(whole, rng)
     blur = int(rng.choice(BLURS)) if place % 2 else 0
@@ -250,7 +252,7 @@ def try_place(
 
 
 def gaps_of(whole: Whole, rng: np.random.Generator) -> list[Gap]:
-    """One to three gaps with room between them, in the order of their frames."""
+    """One to three gaps with enough frames between them, in the order of frames."""
     posed = {number(image.name): image for image in whole.model.images.values() if image.has_pose}
     frames = sorted(posed)
     wanted = int(rng.integers(1, MOST_GAPS + 1))
@@ -277,7 +279,7 @@ def gaps_of(whole: Whole, rng: np.random.Generator) -> list[Gap]:
 
 
 def gap_between(model: Any, posed: dict[int, Any], before: int, after: int) -> Gap:
-    """How far picture and camera move from one frame to another, by a model."""
+    """Motion of picture and camera from one frame to another, measured by a model."""
     first, second = posed[before], posed[after]
     seen = [point for point in first.points2D if point.has_point3D()][:POINTS]
     xy = np.array([point.xy for point in seen]).reshape(-1, 2)
@@ -291,18 +293,18 @@ def gap_between(model: Any, posed: dict[int, Any], before: int, after: int) -> G
 
 
 def number(name: str) -> int:
-    """The frame of an image, by its name."""
+    """The frame number in the name of an image."""
     return int(Path(name).stem.rpartition("_")[2])
 
 
 def blurred(picture: Image, length: int) -> Image:
-    """The picture as of a camera that moves sideways meanwhile."""
+    """The picture with horizontal motion blur."""
     line = np.full((1, length), 1 / length, np.float32)
     return np.asarray(cv2.filter2D(picture, -1, line), np.uint8)
 
 
 def write_clip(path: Path, pictures: Sequence[Image]) -> None:
-    """Pictures as H.264 that loses next to nothing."""
+    """Write pictures as nearly lossless H.264."""
     height, width = pictures[0].shape[:2]
     words = f"-v error -y -f rawvideo -pix_fmt bgr24 -s {width}x{height} -r 25 -i -".split()
     words += ["-c:v", "libx264", "-preset", "veryfast", "-crf", "14", "-pix_fmt", "yuv420p"]
@@ -311,13 +313,13 @@ def write_clip(path: Path, pictures: Sequence[Image]) -> None:
 
 
 def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None, list[str]]:
-    """The model that a way makes of a clip, if any, and what it says of it.
+    """The model of a clip by one way, if any, and the warnings about it.
 
     Args:
         way: one of `WAYS`.
-        whole: what is known of the sequence.
+        whole: the complete sequence.
         clip: the video.
-        folder: folder for what the way writes, each in a folder of its own; emptied before.
+        folder: folder for the output of the ways, each in a subfolder, which is emptied before.
     """
     output = folder / way.partition(",")[0]
     shutil.rmtree(output, ignore_errors=True)
@@ -333,7 +335,7 @@ def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None
 
 
 def run_reconstruct(clip: Path, output: Path, camera: CameraOptions, _: bool) -> list[str]:
-    """The folder for trainers, as by the command with its defaults."""
+    """Reconstruct with default options, like the command."""
     options = ReconstructOptions(match=MatchOptions(camera=camera, images=EVERY_FRAME))
     return about_the_model(reconstruct(clip, output, options=options).warnings)
 
@@ -351,7 +353,7 @@ def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) ->
 
 
 def about_the_model(warnings: Sequence[str]) -> list[str]:
-    """What is said of models that fall apart or bend, and of images that are left out."""
+    """The warnings about bent or disconnected models and images that are not registered."""
     signs = (
         "few matches",
         "no pose",
@@ -366,7 +368,7 @@ def about_the_model(warnings: Sequence[str]) -> list[str]:
 def figures(
     poses: NDArray[np.float64], model: Any | None, kept: list[int]
 ) -> tuple[int, float | None]:
-    """Images with a pose, and the error of their centres in per cent of the true ones' extent."""
+    """Number of registered images, and error of their centres in per cent of the true extent."""
     if model is None:
         return 0, None
     errors = pose_errors(model_poses(model, len(kept)), poses[kept])

@@ -1,13 +1,13 @@
-"""Measure whether loops are closed, and only those that there are, on two rendered clips.
+"""Measure whether true loops are closed, and no false ones, on two rendered clips.
 
 python examples/benchmarks/loops.py --cache benchmark_loops
 
-`rounds`: a hand-held camera goes twice around the things of the example's courtyard, 600 frames of
-640x360 with noise. `fronts`: it walks along a street of identical house fronts, 400 frames, and
-sees no place again. Poses are exact. `reconstruct` gets the clip as it is, and every fifth frame of
-it; SIFT, matched exhaustively and mapped by COLMAP, the same fifth. A pair of images is false whose
-inliers lie off the true epipolar lines by more than 3 px in the median. Rendering takes a quarter
-of an hour of CPU time; clips are kept in the cache.
+`rounds`: a hand-held camera goes twice around the objects of the example's courtyard, 600 frames of
+640x360 with noise. `fronts`: it moves along a street of identical house fronts, 400 frames, and
+never returns to a place. The true poses are known. `reconstruct` gets the whole clip, and every
+fifth frame of it; SIFT, matched exhaustively and mapped by COLMAP, gets the same fifth. A pair of
+images is false if the median distance of its inliers to the true epipolar lines exceeds 3 px.
+Rendering takes 15 minutes of CPU time; clips are kept in the cache.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ SCRIPT = load_render_scene()
 NUM_FRAMES = {"rounds": 600, "fronts": 400}
 WAYS = ("reconstruct", "reconstruct, every 5th", "SIFT exhaustive, every 5th")
 STEP = 5
-NOISE = 2.0  # standard deviation in grey levels
-# Frames between two images that see the same only where a place is seen again.
+NOISE = 2.0  # Standard deviation in grey levels.
+# Images with at least this many frames between them share a view only in a loop.
 FAR = 90
-# Pixels off the true epipolar lines, in the median of a pair, from which on it is false.
+# A pair is false if the median distance of its inliers to the true epipolar lines is larger.
 FALSE = 3.0
 
 Floats = NDArray[np.float64]
 
 
 def shake(num_frames: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Steps and hand tremor: shifts in metres and rotation vectors, each [num_frames, 3]."""
+    """Shake of a hand-held camera: shifts (m) and rotation vectors, each [num_frames, 3]."""
     seconds = np.arange(num_frames) / SCRIPT.FPS
 
     def wobble(amplitude: float) -> Floats:
@@ -67,7 +67,7 @@ def shake(num_frames: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
 
 
 def look(centre: Floats, target: Floats, turn: Floats) -> Floats:
-    """Pose [3, 4] of a camera that looks at a target, but for a rotation vector."""
+    """Pose [3, 4] of a camera that looks at a target, changed by a rotation vector."""
     ahead = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(ahead, [0, 0, 1.0])
     right /= np.linalg.norm(right)
@@ -76,9 +76,10 @@ def look(centre: Floats, target: Floats, turn: Floats) -> Floats:
 
 
 def wall(start: tuple[float, float], end: tuple[float, float], material: str) -> Any:
-    """An upright wall of 9 m that is seen from (0, 0, 2)."""
+    """A vertical wall, 9 m high, that faces (0, 0, 2)."""
     a, b = np.array([*start, 9.0]), np.array([*end, 9.0])
-    # Reach past the neighbouring wall and into the ground: no ray may slip through by rounding.
+    # Extend beyond the neighbouring wall and into the ground, so that no ray slips through by
+    # rounding.
     margin = 0.04 * (b - a) / np.linalg.norm(b - a)
     a, b = a - margin, b + margin
     face = SCRIPT.Surface("quad", a, b - a, np.array([0, 0, -9.04]), material, 110.0, casts=False)
@@ -87,7 +88,7 @@ def wall(start: tuple[float, float], end: tuple[float, float], material: str) ->
 
 
 def ground(corner: tuple[float, float], size: tuple[float, float], texels: float) -> Any:
-    """The flagstones, from their corner of least x and largest y."""
+    """The flagstone ground, from its corner of smallest x and largest y."""
     face = SCRIPT.Surface(
         "quad",
         np.array([*corner, 0.0]),
@@ -101,8 +102,8 @@ def ground(corner: tuple[float, float], size: tuple[float, float], texels: float
 
 
 def rounds() -> tuple[Any, dict[int, int]]:
-    """The scene that the camera goes around twice; no surface has the texture of another."""
-    things = SCRIPT.build_scene().surfaces[5:]  # without ground, walls and pillar
+    """The scene that the camera goes around twice; all surfaces have different textures."""
+    things = SCRIPT.build_scene().surfaces[5:]  # Without ground, walls and pillar.
     corners = [(-10, -9.5), (-10.5, 3), (-6, 9.5), (2, 10), (10, 7), (10.3, -4), (5, -10)]
     materials = ("rubble", "plastered_brick", "ivy", "rubble", "plastered_brick", "ivy", "rubble")
     walls = [
@@ -123,7 +124,7 @@ def rounds() -> tuple[Any, dict[int, int]]:
 
 
 def fronts() -> tuple[Any, dict[int, int]]:
-    """The street of identical fronts; and, by surface, that of the first front it looks like."""
+    """The street of identical fronts, and for each surface its equal in the first front."""
     length = 8.0
     surfaces = [ground((-12, 6), (70, 16), 60.0)]
     surfaces += [wall((56, -10), (56, 6), "rubble"), wall((-8, 6), (-8, -10), "ivy")]
@@ -161,7 +162,7 @@ SCENES = {"rounds": rounds, "fronts": fronts}
 
 
 def pictures(scene: Any, alike: dict[int, int]) -> Iterator[NDArray[np.uint8]]:
-    """The frames in order, uint8 [height, width, 3] RGB, with a sensor's noise."""
+    """The frames in order, uint8 [height, width, 3] RGB, with sensor noise."""
     SCRIPT.SUPERSAMPLE = 2
     textures: list[Any] = []
     for serial in range(len(scene.surfaces)):
@@ -175,7 +176,7 @@ def pictures(scene: Any, alike: dict[int, int]) -> Iterator[NDArray[np.uint8]]:
 
 
 def run_reconstruct(video: Path, output: Path, every: int | None) -> dict[str, Any]:
-    """The folder for trainers, as by the command."""
+    """Reconstruct, like the command."""
     options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=every)))
     report = reconstruct(video, output, options=options)
     return {"images": report.num_images, "revisits": report.links.num_revisits}
@@ -196,7 +197,7 @@ def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[
         database = matched.database
         mapped = measure_mapper(database, footage.image_path, folder / "sift-model")
         if mapped.model is None:
-            raise RuntimeError(f"{clip}: SIFT makes no model: see {folder / 'sift-model'}")
+            raise RuntimeError(f"{clip}: SIFT gives no model: see {folder / 'sift-model'}")
         model, cpu = mapped.model, (matched.cpu_seconds or 0.0) + (mapped.cpu_seconds or 0.0)
         facts: dict[str, Any] = {"images": len(footage.names), "revisits": None}
     else:
@@ -222,7 +223,7 @@ def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[
 
 
 def false_pairs(database: Path, scene: Any) -> dict[str, int]:
-    """Verified pairs of a database, all and those far apart, and the false ones of each."""
+    """Numbers of verified pairs of a database, all and far apart, and of false ones among each."""
     intrinsics = np.array(
         [[scene.fx, 0, scene.cx], [0, scene.fy, scene.cy], [0, 0, 1.0]], dtype=np.float64
     )
@@ -257,7 +258,7 @@ def false_pairs(database: Path, scene: Any) -> dict[str, int]:
 
 
 def main() -> int:
-    """Render what is absent, measure, keep and print the table."""
+    """Render missing clips, measure, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

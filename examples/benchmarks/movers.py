@@ -1,11 +1,11 @@
-"""Measure what people who walk through the rendered scene do to `reconstruct`.
+"""Measure the effect of dynamic objects, people in the rendered scene, on `reconstruct`.
 
 python examples/benchmarks/movers.py --cache benchmark_movers
 
-The courtyard of the example clip with nobody in it, and with people who cover about 5, 15 and 30 %
-of the pictures. Truth is exact: camera centres, and which pixels show people. How exact poses are
-is in part chance: the table has means over several encodings of the same pictures. Rendering takes
-some minutes; pictures and clips are kept in the cache.
+The clips show the courtyard of the example clip without people, and with people who cover about 5,
+15 and 30 % of the pictures. Camera centres and the pixels that show people are exactly known.
+Because the accuracy of poses varies randomly, the table has means over several encodings of the
+same pictures. Rendering takes some minutes; pictures and clips are kept in the cache.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 
 Floats = NDArray[np.float64]
-# As of the option, `drop` making the model of `mask`; or `keep`, with exact masks given.
+# Values of the option (`drop` and `mask` give the same model), or `keep` with exact masks given.
 Moving = Literal["keep", "mask", "exact"]
-# The pictures at different rates, and backwards in time: other motion each time.
+# Different rates, and reversed time, to get different motion fields of the same pictures.
 ENCODINGS = {
     "forward": (22, False),
     "backward": (22, True),
     "fine": (18, False),
     "coarse": (26, True),
 }
-# Pixels that exact masks are grown by, as people's edges are in the blocks beside them.
+# Number of pixels by which exact masks are dilated, because motion blocks cross people's edges.
 GROWN = 4
 SCRIPT = load_render_scene()
-# A point is of a person where most of what it is seen at is, and it is off the surface behind by
-# more than this share of its depth.
+# A point is on a person if most of its observations are on people, and its distance from the
+# background surface exceeds this share of its depth.
 OFF_SURFACE = 0.05
 SUPERSAMPLE = 2
 STEPS_PER_SECOND = 1.8
@@ -52,13 +52,13 @@ STEPS_PER_SECOND = 1.8
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody who walks.
+    """A walking person.
 
     Attributes:
-        start: (x, y) in metres where they are in the first frame.
-        velocity: (x, y) in metres a second.
-        size: their height over 1.7 metres.
-        wait: seconds before they start.
+        start: (x, y) position in metres in the first frame.
+        velocity: (x, y) in metres per second.
+        size: height divided by 1.7 metres.
+        wait: seconds before the person starts to walk.
     """
 
     start: tuple[float, float]
@@ -67,8 +67,8 @@ class Person:
     wait: float = 0.0
 
 
-# By the share of the pictures they cover, in per cent: along with the camera and against it,
-# towards it, and one who waits first.
+# People by the share of the pictures that they cover, in per cent. They walk with the camera,
+# against it or towards it, and one waits first.
 PEOPLE: dict[int, tuple[Person, ...]] = {
     0: (),
     5: (Person((1.4, -1.0), (-1.1, 0.05)),),
@@ -88,7 +88,7 @@ PEOPLE: dict[int, tuple[Person, ...]] = {
 
 
 def body(person: Person) -> list[Any]:
-    """A person's surfaces, in the first frame: trunk, head, legs and arms."""
+    """Surfaces of a person in the first frame: trunk, head, legs and arms."""
     x, y = person.start
     size = person.size
 
@@ -123,7 +123,7 @@ def body(person: Person) -> list[Any]:
 
 
 def moved(person: Person, seconds: float) -> list[Any]:
-    """Their surfaces later: legs and arms swing against each other."""
+    """Surfaces of a person at a later time, with swinging legs and arms."""
     walked = max(seconds - person.wait, 0.0)
     step = np.array([*person.velocity, 0.0]) * walked
     along = np.array([*person.velocity, 0.0])
@@ -137,7 +137,7 @@ def moved(person: Person, seconds: float) -> list[Any]:
 
 
 def scene_at(scene: Any, people: Sequence[Person], frame: int) -> Any:
-    """The scene as a frame shows it."""
+    """The scene with people at the time of a frame."""
     parts = [part for person in people for part in moved(person, frame / SCRIPT.FPS)]
     return replace(scene, surfaces=(*scene.surfaces, *parts))
 
@@ -152,7 +152,7 @@ def pictures(scene: Any, people: Sequence[Person]) -> Iterator[NDArray[np.uint8]
 
 
 def shown_people(scene: Any, people: Sequence[Person]) -> NDArray[np.bool_]:
-    """Bool [frames, height, width]: which pixels' centres show a person."""
+    """Bool [frames, height, width]: pixels whose centres show a person."""
     y, x = np.mgrid[0 : scene.height, 0 : scene.width] + 0.5
     xy = np.column_stack([x.ravel(), y.ravel()])
     seen = [
@@ -164,7 +164,7 @@ def shown_people(scene: Any, people: Sequence[Person]) -> NDArray[np.bool_]:
 
 def main() -> int:
     """Reconstruct with each share of people, and print a table."""
-    parser = argparse.ArgumentParser(description="Measure what moving people do to a model.")
+    parser = argparse.ArgumentParser(description="Measure the effect of people on a model.")
     parser.add_argument("--cache", type=Path, required=True, help="folder for clips and models")
     parser.add_argument("--shares", type=int, nargs="*", default=[*PEOPLE], choices=[*PEOPLE])
     parser.add_argument(
@@ -191,10 +191,7 @@ def main() -> int:
 
 
 def made_clips(cache: Path, scene: Any, share: int) -> NDArray[np.bool_]:
-    """Make the clips with a share of people; returns which pixels show these, see `shown_people`.
-
-    They are `people_SHARE_ENCODING.mp4` in the cache.
-    """
+    """Render the clips `people_SHARE_ENCODING.mp4` in the cache; returns `shown_people` of them."""
     people = PEOPLE[share]
     rendered, truth = cache / f"frames_{share}.npy", cache / f"people_{share}.npy"
     if not rendered.is_file():
@@ -212,7 +209,7 @@ def made_clips(cache: Path, scene: Any, share: int) -> NDArray[np.bool_]:
 def measure(
     clip: Path, scene: Any, shown: NDArray[np.bool_], moving: Moving, *, encoding: str
 ) -> dict[str, Value]:
-    """Reconstruct an encoding of a clip, and hold the model against the truth."""
+    """Reconstruct an encoding of a clip, and compare the model with the ground truth."""
     cache = clip.parent
     if ENCODINGS[encoding][1]:
         shown = shown[::-1]
@@ -246,12 +243,12 @@ def measure(
 
 
 def make(clip: Path, output: Path, options: ReconstructOptions) -> None:
-    """Reconstruct, in a process of its own."""
+    """Reconstruct; called in a separate process."""
     reconstruct(clip, output, options=options)
 
 
 def write_masks(folder: Path, shown: NDArray[np.bool_]) -> Path:
-    """Write exact masks of the frames, a little grown."""
+    """Write exact masks of the frames, slightly dilated."""
     folder.mkdir(exist_ok=True)
     square = np.ones((2 * GROWN + 1, 2 * GROWN + 1), np.uint8)
     for frame, people in enumerate(shown):
@@ -263,11 +260,11 @@ def write_masks(folder: Path, shown: NDArray[np.bool_]) -> Path:
 def points_on_people(
     model: pycolmap.Reconstruction, scene: Any, shown: NDArray[np.bool_]
 ) -> tuple[int, int]:
-    """Points that are of people, and all."""
+    """Numbers of points on people and of all points."""
     off = np.zeros(len(model.points3D))
     number = {point_id: k for k, point_id in enumerate(model.points3D)}
     count = np.zeros(len(off))
-    # The unit of the model's lengths, by its cameras.
+    # Scale of the model, from its camera centres.
     names = sorted(image.name for image in model.images.values())
     by_name = {image.name: image for image in model.images.values()}
     centres = np.array([by_name[name].projection_center() for name in names])
@@ -293,7 +290,7 @@ def points_on_people(
 
 
 def agreement(masks: Path, shown: NDArray[np.bool_]) -> dict[str, Value]:
-    """How the written masks agree with the true ones, over all frames."""
+    """Agreement of the written masks with the true ones, over all frames."""
     found = np.zeros_like(shown)
     for path in masks.iterdir():
         found[int(path.stem[6:12])] = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) == 0

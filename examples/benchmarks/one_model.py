@@ -1,12 +1,12 @@
-"""Measure whether what shows the same becomes one model by `reconstruct`, and only that.
+"""Measure whether `reconstruct` joins videos of the same scene in one model, and only these.
 
 python examples/benchmarks/one_model.py --cache benchmark_one_model
 
 Cases: `cut video`, log_building's frames 60 to 84 and then 0 to 29 and 46 to 59; `two halves`, its
-frames 0 to 42 and 43 to 84 as two videos; `two scenes`, ditch and log_building; `fast drone`,
-drone_park as it is; `long walk`, kitchen_long as it is, which comes back to where it was. Camera
-centres are compared with those of SIFT's model of the whole sequence, each model by itself; places
-seen again by the tool that matches pictures of images far apart.
+frames 0 to 42 and 43 to 84 as two videos; `two scenes`, ditch and log_building; `fast drone`, all
+of drone_park; `long walk`, all of kitchen_long, which returns to its start. Camera centres of each
+model are compared with those of SIFT's model of the whole sequence, and loop closures with the tool
+that matches images far apart.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from colmap_av1.geometry.colmap_model import posed_images, read_model
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames of a sequence as a video; None: its own video, all of it."""
+    """Frames of a sequence as a video; None: the complete video of the sequence."""
 
     sequence: str
     frames: tuple[int, ...] | None = None
@@ -52,28 +52,27 @@ CASES = {
     "fast drone": [Clip("drone_park")],
     "long walk": [Clip("kitchen_long")],
 }
-# How many images lie at least between those that are compared: in the long walk these are so far
-# apart that no track joins them.
+# Smallest number of images between compared images. In the long walk, no track is that long.
 APART = {"long walk": 74}
 
 
 @dataclass(frozen=True)
 class Row:
-    """What became of a case.
+    """Result of a case.
 
     Attributes:
-        case: its name.
-        images: that were asked for.
-        registered: images of each model.
-        centres_off: largest error of a model's centres, as a share of the extent of SIFT's; None
-            where a model holds images of two scenes, or SIFT was not asked.
-        far_views: how far views that see the same miss each other, in pixels, in the median.
-        far_views_90: the 90 % quantile.
-        revisits: links between images that see a place again.
-        between: links between videos.
-        links_cpu_s: CPU seconds that links took.
-        cpu_s: CPU seconds of all.
-        said: warnings about what is not connected.
+        case: name of the case.
+        images: number of chosen images.
+        registered: number of registered images of each model.
+        centres_off: largest error of a model's camera centres, as a share of their extent in SIFT's
+            model; None if a model has images of two scenes, or without SIFT's model.
+        far_views: median long-range epipolar error in pixels.
+        far_views_90: its 90th percentile.
+        revisits: number of loop closures.
+        between: number of SIFT links between videos.
+        links_cpu_s: CPU seconds of SIFT links and loop closures.
+        cpu_s: total CPU seconds.
+        said: warnings about disconnected images.
     """
 
     case: str
@@ -90,7 +89,7 @@ class Row:
 
 
 def main() -> int:
-    """Try the cases, and keep and print the table."""
+    """Measure the cases, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -144,7 +143,7 @@ def measure(case: str, cache: Path, console: Console) -> Row:
 
 
 def video_of(clip: Clip, whole: Whole | None, path: Path) -> Path:
-    """The video of a clip, by a name of its own."""
+    """The video of a clip, under a unique name."""
     if clip.frames is None:
         return Path(shutil.copyfile(read_sequence(ruler.SEQUENCES / clip.sequence).source, path))
     assert whole is not None
@@ -153,17 +152,17 @@ def video_of(clip: Clip, whole: Whole | None, path: Path) -> Path:
 
 
 def run_reconstruct(videos: Sequence[Path], output: Path) -> ReconstructReport:
-    """The folder for trainers, as by the command with its defaults."""
+    """Reconstruct with default options, like the command."""
     return reconstruct(list(videos), output, options=ReconstructOptions())
 
 
 def centres_off(model: Any, clips: Sequence[Clip], wholes: dict[str, Whole]) -> float | None:
-    """How far a model's centres are off SIFT's, of their extent; None for images of two scenes."""
+    """Error of a model's centres against SIFT's, relative to their extent; None for two scenes."""
     found: list[NDArray[np.float64]] = []
     wanted: list[NDArray[np.float64]] = []
     scenes = set()
     for name, image in posed_images(model).items():
-        # Images of several videos lie in a folder each, named like the video, here by its number.
+        # Images of several videos are in folders named like the videos, here by their numbers.
         number = int(Path(name).parent.name.rpartition("_")[2]) if len(clips) > 1 else 0
         clip, frame = clips[number], frame_number(name)
         scenes.add(clip.sequence)
@@ -175,7 +174,7 @@ def centres_off(model: Any, clips: Sequence[Clip], wholes: dict[str, Whole]) -> 
 
 
 def far_views(output: Path, apart: int) -> dict[str, float | None]:
-    """How far views so many images apart and more miss each other: the columns of the row."""
+    """Long-range epipolar error of images at least `apart` images apart: columns of the row."""
     found = ruler.far_views(output / "sparse" / "0", output / "images", apart)
     return {name: found.get(name) for name in ("far_views", "far_views_90")}
 

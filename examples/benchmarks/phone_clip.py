@@ -1,12 +1,12 @@
-"""Render a clip as a phone shoots it, of any length, with exact poses.
+"""Render a clip of any length that resembles the video of a phone, with exact poses.
 
 python examples/benchmarks/phone_clip.py --seconds 10 --cache benchmark_phone
 
-The courtyard of `render_scene.py` at 1920x1080 and 30 frames a second, walked to and fro: with a
-hand's shake, motion blur of a 60th of a second, noise of a sensor, and H.264 of 16 Mbit a second
-with a key frame every second. A second of it is rendered in a minute or two; seconds that are in
-the cache are not rendered again, and a longer clip begins as a shorter one. Half a minute is
-rendered; of longer clips the rest shows it backwards, forwards, and so on.
+The camera walks back and forth in the courtyard of `render_scene.py`, at 1920x1080 and 30 frames
+per second, with hand shake, motion blur of 1/60 s, sensor noise, and H.264 at 16 Mbit/s with a key
+frame every second. Rendering a second takes a minute or two; seconds in the cache are not rendered
+again, and a longer clip begins like a shorter one. At most 30 s are rendered; longer clips repeat
+them backwards, forwards, and so on.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ SCRIPT = ruler.load_render_scene()
 SIZE = (1920, 1080)
 FOCAL = 1560.0
 FPS = 30
-# Seconds from one end of the way to the other, and what the camera turns about the scene by.
+# Seconds from one end of the path to the other, and the angles of its ends around the scene.
 _SWEEP = 6.0
 _ANGLES = (-22.0, 20.0)
 _EXPOSURE = 1 / 60
-_SAMPLES = 2  # over the exposure
-# Standard deviation in grey levels of a sensor's noise, and how far demosaicing spreads it.
+_SAMPLES = 2  # Number of samples over the exposure.
+# Standard deviation of the sensor noise in grey levels, and blur of the noise by demosaicing.
 _NOISE, _SPREAD = 4.0, 0.6
 _SEED = 20240301
-# Seconds that are rendered at most.
+# Largest number of seconds that are rendered.
 _RENDERED = 30
 PHONE = "-c:v libx264 -preset veryfast -b:v 16M -maxrate 24M -bufsize 24M -g 30 -bf 0"
 _LOSSLESS = "-c:v libx264 -preset ultrafast -qp 0"
 
 
 def main() -> int:
-    """Render a clip, and print where it is."""
+    """Render a clip, and print its path."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def phone_clip(cache: Path, seconds: int) -> Path:
-    """The clip of a length, rendered where the cache does not hold it."""
+    """The clip with the given length; missing seconds are rendered into the cache."""
     video = cache / f"phone_{seconds}s.mp4"
     if video.exists():
         return video
@@ -75,11 +75,11 @@ def phone_clip(cache: Path, seconds: int) -> Path:
 
 
 def poses_at(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 3, 4] world-to-camera poses at some times: an arc walked to and fro, unsteadily."""
+    """[n, 3, 4] cam_from_world poses at given times, of a hand-held camera on an arc."""
     along = (1 - np.cos(math.pi * seconds / _SWEEP)) / 2
     angle = np.radians(_ANGLES[0] + (_ANGLES[1] - _ANGLES[0]) * along)
     shift, turn = SCRIPT.hand_held(seconds, np.random.default_rng(_SEED))
-    # Nearer and further with time, so that no way back is the way there.
+    # The distance changes with time, so that the way back differs.
     radius = 4.8 - 0.25 * np.sin(2 * math.pi * seconds / (2.7 * _SWEEP))
     height = 1.6 + 0.15 * np.sin(2 * math.pi * seconds / (3.3 * _SWEEP))
     target = np.array([0.10, 0.35, 0.62])
@@ -111,13 +111,13 @@ def _painted() -> tuple[Any, list[Any]]:
 
 
 def _picture(frame: int) -> NDArray[np.uint8]:
-    """uint8 [height, width, 3] RGB of a frame: its exposure's samples, averaged, and noise."""
+    """Picture of a frame, uint8 [height, width, 3] RGB, with motion blur and noise."""
     scene, textures = _painted()
     times = frame / FPS + _EXPOSURE * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)
     rng = np.random.default_rng((_SEED, frame))
     total = np.zeros((scene.height, scene.width, 3), np.float32)
     for number, pose in enumerate(poses_at(times)):
-        # Samples lie within the pixels, too.
+        # Samples also vary in position within the pixel.
         inside = ((number + 0.5) / _SAMPLES - 0.5) * np.array([1, -1]) * 0.5
         shifted = dataclasses.replace(
             scene,
@@ -133,7 +133,7 @@ def _picture(frame: int) -> NDArray[np.uint8]:
 
 
 def _second(cache: Path, number: int) -> Path:
-    """A second of the clip, backwards in every second sweep of what is rendered."""
+    """A second of the clip, reversed in every other repetition."""
     sweep, own = divmod(number, _RENDERED)
     if sweep % 2 == 0:
         return _rendered_second(cache, own)

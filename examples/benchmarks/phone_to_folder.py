@@ -67,15 +67,15 @@ RENDERED = re.compile(r"phone_(\d+)s")
 
 @dataclass(frozen=True)
 class Clip:
-    """A video and what is known of it.
+    """A video and its ground truth.
 
     Attributes:
-        name: of the clip.
-        video: the file as it was shot.
-        images: which frames become images.
-        camera: the true intrinsics, where they are given; else nothing.
-        poses: [num_frames, 3, 4] true poses; None where unknown.
-        forward_motion: the camera moves along its axis.
+        name: name of the clip.
+        video: the original video.
+        images: options for the frames that become images.
+        camera: options for the true intrinsics if known, else default options.
+        poses: [num_frames, 3, 4] true poses; None if unknown.
+        forward_motion: whether the camera moves along its optical axis.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Row:
-    """What one step, or all steps of one way, took on one clip, and the model at its end."""
+    """Cost of one step, or of all steps of one way, on one clip, and figures of the model."""
 
     clip: str
     way: str
@@ -110,7 +110,7 @@ IMAGES = {"kitchen": ImageOptions(every=2), "kitchen_long": ImageOptions(num_ima
 
 
 def main() -> int:
-    """Measure both ways on every clip, and keep and print the table."""
+    """Measure both ways on every clip, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -128,7 +128,7 @@ def main() -> int:
     parser.add_argument(
         "--without_mapper",
         action="store_true",
-        help="end SIFT with its matches, where the mapper takes hours",
+        help="stop SIFT after matching, for clips whose mapping takes hours",
     )
     add_results(parser, "phone_to_folder")
     arguments = parser.parse_args()
@@ -174,7 +174,7 @@ def clip_of(name: str, folder: Path) -> Clip:
 
 
 def measure_ours(clip: Clip, folder: Path) -> tuple[list[Row], list[str]]:
-    """Rows of the steps, the whole and the stages of `reconstruct`, and names of its images."""
+    """Rows of the steps, the total and the stages of `reconstruct`, and names of its images."""
     converted, made, output = folder_of(clip, folder)
     rows = [row_of(clip, "conversion", converted)] if converted is not None else []
     rows.append(row_of(clip, "reconstruct from AV1", made))
@@ -185,7 +185,7 @@ def measure_ours(clip: Clip, folder: Path) -> tuple[list[Row], list[str]]:
         Row(clip.name, f"{render.STAGE}{stage}", cpu_s, report["seconds"][stage], None)
         for stage, cpu_s in report["cpu_seconds"].items()
     ]
-    # What has no pose is not written; SIFT is given what is.
+    # Images that are not registered are not written; SIFT gets the written ones.
     return rows, sorted(path.name for path in (output / "images").iterdir())
 
 
@@ -257,7 +257,7 @@ def map_incrementally(database: Path, images: Path, output: Path, forward: bool)
 
 
 def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) -> list[Row]:
-    """Rows of the steps of SIFT on the same images, and of all of them."""
+    """Rows of the steps of SIFT on the same images, and their total."""
     steps, model, images = sift_of(clip, folder, names, mapped=mapped)
     rows = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
     total = replace(sum_of("SIFT sequential", rows), images=len(names))
@@ -269,10 +269,7 @@ def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) ->
 
 
 def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any], Path]:
-    """What conversion and the rest of `reconstruct` took, and the folder that it made.
-
-    Nothing was converted where the clip is AV1.
-    """
+    """Cost of conversion (None for AV1 clips) and of the rest of `reconstruct`, and its folder."""
     stream, output = folder / "converted" / "stream.mp4", folder / "made" / "output"
     is_av1 = read_video(clip.video).codec == "av1"
 
@@ -299,20 +296,20 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
 
 
 def run_encode(video: Path, stream: Path) -> None:
-    """Convert a video as `reconstruct` does first."""
+    """Convert a video like `reconstruct`."""
     options = with_downscale(EncodeOptions(effort="quick"), read_video(video).picture_size)
     encode(video, stream, options=options)
 
 
 def run_reconstruct(video: Path, output: Path, options: ReconstructOptions) -> None:
-    """Make the folder; the stream is there already."""
+    """Reconstruct with an existing stream."""
     reconstruct(video, output, options=options)
 
 
 def sift_of(
     clip: Clip, folder: Path, names: list[str], *, mapped: bool
 ) -> tuple[dict[str, dict[str, Any]], Path | None, Path]:
-    """What SIFT's steps took, its model, if it is mapped, and its images."""
+    """Cost of SIFT's steps, its model if it is mapped, and its images."""
     images, database = folder / "frames" / "images", folder / "features" / "database.db"
     frames = [int(Path(name).stem.rpartition("_")[2]) for name in names]
     opened = read_video(clip.video)
@@ -368,7 +365,7 @@ def run_ffmpeg(video: Path, folder: Path, names: list[str], frames: list[int]) -
 
 
 def any_of(terms: list[str]) -> str:
-    """A sum of terms for ffmpeg, nested as little as can be: it refuses deep expressions."""
+    """A sum of terms as a balanced expression, because ffmpeg refuses deep nesting."""
     if len(terms) == 1:
         return terms[0]
     half = len(terms) // 2
@@ -383,13 +380,13 @@ def run_extraction(footage: Footage, database: Path) -> None:
 
 
 def run_matching(database: Path) -> None:
-    """Matches of each image with those after it, with COLMAP's defaults."""
+    """Match sequentially, with COLMAP's defaults."""
     pycolmap.set_random_seed(0)
     pycolmap.match_sequential(database)
 
 
 def taken(run: Measured[Any] | MapperRun) -> dict[str, Any]:
-    """What a measured process took."""
+    """Cost of a measured process."""
     memory = (run.peak_memory or 0) / 1e6
     return {"cpu_s": run.cpu_seconds, "seconds": run.seconds, "memory_mb": memory}
 
@@ -400,7 +397,7 @@ def row_of(clip: Clip, way: str, step: dict[str, Any]) -> Row:
 
 
 def sum_of(way: str, steps: list[Row]) -> Row:
-    """The row of several steps one after the other."""
+    """The total of several steps."""
     return Row(
         steps[0].clip,
         way,
@@ -411,7 +408,7 @@ def sum_of(way: str, steps: list[Row]) -> Row:
 
 
 def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) -> dict[str, Any]:
-    """The figures of a model, those of Row; far views where its images are undistorted."""
+    """Fields of Row for a model; the long-range epipolar error only with undistorted `images`."""
     reconstruction = read_model(model)
     about = model_figures(reconstruction)
     found: dict[str, Any] = {

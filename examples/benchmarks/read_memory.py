@@ -1,9 +1,9 @@
-"""Measure the memory that reading the motion of a long 4K video takes.
+"""Measure the memory for reading the motion of a long 4K video.
 
 python examples/benchmarks/read_memory.py --cache benchmark_clips
 
-Encodes 100 frames of 3840x2160, repeats their packets to the wanted number of frames, and reads
-the result frame by frame in another process, whose peak resident set it reports.
+The script encodes 100 frames of 3840x2160, repeats their packets up to the given number of frames,
+reads the result frame by frame in a separate process, and reports the peak memory of that process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SOURCE = "testsrc2=size=3840x2160:rate=25"
 
 
 def main() -> int:
-    """Make the video if it is absent, read it, print one line."""
+    """Create the video if it is missing, read it, and print one line."""
     parser = argparse.ArgumentParser(
         description="Measure the memory of reading a long 4K video.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -57,14 +57,14 @@ def main() -> int:
 
 
 def make_video(folder: Path, frames: int) -> Path:
-    """The video of `frames` frames, encoded and repeated unless `folder` holds it."""
+    """The video with `frames` frames, created in `folder` if it is missing."""
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-y"]
     clip = folder / "4k.mp4"
     if not clip.exists():
         encoding = f"-frames:v {ENCODED} -c:v libsvtav1 -preset 12 -crf 35 -pix_fmt yuv420p"
         subprocess.run(
             [*ffmpeg, "-f", "lavfi", "-i", SOURCE, *encoding.split(), str(clip)],
-            env=os.environ | {"SVT_LOG": "1"},  # errors alone
+            env=os.environ | {"SVT_LOG": "1"},  # Print errors only.
             check=True,
         )
     video = folder / f"4k-{frames}.mp4"
@@ -76,7 +76,7 @@ def make_video(folder: Path, frames: int) -> Path:
 
 
 def read(video: Path, threads: int) -> int:
-    """Read a video frame by frame; prints the peak memory in MB at the end and before reading."""
+    """Read a video frame by frame; print the peak memory in MB after and before reading."""
     before = peak_mb()
     for _ in read_motion(video, ReadOptions(num_threads=threads)):
         pass
@@ -85,7 +85,7 @@ def read(video: Path, threads: int) -> int:
 
 
 def peak_mb() -> float:
-    """Peak resident set of this process in megabytes."""
+    """Peak resident memory of this process in MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 

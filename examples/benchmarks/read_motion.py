@@ -1,11 +1,11 @@
-"""Time reading an AV1 file's motion against decoding the same file with dav1d.
+"""Compare the time to read the motion of an AV1 file with decoding it with dav1d.
 
 python examples/benchmarks/read_motion.py --cache benchmark_clips
 
-Both start from the file's name and end at its last frame: demuxing is part of either time, and
-no frame is converted. Runs take turns in one process; the table shows medians: of CPU time with
-one thread, which other work on the machine changes little, and of real time with more. The example
-clip is always there, the other clips are made of the sequences in ../shared.
+Both times include opening and demuxing the file; frames are not converted. Runs alternate in one
+process. The table shows medians: CPU time with one thread, which depends little on other load, and
+wall time with more threads. The example clip is always measured; the other clips are created from
+the sequences in ../shared.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from colmap_av1.video.container import open_stream
 
 LIBAOM = "-c:v libaom-av1 -usage realtime -cpu-used 6 -lag-in-frames 0 -row-mt 1 -b:v 0"
 SVT_AV1 = "-c:v libsvtav1 -preset 8"
-# 640x480 upscaled: what a real camera of this size resolves is not in it.
+# Upscaled from 640x480, so it lacks the detail of a real 1080p camera.
 TO_1080P = "-frames:v 120 -vf scale=1920:1440:flags=lanczos,crop=1920:1080"
 
 SOURCES = {
@@ -50,7 +50,7 @@ RATES = (20, 40)
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip of the benchmark; `sequence` is None for the one that need not be made."""
+    """A clip of the benchmark; `sequence` is None for the example clip, which exists."""
 
     name: str
     sequence: str | None = None
@@ -65,7 +65,7 @@ CLIPS = [
         for encoder, words in ENCODERS.items()
         for rate in RATES
     ),
-    # What threads can share: groups of frames that start at a key frame, and tiles
+    # Clips that can be read in parallel: with several key frames, and with tiles.
     Clip("street-keys", "street", f"{LIBAOM} -crf 20 -g 9"),
     Clip("1080p-keys", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 20"),
     Clip("1080p-tiles", "kitchen", f"{TO_1080P} {LIBAOM} -crf 20 -g 9999 -tiles 2x2"),
@@ -74,10 +74,10 @@ CLIPS = [
 
 @dataclass(frozen=True)
 class Timing:
-    """Medians in seconds over the whole clip; `reader` and `dav1d` by number of threads.
+    """Medians in seconds for the whole clip; `reader` and `dav1d` by number of threads.
 
-    `gain` is by how much more threads shorten the reader's real time. All other times with one
-    thread are CPU time.
+    `gain` is the speed-up of the reader's wall time with more threads. Times with one thread are
+    CPU times.
     """
 
     clip: str
@@ -91,21 +91,19 @@ class Timing:
 
 
 def main() -> int:
-    """Make the clips that are absent, time each, print a table."""
+    """Create missing clips, time each, and print a table."""
     parser = argparse.ArgumentParser(
-        description="Time reading motion against decoding with dav1d.",
+        description="Compare the time to read motion with decoding by dav1d.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument(
-        "--cache", type=Path, help="folder that keeps the clips; without, a temporary one"
-    )
-    parser.add_argument("--repeats", type=int, default=5, help="runs of each, in turns")
+    parser.add_argument("--cache", type=Path, help="folder that keeps the clips [a temporary one]")
+    parser.add_argument("--repeats", type=int, default=5, help="number of runs of each")
     parser.add_argument(
         "--clips",
         nargs="+",
         default=[""],
         metavar="NAME",
-        help=f"only clips whose names hold one of these; names: {', '.join(c.name for c in CLIPS)}",
+        help=f"only clips whose names have one of these parts: {', '.join(c.name for c in CLIPS)}",
     )
     parser.add_argument(
         "--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads to time"
@@ -116,7 +114,7 @@ def main() -> int:
         parser.error("--repeats and --threads start at 1")
     clips = [clip for clip in CLIPS if any(word in clip.name for word in arguments.clips)]
     if not clips:
-        parser.error(f"no clip is named like {' '.join(arguments.clips)}: see --help")
+        parser.error(f"no clip has a name like {' '.join(arguments.clips)}: see --help")
 
     threads = sorted(set(arguments.threads))
     timings = []
@@ -152,11 +150,11 @@ def main() -> int:
 
 
 def make_clip(clip: Clip, folder: Path) -> Path:
-    """The clip's file, encoded unless `folder` holds it.
+    """The file of a clip, encoded in `folder` if it is missing.
 
     Raises:
-        FileNotFoundError: the sequence is not there.
-        RuntimeError: it cannot be encoded.
+        FileNotFoundError: the sequence does not exist.
+        RuntimeError: ffmpeg failed.
     """
     if clip.sequence is None:
         return EXAMPLES / "scene.mp4"
@@ -181,7 +179,7 @@ def make_clip(clip: Clip, folder: Path) -> Path:
 
 
 def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing:
-    """Run everything in turns, once untimed and then `repeats` times."""
+    """Run all tasks alternately, once for warm-up and then `repeats` times."""
     with open_stream(path) as stream:
         configuration = stream.configuration
         packets = [bytes(packet.data) for packet in stream.packets()]
@@ -199,7 +197,7 @@ def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing
     real: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
     used: dict[tuple[str, int], list[float]] = {key: [] for key in runs}
     for turn in range(repeats):
-        # Backwards every other time: what one run leaves in the caches serves each in turn.
+        # Alternate the order, so that each task benefits equally from warm caches.
         for key in list(runs)[:: -1 if turn % 2 else 1]:
             start = time.perf_counter(), time.process_time()
             runs[key]()
@@ -223,18 +221,18 @@ def time_clip(name: str, path: Path, threads: list[int], repeats: int) -> Timing
 
 
 def read(path: Path, threads: int) -> int:
-    """Read the motion of a file; the number of coded frames."""
+    """Read the motion of a file; returns the number of coded frames."""
     return count(read_motion(path, ReadOptions(num_threads=threads)))
 
 
 def demux(path: Path) -> int:
-    """Read the packets of a file; their number."""
+    """Read the packets of a file; returns their number."""
     with open_stream(path) as stream:
         return count(stream.packets())
 
 
 def parse(units: list[bytes]) -> int:
-    """Parse temporal units without making arrays of what they hold; the number of frames."""
+    """Parse temporal units without creating arrays; returns the number of frames."""
     parser = _core.Parser(num_threads=1)
     frames = 0
     for unit in units:
@@ -245,7 +243,7 @@ def parse(units: list[bytes]) -> int:
 
 
 def decode(path: Path, threads: int) -> int:
-    """Decode a file with dav1d; the number of pictures."""
+    """Decode a file with dav1d; returns the number of pictures."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         decoder = av.CodecContext.create("libdav1d", "r")
@@ -258,12 +256,12 @@ def decode(path: Path, threads: int) -> int:
 
 
 def count(items: Iterator[object]) -> int:
-    """Use up an iterator without keeping what it gives."""
+    """Number of items of an iterator, which are not kept."""
     return sum(1 for _ in items)
 
 
 def figures(timing: Timing) -> list[dict[str, Value]]:
-    """A row for each number of threads, in milliseconds a shown frame."""
+    """A row for each number of threads, in milliseconds per shown frame."""
     per_frame = 1e3 / timing.frames
     return [
         {
@@ -281,12 +279,12 @@ def figures(timing: Timing) -> list[dict[str, Value]]:
 
 
 def conditions(repeats: int) -> str:
-    """What the figures mean, and what they were taken with."""
+    """Explanation of the figures, and versions of the libraries."""
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (
-        f"Milliseconds per shown frame, medians of {repeats} runs in turns: CPU time with one "
-        "thread, real time with more. Of the reader's time with one thread, parse is the parser "
-        "alone. Gain: times that the reader is faster with more threads.\n"
+        f"Milliseconds per shown frame, medians of {repeats} alternating runs: CPU time with one "
+        "thread, wall time with more. Parse: the share of the parser in the reader's time with one "
+        "thread. Gain: speed-up of the reader with more threads.\n"
         f"Python {platform.python_version()}, PyAV {av.__version__} with FFmpeg "
         f"{av.ffmpeg_version_info} and its libdav1d{load}."
     )

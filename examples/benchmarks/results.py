@@ -1,4 +1,4 @@
-"""The files of results: a script measures, puts its rows into `results/NAME.csv`, prints its table.
+"""Files of results: each script saves its rows to `results/NAME.csv` and prints its table.
 
 `render.py` puts the tables of all files into the documents.
 """
@@ -20,23 +20,23 @@ Value = str | float | int | None
 
 
 def add_results(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add the option for the CSV file that a script writes."""
+    """Add the option for the CSV file of a script."""
     parser.add_argument(
         "--results",
         type=Path,
         default=RESULTS / f"{name}.csv",
         metavar="CSV",
-        help="file that gets the figures; rows of what is not measured again stay",
+        help="file for the results; rows that are not measured again are kept",
     )
 
 
 def spelled(row: Mapping[str, Value]) -> dict[str, str]:
-    """A row as a CSV file holds it: six significant digits, nothing for what was not measured."""
+    """A row in the format of the CSV file: six significant digits, empty for None."""
     return {name: _spell(value) for name, value in row.items()}
 
 
 def save(path: Path, rows: Sequence[Mapping[str, Value]], key: Sequence[str]) -> None:
-    """Put rows into a CSV file, each in place of the one with the same values of `key`.
+    """Save rows to a CSV file, replacing existing rows with the same values of the `key` columns.
 
     Every row gets the commit of the checkout and the machine as its last columns.
     """
@@ -54,7 +54,7 @@ def save(path: Path, rows: Sequence[Mapping[str, Value]], key: Sequence[str]) ->
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file; none where there is no file."""
+    """The rows of a CSV file; empty without a file."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:
@@ -62,7 +62,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def commit() -> str:
-    """The commit of this checkout, marked where more of it than results has been changed since."""
+    """The commit of this checkout, with a mark if files other than results have changed."""
     git = ["git", "-C", str(RESULTS.parent)]
     words = ["describe", "--always", "--exclude", "*"]
     done = subprocess.run([*git, *words], capture_output=True, text=True, check=False)
@@ -74,7 +74,7 @@ def commit() -> str:
 
 
 def machine() -> str:
-    """Number of cores, and the processor."""
+    """Number of cores, and name of the processor."""
     name = platform.processor() or platform.machine()
     cpus = Path("/proc/cpuinfo")
     if cpus.is_file():

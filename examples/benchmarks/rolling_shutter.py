@@ -1,10 +1,10 @@
-"""Measure what a rolling shutter costs, and what remains where its read-out time is estimated.
+"""Measure the errors due to a rolling shutter, with and without estimating its read-out time.
 
 python examples/benchmarks/rolling_shutter.py --cache benchmark_shutter
 
-Renders a hand-held walk and a hand-held pan through a room, 50 frames of 480x360 at 25 per second,
-each row at its own time, for shutters that read in 0, 5, 15 and 30 ms; encodes them as AV1 and
-reconstructs each with and without `--rolling_shutter estimate`. The intrinsics are given.
+The script renders a hand-held walk and a hand-held pan in a room, 50 frames of 480x360 at 25 per
+second, with read-out times of 0, 5, 15 and 30 ms. It encodes the clips as AV1 and reconstructs each
+with and without `--rolling_shutter estimate`. The intrinsics are given.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CLIPS = ("walk", "pan")
 
 
 def poses(clip: str, t: Floats) -> Floats:
-    """Poses [n, 3, 4] of a clip at times in seconds."""
+    """Poses [n, 3, 4] of a clip at times [n] in seconds."""
     seeds = map(np.random.default_rng, range(6))
     x, y, z, yaw, pitch, roll = (SCRIPT.unsteady(t, seed) for seed in seeds)
     if clip == "walk":
@@ -57,7 +57,7 @@ def poses(clip: str, t: Floats) -> Floats:
 
 
 def make_clip(path: Path, clip: str, read_out: float) -> None:
-    """Render and encode a clip, unless it is there; the read-out time is in milliseconds."""
+    """Render and encode a clip if it is missing; the read-out time is in milliseconds."""
     if path.exists():
         return
     params = [FOCAL, WIDTH / 2, HEIGHT / 2]
@@ -81,7 +81,7 @@ def make_clip(path: Path, clip: str, read_out: float) -> None:
 
 
 def measure(video: Path, output: Path, clip: str, how: str) -> dict[str, Any]:
-    """Reconstruct a clip: read-out time found, reprojection error, error of centres, CPU time."""
+    """Reconstruct a clip: estimated read-out time, reprojection error, centre error, CPU time."""
     words = ["--video", str(video), "--output", str(output), "--every", "2", "--points", "survey"]
     words += ["--camera_model", "SIMPLE_PINHOLE"]
     words += [f"--camera_params={FOCAL},{WIDTH / 2},{HEIGHT / 2}", "--rolling_shutter", how]
@@ -110,15 +110,15 @@ def measure(video: Path, output: Path, clip: str, how: str) -> dict[str, Any]:
 
 
 def centre_error(found: Floats, exact: Floats) -> float:
-    """RMS distance of centres after the best similarity (Umeyama 1991)."""
+    """RMS distance of camera centres after similarity alignment (Umeyama 1991)."""
     fit = pycolmap.estimate_sim3d(found, exact)
     moved = fit.scale * found @ fit.rotation.matrix().T + fit.translation
     return float(np.sqrt(((moved - exact) ** 2).sum(axis=1).mean()))
 
 
 def main() -> int:
-    """Render what is absent, reconstruct, print the table."""
-    parser = argparse.ArgumentParser(description="Measure rolling shutters of known read-out.")
+    """Render missing clips, reconstruct, and print the table."""
+    parser = argparse.ArgumentParser(description="Measure errors due to a rolling shutter.")
     parser.add_argument("--cache", type=Path, help="folder that keeps the clips")
     add_results(parser, "rolling_shutter")
     arguments = parser.parse_args()

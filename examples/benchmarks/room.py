@@ -1,9 +1,9 @@
-"""A furnished room seen by any camera, with a pose for each row: fisheye lenses, rolling shutters.
+"""Rendering a furnished room with any camera model and a pose for each row.
 
-Rays are cast at axis-aligned boxes, whose faces have seeded textures: simpler than
-`examples/render_scene.py`, but a frame of 480x360 takes a third of a second, and a ray may start
-anywhere. The world is in metres, z up; cameras look along +z with x right and y down, and the
-image's top-left corner is (0, 0).
+It serves to test fisheye lenses and rolling shutters. The renderer casts rays at axis-aligned boxes
+with seeded textures. It is simpler than `examples/render_scene.py`, but a frame of 480x360 takes
+only a third of a second, and each ray may have a different origin. The world is in metres, z up;
+cameras look along +z with x right and y down, and the image's top-left corner is (0, 0).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-_TEXELS = 512  # of a face's texture, which repeats every _PERIOD metres
+_TEXELS = 512  # Size of a texture, which repeats every _PERIOD metres.
 _PERIOD = 4.0
 _SEED = 5
-# The room from inside, and what stands in it: least and largest corners in metres.
+# The inside of the room, and the furniture: smallest and largest corners in metres.
 ROOM = np.array([[-5.0, -4.0, 0.0], [5.0, 6.0, 3.4]])
 BOXES = np.array(
     [
@@ -35,7 +35,7 @@ BOXES = np.array(
 
 
 def rays_of(camera: pycolmap.Camera, samples: int = 2) -> Floats:
-    """Float64 [height, width, samples**2, 3] rays of a camera's pixels, z = 1."""
+    """Rays of a camera's pixels, float64 [height, width, samples**2, 3] with z = 1."""
     s = samples
     x, y = (np.arange(n * s) + 0.5 for n in (camera.width, camera.height))
     grid = np.stack(np.meshgrid(x / s, y / s), -1).reshape(-1, 2)
@@ -55,7 +55,7 @@ def render(
     """A picture, uint8 [height, width, 3].
 
     Args:
-        rays: as `rays_of` gives them.
+        rays: rays from `rays_of`.
         cam_from_world: float64 [height, 3, 4] pose of each row.
         textures: as `make_textures` gives them, for the faces across x, y and z of the room and
             then of each box; they begin again if there are fewer.
@@ -79,7 +79,7 @@ def render(
     u = np.where(axis == 0, hit[..., 1], hit[..., 0])
     v = np.where(axis == 2, hit[..., 1], hit[..., 2])
     columns, rows = (w % _PERIOD * (_TEXELS / _PERIOD) for w in (u, v))
-    rows += texture * (_TEXELS + 1)  # each lies below the one before, with its first row repeated
+    rows += texture * (_TEXELS + 1)  # Stacked, each with its first row repeated.
     shape = (best.shape[0], -1)
     atlas = np.concatenate([np.pad(t, ((0, 1), (0, 1), (0, 0)), mode="wrap") for t in textures])
     seen = cv2.remap(
@@ -93,7 +93,7 @@ def render(
 
 
 def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
-    """Textures of several scales, float32 [_TEXELS, _TEXELS, 3], that repeat without a seam."""
+    """Seamless textures with several scales, float32 [_TEXELS, _TEXELS, 3]."""
     rng = np.random.default_rng(_SEED)
     made = []
     for _ in range(count):
@@ -119,7 +119,7 @@ def _leave(start: Any, step: Any, walls: Floats) -> tuple[Any, Any]:
 
 
 def _enter(start: Any, step: Any, box: Any) -> tuple[Any, Any]:
-    """Where rays enter a box, infinite where they miss it, and the axis."""
+    """Intersections of rays with a box: ray parameter, infinite for a miss, and axis."""
     one, two = (box[0] - start) * step, (box[1] - start) * step
     near, far = np.minimum(one, two), np.maximum(one, two)
     first, last = near.max(axis=-1), far.min(axis=-1)
@@ -128,7 +128,7 @@ def _enter(start: Any, step: Any, box: Any) -> tuple[Any, Any]:
 
 
 def look(centre: Floats, target: Floats) -> Floats:
-    """Poses [n, 3, 4] of level cameras at centres [n, 3] that look at targets [n, 3]."""
+    """Poses [n, 3, 4] of upright cameras at centres [n, 3] that look at targets [n, 3]."""
     z = target - centre
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     x = np.cross(z, [0.0, 0.0, 1.0])

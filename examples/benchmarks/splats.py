@@ -1,15 +1,16 @@
-"""Measure how 3D Gaussians trained from `reconstruct`'s folder look, beside those from SIFT's.
+"""Measure renderings of 3D Gaussians trained from the folders of `reconstruct` and of SIFT.
 
 python examples/benchmarks/splats.py --cache benchmark_phone
 
-For each clip the two folders of `phone_to_folder.py` are made, in its cache, and Gaussians are
-trained on half of the images of each, from its own poses and points, and rendered for the others;
-of `reconstruct`, from the Gaussians of `--gaussians`, too, and from these while training adds none;
-and from those that `densify --gaussians` makes on the poses that SIFT led to.
-All pictures are undistorted as `reconstruct` does it: renderings are held against them, and come
-nearer to those that another program leaves a little softer, whatever was trained from.
-The trainer is a small one for CPUs, `../shared/tools/gs_cpu`: what it gives is to be compared with
-what it gives for another cloud, not with other trainers' figures. Its time is of training alone.
+For each clip, the two folders of `phone_to_folder.py` are created in its cache. Gaussians are
+trained on half of the images of each, from its poses and points, and rendered for the other half.
+For `reconstruct`, training also starts from the Gaussians of `--gaussians`, with and without
+densification, and from those of `densify --gaussians` on SIFT's poses.
+
+All pictures are undistorted by the code of `reconstruct`, because renderings score higher against
+the slightly softer pictures of another program. The trainer is a small one for CPUs,
+`../shared/tools/gs_cpu`: compare its figures only with each other, not with other trainers. Times
+are those of training only.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
 FROM_GAUSSIANS = Path(__file__).with_name("train_from_gaussians.py")
 OURS = render.SPLAT_WAYS[1:-1]
 GAUSSIANS, NONE_ADDED, ON_SIFT = render.SPLAT_WAYS[-3:]
-# Which frames become images, where that differs from the other benchmark.
+# Options of images, for clips where they differ from `phone_to_folder.py`.
 IMAGES = {"kitchen": ImageOptions(every=4)}
 WIDTH, ITERATIONS = 225, 3000
 MILESTONES = (100, 200, 300, 400, 600, 800, 1000, 1250, 1500, 2000, 2500, ITERATIONS)
@@ -55,7 +56,7 @@ FIGURES = {"iter": "iterations", "cpu_s": "cpu_s", "gaussians": "gaussians"} | {
 
 
 def main() -> int:
-    """Train on every clip, all ways, and keep and print the table."""
+    """Train on every clip in all ways, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -90,7 +91,7 @@ def main() -> int:
 
 
 def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
-    """The images and the model that one way makes of a clip, undistorted."""
+    """The undistorted images and model of a clip by one way."""
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
     if way in OURS:
         return output / "images", output / "sparse" / "0"
@@ -122,7 +123,7 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
 
 
 def undistort_images(model: Path, images: Path, output: Path) -> None:
-    """Write the undistorted images of a model of one camera into a folder."""
+    """Write the undistorted images of a model with a single camera to a folder."""
     reconstruction = read_model(model)
     (camera,) = reconstruction.cameras.values()
     change = undistortion(camera, pinhole_camera(camera))
@@ -132,7 +133,7 @@ def undistort_images(model: Path, images: Path, output: Path) -> None:
 
 
 def undistort_model(model: Path, output: Path) -> None:
-    """Write a model of one camera with the undistorted one."""
+    """Write a model with a single camera with its undistorted camera."""
     reconstruction = read_model(model)
     (camera,) = reconstruction.cameras.values()
     pinhole = pinhole_camera(camera)
@@ -147,7 +148,7 @@ def undistort_model(model: Path, output: Path) -> None:
 def train(
     images: Path, model: Path, folder: Path, seed: int, way: str
 ) -> Iterator[dict[str, Value]]:
-    """Train from a model's points, or Gaussians of these, and give what is measured on the way."""
+    """Train from a model's points, or from Gaussians of these; returns rows of the milestones."""
     cloud, output = folder / "cloud.npz", folder / f"seed_{seed}"
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)

@@ -1,10 +1,10 @@
-"""Measure tracks and the models mapped from them, beside SIFT's, on sequences with known poses.
+"""Measure tracks and their models on sequences with known poses, compared with SIFT.
 
 python examples/benchmarks/tracks.py --cache benchmark_tracks
 
-Each sequence is encoded once as AV1 and its frames are written as images; every front-end gets
-these. What is measured stays in the cache: a run that was stopped is resumed, and only what has
-changed is measured again. The rendered clip is always there, the sequences lie in ../shared.
+Each sequence is encoded once as AV1, and its frames are written as images for all front-ends.
+Results stay in the cache: an interrupted run resumes, and only changed front-ends are measured
+again. The rendered clip is always measured; the other sequences are in ../shared.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 
-# Given the pictures the video was made from, not those decoded from it.
+# Front-ends that get the original pictures, not those decoded from the AV1 video.
 FROM_SOURCE = {
     "sift-sequential-source": "sift-sequential",
     "sift-exhaustive-source": "sift-exhaustive",
 }
-# Where few and accurate tracks give the poses, all are triangulated on them.
+# Front-ends with few, accurate tracks for the poses, on which all tracks are triangulated.
 ALL_TRACKS = {
     "av1-sparse": DensifyOptions(),
     "av1-refined-sparse": DensifyOptions(match=MatchOptions(refine=RefineOptions(refine="lk"))),
@@ -87,7 +87,7 @@ ALL_TRACKS = {
 
 @dataclass(frozen=True)
 class Row:
-    """What one front-end gave; what could not be measured is None."""
+    """Figures of one front-end; None if not measured."""
 
     frontend: str
     run: FrontendRun
@@ -102,14 +102,14 @@ class Row:
 
 
 def main() -> int:
-    """Measure every front-end on every sequence and print the tables."""
+    """Measure every front-end on every sequence, and print the tables."""
     names = [case.name for case in CASES]
     parser = argparse.ArgumentParser(
-        description="Measure tracks and the models mapped from them, beside SIFT's.",
+        description="Measure tracks and their models, compared with SIFT.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
-        "--cache", type=Path, help="folder that keeps all results; without, a temporary one"
+        "--cache", type=Path, help="folder that keeps all results [a temporary one]"
     )
     parser.add_argument(
         "--sequences",
@@ -129,8 +129,8 @@ def main() -> int:
     )
     parser.add_argument(
         "--camera_model",
-        help="COLMAP's camera model where the intrinsics are unknown; without, SIMPLE_RADIAL, "
-        "and RADIAL where match estimates the focal length",
+        help="COLMAP's camera model for unknown intrinsics [SIMPLE_RADIAL, or RADIAL if match "
+        "estimates the focal length]",
     )
     parser.add_argument("--no_mapping", action="store_true", help="measure only the tracks")
     add_results(parser, "tracks")
@@ -162,7 +162,7 @@ def main() -> int:
 def measure_case(
     case: Case, folder: Path, arguments: argparse.Namespace, console: Console
 ) -> list[dict[str, Value]]:
-    """Figures of one sequence, a row for each front-end."""
+    """Figures of one sequence, one row for each front-end."""
     mapping = not arguments.no_mapping
     material = material_of(case, folder, console)
     unknown = CameraOptions(camera_model=arguments.camera_model)
@@ -210,7 +210,7 @@ def measure_case(
 
 
 def source_footage(footage: Footage, material: Material, folder: Path) -> Footage:
-    """The same footage with the pictures the video was made from."""
+    """The same footage with the original pictures."""
     assert material.source is not None
     words = material.source
     images = folder / "source" / "images"
@@ -232,7 +232,7 @@ def measure_row(
     material: Material,
     truth: Truth,
 ) -> Row:
-    """Figures of a filled database and, where it was mapped, of its model."""
+    """Figures of a filled database and, if it was mapped, of its model."""
     tracks = database_tracks(run.database, material.num_frames)
     epipolar = None
     if truth.geometry is not None:
@@ -260,7 +260,7 @@ def measure_row(
 def exact_by_span(
     tracks: Tracks, transfer: Callable[..., Any] | None
 ) -> dict[int, tuple[float, float]] | None:
-    """Median and 90th percentile in pixels of the exact error; None without exact truth."""
+    """Median and 90th percentile in pixels of the exact error; None without exact ground truth."""
     if transfer is None:
         return None
     by_span = {}
@@ -271,7 +271,7 @@ def exact_by_span(
 
 
 def track_figures(row: Row) -> dict[str, Value]:
-    """The figures of tracks, as `results/tracks.csv` names them."""
+    """The figures of tracks, with the column names of `results/tracks.csv`."""
     about = row.statistics
     figures: dict[str, Value] = {"tracks": about.num_tracks}
     for length, count in zip(render.LENGTHS, about.tracks_by_length.values(), strict=True):
@@ -287,7 +287,7 @@ def track_figures(row: Row) -> dict[str, Value]:
 
 
 def model_figures_of(row: Row, name: str) -> dict[str, Value]:
-    """The figures of the model and of what it took, as `results/tracks.csv` names them."""
+    """Figures and cost of the model, with the column names of `results/tracks.csv`."""
     memory = row.run.peak_memory
     figures: dict[str, Value] = {
         "frontend_cpu_s": row.run.cpu_seconds,
@@ -301,7 +301,7 @@ def model_figures_of(row: Row, name: str) -> dict[str, Value]:
         figures["points"] = row.model.num_points
         figures["error_px_mean"] = row.model.mean_error
         figures["error_px_median"] = row.model.median_error
-    # The reference has no error against itself.
+    # Omit the errors of the reference against itself.
     if row.pose_errors is not None and (name != REFERENCE or row.poses_are_true):
         figures["ate"] = row.pose_errors.ate
         figures["ate_of_extent"] = row.pose_errors.ate / row.pose_errors.extent

@@ -1,9 +1,9 @@
-"""Run the trainer for CPUs of `../shared` on a file of Gaussians in place of points.
+"""Run the CPU trainer of `../shared` from a file of Gaussians instead of points.
 
 python examples/benchmarks/train_from_gaussians.py init.ply TRAINER_FOLDER ARGUMENTS_OF_gs_train...
 
-That trainer starts from points alone. Here what it makes of them is replaced by what
-`reconstruct --gaussians init.ply` wrote; all else is its own.
+The trainer accepts only points. This script replaces its initial Gaussians with those that
+`reconstruct --gaussians init.ply` wrote, and changes nothing else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _Floats = NDArray[np.float32]
 
 
 def read_gaussians(path: Path) -> dict[str, _Floats]:
-    """The parameters by the names that the trainer gives them, float32 [n, ...]."""
+    """The parameters of the Gaussians by the trainer's names, float32 [n, ...]."""
     with path.open("rb") as file:
         header = iter(file.readline, b"end_header\n")
         names = [line.split()[-1].decode() for line in header if line.startswith(b"property")]
@@ -36,7 +36,7 @@ def read_gaussians(path: Path) -> dict[str, _Floats]:
         "rot": columns("rot", range(4)),
         "op": column["opacity"][:, None],
         "dc": columns("f_dc", range(3)),
-        # Of the first degree; all are 0.
+        # Coefficients of degree 1, which are all 0.
         "rest": columns("f_rest", range(9)),
     }
 

@@ -1,12 +1,12 @@
-"""Measure the verification of image pairs beside COLMAP's, on the same pairs and matches.
+"""Measure the verification of image pairs, compared with COLMAP on the same pairs and matches.
 
 python examples/benchmarks/verification.py --cache benchmark_verification
 
-`match` fills a database for each video. Then `verify_pairs` and pycolmap's `verify_matches` take
-turns on it, each in a process of its own and with all CPUs, COLMAP with two seeds in turn: what it
-disagrees on with itself no other implementation can agree on. CPU times leave out imports and
-reading the database, COLMAP's holds its writing of the rows. The rendered clip is always there,
-the sequences lie in ../shared.
+`match` fills a database for each video. Then `verify_pairs` and pycolmap's `verify_matches` verify
+it alternately, each in a separate process with all CPUs. COLMAP runs with two seeds, because its
+agreement with itself is the best that another implementation can reach. CPU times exclude imports
+and reading the database; COLMAP's include writing the rows. The rendered clip is always measured;
+the other sequences are in ../shared.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ NAMES = ("scene", "street", "log_building", "ditch", "shelfbox")
 
 @dataclass(frozen=True)
 class Verified:
-    """CPU seconds of a verification, and by pair id the config and the inlier matches."""
+    """CPU seconds of a verification, and the config and inlier matches by pair id."""
 
     cpu_seconds: float
     geometries: dict[int, tuple[int, NDArray[np.uint32]]]
 
 
 def main() -> int:
-    """Fill the databases that are absent, verify each in turns, print a table."""
+    """Fill missing databases, verify each alternately, and print a table."""
     parser = argparse.ArgumentParser(
-        description="Measure verification beside COLMAP's.",
+        description="Measure verification, compared with COLMAP.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
-        "--cache", type=Path, help="folder that keeps videos and databases; without, temporary"
+        "--cache", type=Path, help="folder that keeps videos and databases [a temporary one]"
     )
-    parser.add_argument("--repeats", type=int, default=2, help="runs of each, in turns")
+    parser.add_argument("--repeats", type=int, default=2, help="number of runs of each")
     parser.add_argument(
         "--preset", choices=["sparse", "default", "dense"], default="dense", help="tracks to match"
     )
@@ -89,7 +89,7 @@ def main() -> int:
 
 
 def fill_database(name: str, preset: str, cache: Path) -> Path:
-    """The database of a clip, filled unless the cache holds it."""
+    """The database of a clip, filled in the cache if it is missing."""
     database = cache / f"{name}_{preset}.db"
     if database.exists():
         return database
@@ -110,7 +110,7 @@ def fill_database(name: str, preset: str, cache: Path) -> Path:
 
 
 def measure(database: Path, repeats: int, cache: Path) -> dict[str, Value]:
-    """Figures of a database."""
+    """Verify a database repeatedly; returns the figures."""
     log = cache / "log.txt"
     ours, theirs = [], []
     for turn in range(repeats):
@@ -185,7 +185,7 @@ def verify_with_colmap(database: Path, seed: int) -> Verified:
 
 
 def agreement(a: Verified, b: Verified) -> tuple[float, float, float]:
-    """Share of pairs with the same config; mean Jaccard index; share of pairs at 0.98 or above."""
+    """Share of pairs with equal config, mean Jaccard index of inliers, and its share >= 0.98."""
     same, overlap = [], []
     for pair_id, (config, inliers) in b.geometries.items():
         other_config, other = a.geometries[pair_id]

@@ -188,7 +188,7 @@ def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
         run_batch(clips, out, DensifyOptions())
     with pytest.raises(OptionError, match="models is for"):
         run_batch(clips, out, ReconstructOptions(), models=tmp_path)
-    with pytest.raises(OptionError, match="no options of a batch"):
+    with pytest.raises(OptionError, match="not a task of a batch"):
         run_batch(clips, out, RunOptions())
     with pytest.raises(OptionError, match="give engine ray"):
         BatchOptions(address="auto")

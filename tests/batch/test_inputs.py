@@ -51,11 +51,11 @@ def test_lists(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("empty.txt", "holds no video"),
-        ("nothing*", "holds no video"),
-        ("empty", "holds no video"),
+        ("empty.txt", "has no video"),
+        ("nothing*", "has no video"),
+        ("empty", "has no video"),
         ("none.mp4", "no such file or folder"),
-        ("binary", "line 1 is no path"),
+        ("binary", "line 1 is not a path"),
         ("gopher9://x/y.mp4", "Protocol not known"),
     ],
 )

@@ -86,7 +86,7 @@ def test_a_command_renders_at_milestones(split: Split) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("str(stop)", "str(stop + 1)", r"renders/2: holds 0 renderings for 2 test images"),
+        ("str(stop)", "str(stop + 1)", r"renders/2: has 0 renderings for 2 test images"),
         ("iterations,seconds", "steps,seconds", r"times.csv: cannot be read: let the trainer's"),
         ("{2 * stop}", "nan", r"times.csv: cannot be read: let the trainer's"),
     ],
@@ -124,9 +124,9 @@ def test_tables_of_a_report() -> None:
     bare = Column("disk")
     table = renderings_table([own, bare, sift])
     rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
-    assert rows["av1"]["baseline's PSNR-Y after"] == rows["av1"]["its VMAF after"] == "50%"
-    assert rows["sift-sequential"]["its VMAF after"] == "100%"
-    assert rows["disk"]["its VMAF after"] == "-"
+    assert rows["av1"]["time to baseline PSNR-Y"] == rows["av1"]["time to baseline VMAF"] == "50%"
+    assert rows["sift-sequential"]["time to baseline VMAF"] == "100%"
+    assert rows["disk"]["time to baseline VMAF"] == "-"
     assert "The baseline is sift-sequential" in table.about
 
     on_the_way = milestones_table([own, bare, sift])

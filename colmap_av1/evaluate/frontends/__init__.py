@@ -1,1 +1,1 @@
-"""The front-ends that are compared, the images they share, and the mapper on their databases."""
+"""The compared front-ends, their common images, and mapping of their databases."""

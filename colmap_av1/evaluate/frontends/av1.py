@@ -18,14 +18,14 @@ Preset = Literal["sparse", "default", "dense"]
 def av1_frontend(
     refine: Literal["none", "lk"], preset: Preset, options: MatchOptions | None = None
 ) -> Frontend:
-    """This package's `match`, with the given refinement and preset in some options."""
+    """This package's `match`, with the given options except refinement and preset."""
     options = options if options is not None else MatchOptions()
     given = replace(
         options,
         refine=replace(options.refine, refine=refine),
         density=replace(options.density, preset=preset),
     )
-    # Where the stream lies does not change the result.
+    # The location of the stream does not change the result.
     anywhere = replace(given, keep_stream=None)
     return Frontend(partial(_match, given), lambda _: (anywhere,))
 

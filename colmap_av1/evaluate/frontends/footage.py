@@ -1,4 +1,4 @@
-"""The images of a video that every front-end is given."""
+"""The video, images and camera that every front-end gets."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ from colmap_av1.video.unchanged import unchanged
 
 @dataclass(frozen=True)
 class Footage:
-    """What every front-end is given.
+    """The input of every front-end.
 
     Attributes:
-        video: a video.
-        image_path: folder that holds the images, decoded from the video or what it was made of.
-        names: the images' file names, in display order.
-        frames: the video's frames that are images.
-        num_frames: shown frames of the video.
-        size: (width, height) of the images.
+        video: the video.
+        image_path: folder of the images, decoded from the video or from its original.
+        names: file names of the images, in display order.
+        frames: frame index of each image.
+        num_frames: number of shown frames of the video.
+        size: (width, height) of the images in pixels.
         pixel_aspect: width of a pixel over its height.
-        camera: the camera of all images.
-        forward_motion: the camera moves along its axis, see `MatchReport`.
-        warnings: what was noticed while the images were chosen.
-        existed: others wrote the images, which may be scaled.
+        camera: camera options of all images.
+        forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
+        warnings: warnings from choosing the images.
+        existed: whether the images existed before; such images may be scaled.
     """
 
     video: Path
@@ -64,14 +64,14 @@ class Footage:
 def prepare_footage(
     video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
 ) -> Footage:
-    """Write the video's frames as the images that every front-end gets.
+    """Write frames of a video at regular steps as the images that every front-end gets.
 
     Args:
         video: an AV1 video.
-        folder: gets `images/`; what is there of the same video is kept.
+        folder: gets `images/`; existing images of the same video are kept.
         num_frames: number of frames of the video.
-        image_step: distance between the frames that are images.
-        camera: the camera of all images.
+        image_step: step between the frames that become images.
+        camera: camera options of all images.
 
     Raises:
         VideoError: the video cannot be read.
@@ -107,17 +107,18 @@ def choose_footage(
     image_path: Path | None = None,
     progress: Progress = no_progress,
 ) -> Footage:
-    """Choose the video's frames that are images, as `match` does, and write them.
+    """Choose the frames of a video that become images, as `match` does, and write them.
 
     Args:
-        video: a video; one that is not AV1 is converted first.
-        folder: what is there of the same video and options is kept.
-        options: those of the images, of reading and of the camera are used.
-        image_path: folder of images that exist or are written; None: `images/` in the folder.
-        progress: called with a stage's name, what is done, and of how much where known.
+        video: a video; a video that is not AV1 is converted first.
+        folder: folder for the results; results of the same video and options are kept.
+        options: options of images, reading, encoding, tracks and the camera.
+        image_path: folder of existing images, or to write images to; None: `images/` in the
+            folder.
+        progress: called with a stage's name, the amount of work done, and the total if known.
 
     Raises:
-        ColmapAv1Error: as `match` says.
+        ColmapAv1Error: see `match`.
     """
     images = image_path if image_path is not None else folder / "images"
 
@@ -162,12 +163,12 @@ def choose_footage(
 
 
 def frame_list(footage: Footage, path: Path, names: Collection[str] | None = None) -> str:
-    """Write which frames the images are, as `frame_list` of ImageOptions reads it.
+    """Write the frame and name of each image, in the format of `ImageOptions.frame_list`.
 
     Args:
         footage: the images.
         path: the file.
-        names: the images that are listed; all if None.
+        names: names of the images to list; all if None.
 
     Returns:
         The file's path.
@@ -178,7 +179,7 @@ def frame_list(footage: Footage, path: Path, names: Collection[str] | None = Non
 
 
 def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOptions) -> bool:
-    """Whether the camera moves along its axis; decided only with known intrinsics."""
+    """Whether the camera moves along its optical axis; False if the intrinsics are unknown."""
     if options.camera.camera_params is None:
         return False
     tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
@@ -194,6 +195,6 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
             min_length=least_length(options.tracks),
             context=context,
         )
-    except VideoError:  # no two images share tracks; other front-ends may still match them
+    except VideoError:  # No two images share tracks, but other front-ends may still match them.
         return False
     return verify_images(paired, camera, options.verify, context).forward_motion

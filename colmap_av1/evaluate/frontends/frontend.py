@@ -1,4 +1,4 @@
-"""A front-end: images or a video in, rows of a COLMAP database out; and a run of one."""
+"""The interface of a front-end, which fills a COLMAP database, and a measured run of one."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.util.digests import digest_of, file_digest
 from colmap_av1.util.stages import WHOLE_PACKAGE, run_stage_in
 
-# Whose code changes what other programs give: an upgrade of the rest does not repeat them.
+# Only changes of this code affect the results of other programs. Changes elsewhere in the package
+# do not repeat their runs.
 OF_OTHERS = ("evaluate/frontends",)
 
 
 @dataclass(frozen=True)
 class FrontendRun:
-    """A database and what it took to fill it.
+    """A database and the cost of filling it.
 
     Attributes:
         name: the front-end.
         database: the COLMAP database.
         seconds: wall time of each stage.
-        cpu_seconds: CPU time of all stages together.
-        peak_memory: largest resident memory in bytes; None where the system does not report it.
+        cpu_seconds: total CPU time of all stages.
+        peak_memory: largest resident memory in bytes; None if the system does not report it.
     """
 
     name: str
@@ -43,13 +44,13 @@ class Frontend:
     """One way to fill a database.
 
     Attributes:
-        run: fills the given database, which does not exist yet, from the footage, and returns
-            the wall time of each stage. Called in a process of its own.
-        depends_on: what a result depends on beside name, video, frames and camera, see
+        run: creates the given database from the footage, and returns the wall time of each stage.
+            Called in a separate process.
+        depends_on: what the result depends on in addition to name, video, frames and camera, see
             `digest_of`.
         made_by: folders of this package whose code changes the result.
-        check: refuses what the front-end cannot run without, before any long work.
-        files: files of the user that it reads beside the footage.
+        check: raises an error if a requirement is missing; called before any long work.
+        files: further input files of the user.
     """
 
     run: Callable[[Footage, Path], dict[str, float]]
@@ -62,17 +63,17 @@ class Frontend:
 def run_measured_frontend(
     name: str, footage: Footage, folder: Path, frontend: Frontend
 ) -> FrontendRun:
-    """Fill a database and measure what it takes; a finished run is not repeated.
+    """Fill a database and measure the cost; a finished run is not repeated.
 
     Args:
-        name: of the front-end.
+        name: name of the front-end.
         footage: video and images.
         folder: gets `database.db`, `log.txt` and the figures.
         frontend: the front-end.
 
     Raises:
         ColmapAv1Error: the front-end refuses the footage.
-        EvaluationError: it failed.
+        EvaluationError: the front-end failed.
     """
     database = folder / "database.db"
 
@@ -98,7 +99,7 @@ def run_measured_frontend(
 
 
 def camera_model(footage: Footage) -> str:
-    """COLMAP's name of the camera model of images whose focal length no front-end estimates."""
+    """COLMAP's name of the camera model, for front-ends that do not estimate the focal length."""
     return str(make_camera(footage.camera, *footage.size, footage.pixel_aspect).model_name)
 
 
@@ -108,12 +109,13 @@ def images_digest(footage: Footage) -> str:
 
 
 def list_images(footage: Footage, database: Path) -> None:
-    """Make a database of the images, as COLMAP does."""
+    """Create a database with the images and one camera, without features."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model(footage)
     reader.camera_params = footage.camera.camera_params or ""
     pycolmap.Database.open(database).close()
-    # Threads of the extraction would number the images in the order in which they finish.
+    # Imported first, for deterministic ids: the extraction inserts images in the order in which
+    # its threads finish.
     mode = pycolmap.CameraMode.SINGLE
     pycolmap.import_images(
         database, footage.image_path, mode, image_names=footage.names, options=reader

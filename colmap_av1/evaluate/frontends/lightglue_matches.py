@@ -1,9 +1,10 @@
-"""Learned features and LightGlue's matches, as a program: torch and pycolmap share no process.
+"""Program that extracts learned features and matches them with LightGlue.
 
-Standard input: a JSON object as `colmap_av1.evaluate.frontends.learned` writes it; standard
-output: the wall time of each stage. The files have hloc's layout, positions counted from the first
-pixel's centre. Where the packages are missing, one line on standard error says so, with exit
-status 3. Imports nothing of the package.
+It runs in a separate process because torch and pycolmap must not share one, and imports nothing
+from this package. Standard input is a JSON object written by
+`colmap_av1.evaluate.frontends.learned`; standard output is a JSON object with the wall time of each
+stage. The output files have hloc's layout, with the first pixel's centre at (0, 0). If a package is
+missing, the program prints one line on standard error and exits with status 3.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _EXTRACTORS = {"disk": DISK, "aliked": ALIKED}
 
 
 def main() -> int:
-    """Extract and match as the JSON on standard input says."""
+    """Run the task given on standard input."""
     task = json.load(sys.stdin)
     torch.set_num_threads(task["num_threads"])
     torch.manual_seed(0)
@@ -67,11 +68,11 @@ def main() -> int:
 
 
 def _extract(extractor: Any, path: str, max_size: int, device: str) -> dict[str, torch.Tensor]:
-    # OpenCV opens no path that is not UTF-8.
+    # cv2.imread cannot open paths that are not UTF-8.
     pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
     image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
     tensor = torch.from_numpy(image).permute(2, 0, 1).float() / 255
-    # Images are never enlarged.
+    # Do not enlarge small images.
     features: dict[str, torch.Tensor] = extractor.extract(
         tensor.to(device), resize=min(max_size, max(image.shape[:2]))
     )
@@ -83,7 +84,7 @@ def _array(tensor: torch.Tensor) -> Any:
 
 
 def _part(name: str) -> str:
-    """An image's name as it stands in the name of a pair."""
+    """An image's name as hloc writes it in the name of a pair."""
     return name.replace("/", "-")
 
 

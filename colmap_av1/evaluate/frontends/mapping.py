@@ -1,4 +1,4 @@
-"""COLMAP's mappers on the database of a front-end, dense points on its poses, measured."""
+"""Measured runs of COLMAP's mappers on a front-end's database, and of `densify` on its poses."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from colmap_av1.util.stages import run_stage_in
 
 @dataclass(frozen=True)
 class MapperRun:
-    """A mapped database and what it took.
+    """A mapped database and the cost of mapping it.
 
     Attributes:
-        model: folder of the model with the most images; None where no model came out.
-        num_models: models that came out.
+        model: folder of the model with the most images; None if there is no model.
+        num_models: number of models.
         seconds: wall time of the mapper.
-        cpu_seconds: its CPU time.
-        peak_memory: largest resident memory in bytes; None where the system does not report it.
+        cpu_seconds: CPU time of the mapper.
+        peak_memory: largest resident memory in bytes; None if the system does not report it.
     """
 
     model: Path | None
@@ -42,7 +42,7 @@ class MapperRun:
 def measure_mapper(
     database: Path, image_path: Path, folder: Path, options: MapOptions | None = None
 ) -> MapperRun:
-    """Map a database in a process whose time and memory are measured.
+    """Map a database in a separate process, and measure its time and memory.
 
     A finished run is not repeated.
 
@@ -50,7 +50,7 @@ def measure_mapper(
         database: COLMAP database with verified matches; a copy of it is mapped.
         image_path: folder of its images, for the points' colours.
         folder: gets the models, `log.txt` and the figures.
-        options: which mapper, and how; the defaults of MapOptions if None.
+        options: the mapper and its options; the defaults of MapOptions if None.
 
     Raises:
         EvaluationError: the mapper failed.
@@ -59,7 +59,7 @@ def measure_mapper(
     model = folder / "model"
 
     def make() -> dict[str, Any]:
-        # pycolmap brings a database to its own layout.
+        # Map a copy: pycolmap migrates a database to its own layout.
         copy = folder / "mapped.db"
         shutil.copyfile(database, copy)
         measured = run_measured(_map, copy, image_path, model, options, log=folder / "log.txt")
@@ -93,10 +93,10 @@ def densify_model(
         model: folder of the model.
         footage: video and images.
         folder: gets the model, `log.txt` and the figures.
-        options: as of `densify`; the images are those of the footage.
+        options: options of `densify`; the images are taken from the footage.
 
     Raises:
-        ColmapAv1Error: as `densify` says.
+        ColmapAv1Error: see `densify`.
     """
     options = options if options is not None else DensifyOptions()
     output = folder / "model"
@@ -116,7 +116,7 @@ def densify_model(
         }
 
     inputs = [file_digest(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
-    # Where the stream lies does not change the result.
+    # The location of the stream does not change the result.
     anywhere = replace(options, match=replace(options.match, keep_stream=None))
     given = (inputs, footage.names, footage.frames, anywhere)
     return MapperRun(

@@ -1,4 +1,4 @@
-"""Time and memory of a call, in a process of its own."""
+"""Measuring the time and memory of a function call in a separate process."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Measured(Generic[_Result]):
-    """What a call returned and what it took.
+    """Result and cost of a call.
 
     Attributes:
-        result: what it returned.
+        result: the return value.
         seconds: wall time.
-        cpu_seconds: CPU time of all its threads and of the processes it waited for.
-        peak_memory: largest resident memory of its process, or of one it waited for, in bytes,
-            the interpreter and its libraries included; None where the system does not report it.
+        cpu_seconds: CPU time of all threads and of all child processes that have ended.
+        peak_memory: largest resident memory in bytes of the process or of one of these children,
+            including the interpreter and libraries; None if the system does not report it.
     """
 
     result: _Result
@@ -43,25 +43,25 @@ class Measured(Generic[_Result]):
 
 
 def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Measured[_Result]:
-    """Call a function in a fresh process, so that nothing else counts towards its figures.
+    """Call a function in a new process, so that its figures include nothing else.
 
     Args:
-        function: a function that can be pickled, as its arguments and its result can.
+        function: a function; it, its arguments and its result must be picklable.
         args: its arguments.
-        log: file that gets what it and its libraries print.
+        log: file that gets the output of the function and its libraries.
 
     Raises:
-        ColmapAv1Error: the one the function raised.
-        EvaluationError: it failed otherwise, or its process died; the log says more.
+        ColmapAv1Error: the function raised it.
+        EvaluationError: the function raised another error or its process died; see the log.
     """
-    # Fresh, not forked: a fork has the parent's threads' locks and its peak memory.
+    # Spawned, not forked: a forked process inherits locks and the peak memory of its parent.
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_call, args=(os.getpid(), sender, log, function, args))
     if os.name == "posix":
-        resource_tracker.ensure_running()  # its start lets interrupts through
+        resource_tracker.ensure_running()  # Starting it later would unblock signals.
     try:
-        with held_back():  # while it starts an interrupt would be answered by a trace of its own
+        with held_back():  # An interrupt would make the starting process print a traceback.
             process.start()
         sender.close()
         outcome = receiver.recv()
@@ -83,13 +83,13 @@ def run_measured(function: Callable[..., _Result], *args: Any, log: Path) -> Mea
 
 
 def _end(process: BaseProcess) -> None:
-    """End a process, and those it started."""
+    """Kill a process and the processes that it started."""
     if process.pid is None:
         return
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
-    process.kill()  # pycolmap would answer SIGTERM with a stack trace
+    process.kill()  # pycolmap prints a stack trace on SIGTERM.
 
 
 def _call(
@@ -103,7 +103,7 @@ def _call(
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)
     with log.open("ab") as file:
-        # Libraries write to the descriptors, not to sys.stdout and sys.stderr.
+        # C++ libraries write to the file descriptors, not to sys.stdout and sys.stderr.
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     let_through()
@@ -122,14 +122,14 @@ def _call(
 
 
 def _peak_memory() -> int | None:
-    # Linux's ru_maxrss keeps the peak of the process that started this one.
+    # On Linux, ru_maxrss includes the peak of the parent process, VmHWM does not.
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
-                # A process it waited for counts from this one's size at its start, not below.
+                # A child's peak is at least the size of this process when it started the child.
                 return max(int(line.split()[1]), _peak_of_children()) * 1024
     if sys.platform == "darwin":
-        import resource  # noqa: PLC0415 - there is none on Windows
+        import resource  # noqa: PLC0415 - not available on Windows
 
         own = int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
         return max(own, _peak_of_children())
@@ -137,6 +137,6 @@ def _peak_memory() -> int | None:
 
 
 def _peak_of_children() -> int:
-    import resource  # noqa: PLC0415 - there is none on Windows
+    import resource  # noqa: PLC0415 - not available on Windows
 
     return int(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)

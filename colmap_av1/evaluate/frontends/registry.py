@@ -1,4 +1,4 @@
-"""All front-ends by their names: one file each, behind the interface of `frontend`."""
+"""All front-ends by name."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from colmap_av1.options import LearnedOptions, MatchOptions
 def make_frontends(
     match: MatchOptions | None = None, learned: LearnedOptions | None = None
 ) -> dict[str, Frontend]:
-    """All front-ends by their names.
+    """All front-ends by name.
 
     Args:
-        match: options of this package's; refinement and preset are those of the name.
-        learned: options of the learned ones.
+        match: options of this package's front-ends, except refinement and preset.
+        learned: options of the learned front-ends.
     """
     return {
-        # What a mapper gets from the bitstream alone; `-refined` after a look at the pictures.
+        # "av1" uses the bitstream alone; "av1-refined" refines tracks in the decoded pictures.
         "av1": av1_frontend("none", "default", match),
         "av1-sparse": av1_frontend("none", "sparse", match),
         "av1-dense": av1_frontend("none", "dense", match),
@@ -47,18 +47,18 @@ FRONTENDS = make_frontends()
 def run_frontend(
     name: str, footage: Footage, folder: Path, frontend: Frontend | None = None
 ) -> FrontendRun:
-    """Fill a database and measure what it takes; a finished run is not repeated.
+    """Fill a database and measure the cost; a finished run is not repeated.
 
     Args:
         name: one of FRONTENDS, or the name of `frontend`.
         footage: video and images.
         folder: gets `database.db`, `log.txt` and the figures.
-        frontend: the front-end, where it is none of FRONTENDS.
+        frontend: the front-end, if it is not one of FRONTENDS.
 
     Raises:
-        OptionError: there is no such front-end.
+        OptionError: the name is unknown.
         ColmapAv1Error: the front-end refuses the footage.
-        EvaluationError: it failed.
+        EvaluationError: the front-end failed.
     """
     if frontend is None:
         if name not in FRONTENDS:

@@ -1,4 +1,4 @@
-"""COLMAP's SIFT as front-ends, matched sequentially or exhaustively."""
+"""Front-ends with COLMAP's SIFT, matched sequentially or exhaustively."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from colmap_av1.util.progress import Clock
 
 
 def sequential_sift() -> Frontend:
-    """Each image is matched with those after it."""
+    """SIFT; each image is matched with the following ones, by COLMAP's sequential matcher."""
     return _sift_frontend(_pair_sequentially)
 
 
 def exhaustive_sift() -> Frontend:
-    """All images are matched with each other."""
+    """SIFT; all image pairs are matched."""
     return _sift_frontend(_pair_exhaustively)
 
 

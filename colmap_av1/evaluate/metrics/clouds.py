@@ -1,4 +1,4 @@
-"""Distances between point clouds in the same coordinates, and between depths in the same images."""
+"""Distances between point clouds in the same coordinates, and depth differences in images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-# Images that a point is seen in at least to be compared with, and points that are nearest to one.
+# Smallest track length of a reference point, and number of nearby reference points to consider.
 _REFERENCE_LENGTH = 4
 _NEAREST = 3
 
@@ -19,11 +19,11 @@ class CloudDistances:
     """Distances between two point clouds, in the reference's unit.
 
     Attributes:
-        accuracy: mean distance from a point of the cloud to the nearest of the reference.
-        completeness: mean distance from a point of the reference to the nearest of the cloud.
-        hausdorff: the largest of all these distances; one stray point decides it.
-        robust_hausdorff: the larger of the two 95 % quantiles.
-        extent: diagonal of the box that holds the middle 90 % of the reference on each axis.
+        accuracy: mean distance from a point of the cloud to the nearest reference point.
+        completeness: mean distance from a reference point to the nearest point of the cloud.
+        hausdorff: the largest of all these distances, which a single outlier determines.
+        robust_hausdorff: the larger of the two 95th percentiles.
+        extent: diagonal of the box that contains the middle 90 % of the reference on each axis.
     """
 
     accuracy: float
@@ -45,10 +45,10 @@ def cloud_distances(
 
     Args:
         points: float64 [n, 3].
-        reference: float64 [m, 3], such as the cloud of a trusted front-end.
+        reference: float64 [m, 3], for example the cloud of a trusted front-end.
 
     Returns:
-        The distances; None where a cloud is empty.
+        The distances; None if a cloud is empty.
     """
     if len(points) == 0 or len(reference) == 0:
         return None
@@ -67,20 +67,20 @@ def cloud_distances(
 def depth_differences(
     model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction, *, pixels: float = 5.0
 ) -> NDArray[np.float64]:
-    """Relative differences of a model's depths to those of another model's points nearby.
+    """Relative differences between a model's depths and those of nearby reference points.
 
-    A point is looked at in the image in the middle of its track, and so are the three points of the
-    reference that lie nearest to it there, of those that four images or more see. The one of the
-    three that is nearest in depth counts, as at an edge others lie on what is behind.
+    Each point is projected into the middle image of its track. Of the three nearest reference
+    points there with four or more observations, the one with the most similar depth counts, because
+    at an occlusion boundary others lie on the background.
 
     Args:
         model: a pycolmap.Reconstruction.
-        reference: another one on the same poses, whose images have the same ids.
-        pixels: how far in the image the points of the reference may be.
+        reference: another model with the same poses and image ids.
+        pixels: largest distance in the image to a reference point, in pixels.
 
     Returns:
-        float64 [num_points], in the order of the ids: the difference as a share of the
-        reference's depth; NaN where no point of the reference is near.
+        float64 [num_points], in the order of the point ids: the difference divided by the
+        reference's depth; NaN if no reference point is near.
     """
     ids = sorted(model.points3D)
     xyz = point_cloud(model)
@@ -103,7 +103,7 @@ def depth_differences(
         xy, there = (np.array(column) for column in zip(*seen, strict=True))
         depth = np.append(there @ pose[2, :3] + pose[2, 3], np.nan)
         projected = np.asarray(model.cameras[image.camera_id].img_from_cam(in_camera))
-        # The index one beyond the last stands for none.
+        # KDTree returns len(xy) for a missing neighbour, whose depth here is NaN.
         _, near = KDTree(xy).query(projected, k=_NEAREST, distance_upper_bound=pixels)
         off = np.abs(in_camera[:, 2:] / depth[near] - 1)
         difference[own] = np.fmin.reduce(off, axis=1)

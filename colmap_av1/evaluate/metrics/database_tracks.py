@@ -1,4 +1,4 @@
-"""Tracks joined from the verified matches of a database, whichever front-end wrote them."""
+"""Tracks from the verified matches of a database."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from colmap_av1.util.graphs import connected_components
 def database_tracks(database: Path, num_frames: int) -> Tracks:
     """Join the verified matches of a database to tracks, as a mapper does.
 
-    Keypoints that inlier matches connect are one track. Where several of them lie in one image,
-    the matches contradict each other: none of that image's is in the track.
+    Keypoints connected by inlier matches form a track. If several of them lie in one image, the
+    matches contradict each other, and the track gets no observation in that image.
 
     Args:
-        database: COLMAP database; image names hold the frame's number from 0.
+        database: COLMAP database whose image names contain the frame number, from 0.
         num_frames: number of frames of the video.
 
     Returns:
-        Tracks of two observations or more. The expected error is not known: NaN.
+        Tracks with two or more observations. Their expected errors are unknown: NaN.
 
     Raises:
-        DatabaseError: it is no COLMAP database, is damaged, or its images differ in size, or there
-            is none.
-        ImageError: an image's name holds no frame number.
+        DatabaseError: the file is not a COLMAP database, is damaged, has no images, or has images
+            of different sizes.
+        ImageError: an image's name has no frame number.
     """
     names, sizes, keypoints, edge = _read(database)
     if len(sizes) != 1:
         raise DatabaseError(
-            f"{database}: holds images of {len(sizes)} sizes: give a database of one video"
+            f"{database}: has images of {len(sizes)} sizes: give a database of one video"
         )
     count = sum(map(len, keypoints))
     track = connected_components(count, edge)
@@ -72,7 +72,10 @@ def database_tracks(database: Path, num_frames: int) -> Tracks:
 def _read(
     database: Path,
 ) -> tuple[list[str], set[tuple[int, int]], list[NDArray[np.float32]], NDArray[np.int64]]:
-    """Names, sizes of cameras, keypoints [n, 2] of each image, and inliers between all of them."""
+    """Image names, camera sizes, keypoints [n, 2] of each image, and all inlier matches.
+
+    The matches, int64 [m, 2], are indices into the concatenated keypoints.
+    """
     with open_unaltered(database) as connection:
         images = dict(connection.execute("SELECT image_id, name FROM images ORDER BY image_id"))
         sizes = set(connection.execute("SELECT width, height FROM cameras").fetchall())
@@ -92,8 +95,8 @@ def _read(
             counts = [len(keypoints[i]) if i in images else 0 for i in (a, b)]
             if (inliers >= counts).any():
                 raise DatabaseError(
-                    f"{database}: images {a} and {b} match keypoints that are not there: "
-                    "'colmap-av1 check' says what else is wrong"
+                    f"{database}: images {a} and {b} match keypoints that do not exist: "
+                    "run 'colmap-av1 check' for a full list of problems"
                 )
             edges.append(inliers + np.array([first[a], first[b]]))
     return list(images.values()), sizes, list(keypoints.values()), np.concatenate(edges)

@@ -1,9 +1,9 @@
-"""LPIPS of image pairs, as a program: torch must not share a process with pycolmap.
+"""Program that measures LPIPS distances of image pairs.
 
-Standard input: a JSON list of [rendered file, reference file]; standard output: a JSON list
-of distances. Where the packages or the weights are missing, one line on standard error says
-so, with exit status 3. Run by `colmap_av1.evaluate.metrics.renderings`; imports nothing of
-the package.
+It runs in a separate process because torch and pycolmap must not share one, and imports nothing
+from this package. Standard input is a JSON list of [rendered file, reference file]; standard output
+is a JSON list of distances. If packages or weights are missing, the program prints one line on
+standard error and exits with status 3.
 """
 
 import contextlib
@@ -17,18 +17,18 @@ _NOT_HERE = 3
 def main() -> int:
     """Measure the pairs named on standard input."""
     try:
-        import cv2  # noqa: PLC0415 - after the check that torch is there, in any order
+        import cv2  # noqa: PLC0415 - the packages are optional
         import lpips  # noqa: PLC0415
         import numpy as np  # noqa: PLC0415
         import torch  # noqa: PLC0415
     except ImportError as error:
         print(f"LPIPS needs the package {error.name}: pip install lpips", file=sys.stderr)
         return _NOT_HERE
-    # The package carries the weights of the distance, torchvision fetches the network's.
+    # The package lpips includes the weights of the distance, but not those of the network.
     weights = Path(torch.hub.get_dir()) / "checkpoints" / "alexnet-owt-7be5be79.pth"
     if not weights.is_file():
         print(
-            f"LPIPS needs AlexNet's weights at {weights}: fetch them with torchvision",
+            f"LPIPS needs AlexNet's weights at {weights}: download them with torchvision",
             file=sys.stderr,
         )
         return _NOT_HERE
@@ -36,7 +36,7 @@ def main() -> int:
         distance = lpips.LPIPS(net="alex", verbose=False).eval()
 
     def read(path: str) -> "torch.Tensor":
-        # OpenCV opens no path that is not UTF-8.
+        # cv2.imread cannot open paths that are not UTF-8.
         pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
         image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
         return torch.from_numpy(image).permute(2, 0, 1)[None].float() / 127.5 - 1

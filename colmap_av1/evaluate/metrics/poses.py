@@ -1,4 +1,4 @@
-"""Errors of estimated poses after similarity alignment to true ones."""
+"""Errors of estimated poses against ground truth, after similarity alignment."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class PoseErrors:
     """Errors of estimated poses against the ground truth.
 
     Attributes:
-        num_poses: frames whose pose is both estimated and known.
-        ate: absolute trajectory error: RMS distance of the aligned camera centres, in the
-            truth's unit.
+        num_poses: number of frames whose pose is both estimated and known.
+        ate: absolute trajectory error: RMS distance of the aligned camera centres, in the unit of
+            the ground truth.
         max_centre: the largest of these distances.
-        extent: diagonal of the box around the true centres, in the truth's unit.
-        rotation: median angle between estimated and true camera orientations, in degrees, under
-            the one turn of the world that fits the orientations best.
+        extent: diagonal of the bounding box of the true centres, in the unit of the ground truth.
+        rotation: median angle between estimated and true camera orientations, in degrees, after
+            the rotation of the world that aligns the orientations best.
         max_rotation: the largest of these angles.
-        relative_translation: relative pose error: RMS distance between estimated and true motion
-            from a pose to the next, in the truth's unit.
-        relative_rotation: RMS angle between estimated and true turn from a pose to the next, in
-            degrees.
+        relative_translation: relative pose error: RMS difference of estimated and true translation
+            between consecutive poses, in the unit of the ground truth.
+        relative_rotation: RMS angle between estimated and true rotation between consecutive poses,
+            in degrees.
     """
 
     num_poses: int
@@ -47,15 +47,15 @@ class PoseErrors:
 def fit_similarity(
     cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> Similarity | None:
-    """The similarity that aligns camera centres best with those of other poses (Umeyama).
+    """The similarity that best aligns camera centres with those of other poses (Umeyama 1991).
 
     Args:
-        cam_from_world: float64 [n, 3, 4] poses, NaN where there is none.
-        truth: float64 [n, 3, 4] the others, NaN where unknown.
+        cam_from_world: float64 [n, 3, 4] poses, NaN where unknown.
+        truth: float64 [n, 3, 4] reference poses, NaN where unknown.
 
     Returns:
-        What brings the first to the second; None where fewer than three poses are in both or
-        where their centres determine no similarity.
+        The similarity from the first to the second; None if fewer than three poses are in both or
+        their centres do not determine a similarity.
 
     Raises:
         ValueError: the two differ in their number of poses.
@@ -75,15 +75,15 @@ def fit_similarity(
 def pose_errors(
     cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> PoseErrors | None:
-    """Compare poses with the ground truth after similarity alignment of their centres (Umeyama).
+    """Compare poses with ground truth after similarity alignment of their centres.
 
     Args:
-        cam_from_world: float64 [num_frames, 3, 4] estimated poses, NaN where there is none.
+        cam_from_world: float64 [num_frames, 3, 4] estimated poses, NaN where unknown.
         truth: float64 [num_frames, 3, 4] true poses, NaN where unknown.
 
     Returns:
-        The errors, over the frames that have both; None where fewer than three have or where
-        their centres determine no similarity.
+        The errors over the frames with both poses; None if there are fewer than three or their
+        centres do not determine a similarity.
 
     Raises:
         ValueError: the two differ in their number of frames.
@@ -112,11 +112,14 @@ def pose_errors(
 
 
 def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> NDArray[np.float64]:
-    """Poses of a model's images: float64 [n, 3, 4] cam_from_world, NaN without one.
+    """Poses of named images of a model.
 
     Args:
         model: pycolmap.Reconstruction.
         names: names of the images.
+
+    Returns:
+        float64 [n, 3, 4] cam_from_world, NaN for images that are not registered.
     """
     found = posed_images(model)
     cam_from_world = np.full((len(names), 3, 4), np.nan)
@@ -130,14 +133,14 @@ def model_poses(model: pycolmap.Reconstruction, num_frames: int) -> NDArray[np.f
     """Poses of a model's registered images, by frame.
 
     Args:
-        model: pycolmap.Reconstruction whose image names hold the frame's number from 0.
+        model: pycolmap.Reconstruction whose image names contain the frame number, from 0.
         num_frames: number of frames of the video.
 
     Returns:
         float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a registered image.
 
     Raises:
-        ImageError: an image's name holds no frame number.
+        ImageError: an image's name has no frame number.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
     for name, image in posed_images(model).items():
@@ -147,14 +150,14 @@ def model_poses(model: pycolmap.Reconstruction, num_frames: int) -> NDArray[np.f
 
 def _in_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
     if a.shape != b.shape:
-        raise ValueError(f"{len(a)} estimated poses, {len(b)} true ones")
+        raise ValueError(f"got {len(a)} estimated and {len(b)} true poses: give as many of both")
     return np.asarray(np.isfinite(a).all((1, 2)) & np.isfinite(b).all((1, 2)))
 
 
 def _relative_errors(
     aligned: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """RMS errors of the motion from each pose to the next: of translation and of rotation."""
+    """RMS errors of translation and rotation (degrees) between consecutive poses."""
     translation, turn = zip(*map(_motions, (aligned, truth)), strict=True)
     distance = np.linalg.norm(translation[0] - translation[1], axis=1)
     angle = np.degrees((turn[0] * turn[1].inv()).magnitude())
@@ -162,7 +165,7 @@ def _relative_errors(
 
 
 def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
-    """Translation, in the first camera's axes, and rotation from each pose to the next."""
+    """Translation, in the first camera's axes, and rotation between consecutive poses."""
     rotation, step = cam_from_world[:, :, :3], np.diff(camera_centres(cam_from_world), axis=0)
     turn = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
     return np.einsum("nij,nj->ni", rotation[:-1], step), turn
@@ -173,8 +176,8 @@ def _rotation_errors(
 ) -> NDArray[np.float64]:
     """Angles in degrees between orientations [n, 3, 3] after the best rotation of the world.
 
-    Not under the turn that fits the centres: these lie nearly on a line where a car drives, and
-    leave the turn about it open.
+    The rotation that aligns the centres is not suitable: on a nearly straight path the centres do
+    not determine the rotation about it.
     """
     turn = Rotation.from_matrix(truth.transpose(0, 2, 1) @ estimated).mean()
     between = Rotation.from_matrix(estimated) * turn.inv() * Rotation.from_matrix(truth).inv()

@@ -24,8 +24,8 @@ from colmap_av1.util.processes import bound
 
 _Image = NDArray[np.uint8]
 
-# Zhu and Milanfar's patch side in pixels, and the share of patches of pure noise that may
-# count as structure.
+# Patch size in pixels of Zhu and Milanfar's Q, and its significance level: the share of patches of
+# pure noise that count as structure.
 _PATCH = 8
 _SIGNIFICANCE = 0.001
 _LPIPS_SCRIPT = Path(__file__).with_name("lpips_distances.py")
@@ -42,8 +42,8 @@ class RenderingMetrics:
         vmaf: VMAF (model vmaf_v0.6.1), 0 to 100.
         sharpness: Zhu and Milanfar's Q of the rendered image.
         sharpness_difference: absolute difference to the Q of the reference.
-        lpips: LPIPS (AlexNet) distance, 0 for equal images; None where `no_lpips` says why.
-        no_lpips: why there is no LPIPS; empty where there is.
+        lpips: LPIPS (AlexNet) distance, 0 for equal images; None if not available.
+        no_lpips: why LPIPS is not available; empty if it is.
     """
 
     psnr_y: NDArray[np.float64]
@@ -60,13 +60,13 @@ def rendering_metrics(
     references: Sequence[Path],
     progress: Callable[[int], None] | None = None,
 ) -> RenderingMetrics:
-    """Compare rendered images with the photographs they stand for.
+    """Compare rendered images with the photographs of the same views.
 
-    PSNR-Y, SSIM and VMAF are libvmaf's, on the luma of BT.709 at limited range, as of video.
+    libvmaf measures PSNR-Y, SSIM and VMAF, on BT.709 luma in limited range, as for video.
 
     Args:
         rendered: image files.
-        references: for each, the file of the photograph, of the same size.
+        references: file of the photograph of each, of the same size.
         progress: called with the number of images done so far.
 
     Raises:
@@ -86,7 +86,7 @@ def rendering_metrics(
                 f"{reference.shape[1]}x{reference.shape[0]}: render at the size of the photographs"
             )
         by_size.setdefault(image.shape, []).append(i)
-        # Structure is where the reference has it, whatever the rendering made of it.
+        # The patches with structure are those of the reference, for both images.
         structure = _is_structure(_luma(reference))
         sharpness.append([_sharpness(_luma(x), structure) for x in (image, reference)])
         if progress is not None:
@@ -111,7 +111,7 @@ def rendering_metrics(
 
 
 def sharpness(image: _Image) -> float:
-    """Zhu and Milanfar's no-reference measure Q of structure over noise.
+    """Zhu and Milanfar's no-reference sharpness measure Q.
 
     X. Zhu and P. Milanfar, "Automatic Parameter Selection for Denoising Algorithms Using a
     No-Reference Measure of Image Content", IEEE Transactions on Image Processing 19 (2010):
@@ -119,7 +119,7 @@ def sharpness(image: _Image) -> float:
     over the patches with a dominant direction and divided by the number of all patches.
 
     Args:
-        image: uint8 [height, width, 3] BGR, 8 pixels or more each way.
+        image: uint8 [height, width, 3] BGR, at least 8x8 pixels.
     """
     luma = _luma(image)
     return _sharpness(luma, _is_structure(luma))
@@ -133,7 +133,7 @@ def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float
 
 
 def _is_structure(luma: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Patches whose coherence noise alone would not reach: bool [rows, cols] of patches."""
+    """Bool [rows, cols]: patches whose gradient coherence is too high for pure noise."""
     s1, s2 = _singular_values(luma)
     total = s1 + s2
     coherence = np.divide(s1 - s2, total, out=np.zeros_like(s1), where=total > 0)
@@ -168,9 +168,9 @@ def _read(path: Path) -> _Image:
 
 
 def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
-    """PSNR-Y, SSIM and VMAF of pairs of image files of one size: float64 [n, 3]."""
+    """PSNR-Y, SSIM and VMAF of pairs of image files of the same size: float64 [n, 3]."""
     height, width = _read(pairs[0][0]).shape[:2]
-    # Both come as one stream, the rendered image above its reference.
+    # Both images are sent in one stream, the rendered image above its reference.
     graph = (
         "scale=out_color_matrix=bt709:out_range=tv,format=yuv444p,split[x][y];"
         f"[x]crop={width}:{height}:0:0[a];[y]crop={width}:{height}:0:{height}[b];"
@@ -194,7 +194,7 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
             bound(command), cwd=folder, stdin=subprocess.PIPE, stderr=subprocess.PIPE
         ) as process:
             pipe: Any = process.stdin
-            # An early end of ffmpeg is explained by its own words below.
+            # If ffmpeg ends early, its message is reported below.
             with contextlib.suppress(BrokenPipeError):
                 for path in itertools.chain.from_iterable(pairs):
                     pipe.write(_read(path).tobytes())
@@ -210,10 +210,7 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
 def _lpips(
     rendered: Sequence[Path], references: Sequence[Path]
 ) -> tuple[NDArray[np.float64] | None, str]:
-    """LPIPS of pairs of files, and why there is none.
-
-    In a process of its own: torch and pycolmap do not live in one.
-    """
+    """LPIPS of pairs of files, or None and the reason why it is not available."""
     files = [[str(a), str(b)] for a, b in zip(rendered, references, strict=True)]
     try:
         distances = run_program(_LPIPS_SCRIPT, files)

@@ -1,4 +1,4 @@
-"""Sequences with ground truth of their cameras."""
+"""Image sequences with ground-truth cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WHAT_TO_GIVE = "give lines of 'name tx ty tz qx qy qz qw', or the folder of a C
 
 @dataclass(frozen=True)
 class Sequence:
-    """A folder of frames or a clip, and its true cameras where they are known.
+    """A folder of frames or a clip, with its true intrinsics and poses if known.
 
     Attributes:
         name: name of the sequence.
@@ -30,9 +30,9 @@ class Sequence:
         width: picture width in pixels.
         height: picture height in pixels.
         fps: frames per second.
-        camera: pycolmap.Camera with the true intrinsics; None where they are unknown.
+        camera: pycolmap.Camera with the true intrinsics; None if unknown.
         cam_from_world: float64 [num_frames, 3, 4] true poses in metres, x_cam = R x_world + t,
-            NaN for frames without one; None where no pose is known.
+            NaN for frames without one; None if no pose is known.
     """
 
     name: str
@@ -48,21 +48,21 @@ class Sequence:
 def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     """Read a sequence's description and ground truth.
 
-    The folder holds `sequence.json` (name, frames, width, height, fps, intrinsics, clip), either
-    `frames/` or the clip named there, and, where poses are known, `groundtruth.txt`: one line a
-    frame, `name tx ty tz qx qy qz qw`, the camera-to-world pose with x right, y down, z forward.
-    The number in a name is its frame's index from 0. Intrinsics are a COLMAP model's name and its
-    parameters, in COLMAP's convention (first pixel's centre at (0.5, 0.5)).
+    The folder has `sequence.json` (name, frames, width, height, fps, intrinsics, clip), either
+    `frames/` or the clip named there, and, if poses are known, `groundtruth.txt` with one line for
+    each frame: `name tx ty tz qx qy qz qw`, the camera-to-world pose with x right, y down, z
+    forward. The number in a name is the frame index, from 0. Intrinsics are the name and parameters
+    of a COLMAP camera model, with the first pixel's centre at (0.5, 0.5).
 
     Raises:
-        VideoError: the folder is no sequence.
-        ImageError: a pose names a frame that the sequence lacks.
+        VideoError: the folder is not a sequence.
+        ImageError: a pose refers to a frame that the sequence lacks.
     """
     folder = Path(folder)
     try:
         about = json.loads((folder / "sequence.json").read_text())
     except (OSError, ValueError) as error:
-        raise VideoError(f"{folder}: no readable sequence.json there: {error}") from error
+        raise VideoError(f"{folder}: has no readable sequence.json: {error}") from error
     width, height = int(about["width"]), int(about["height"])
     camera = None
     if about.get("intrinsics"):
@@ -73,10 +73,10 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
             params=about["intrinsics"]["params"],
         )
     truth = folder / "groundtruth.txt"
-    # The clip's file name comes first in its description.
+    # The clip's description begins with its file name.
     source = folder / (about["clip"].split()[0] if about.get("clip") else "frames")
     if not source.exists():
-        raise VideoError(f"{folder}: sequence.json speaks of {source.name}, which is not there")
+        raise VideoError(f"{folder}: {source.name}, named in sequence.json, does not exist")
     return Sequence(
         name=about["name"],
         source=source,
@@ -90,19 +90,19 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
 
 
 def frame_number(name: str) -> int:
-    """The number of the frame a file name stands for: its last group of digits.
+    """The frame number in a file name: its last group of digits.
 
     Raises:
-        ImageError: the name holds no number.
+        ImageError: the name has no number.
     """
     numbers = re.findall(r"\d+", Path(name).stem)
     if not numbers:
-        raise ImageError(f"image '{name}': its name holds no frame number: rename it")
+        raise ImageError(f"image '{name}': its name has no frame number: rename it")
     return int(numbers[-1])
 
 
 def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
-    """Read true poses, one line a frame: `name tx ty tz qx qy qz qw`, see `read_sequence`.
+    """Read true poses from lines of `name tx ty tz qx qy qz qw`, see `read_sequence`.
 
     Args:
         path: the file.
@@ -112,13 +112,13 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
         float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a line.
 
     Raises:
-        ImageError: the file cannot be read, or names a frame that the video lacks.
+        ImageError: the file cannot be read, or refers to a frame that the video lacks.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
     try:
         lines = read_lines(path)
     except UnicodeDecodeError as error:
-        raise ImageError(f"{path}: is no text: {_WHAT_TO_GIVE}") from error
+        raise ImageError(f"{path}: is not a text file: {_WHAT_TO_GIVE}") from error
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror}: {_WHAT_TO_GIVE}") from error
     for line in lines:
@@ -128,13 +128,13 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
         frame = frame_number(words[0])
         if frame >= num_frames:
             raise ImageError(
-                f"{path}: '{words[0]}' is none of the {num_frames} frames: give the truth of this "
-                "video"
+                f"{path}: '{words[0]}' is not one of the {num_frames} frames: give the ground "
+                "truth of this video"
             )
         try:
             values = np.array(words[1:], dtype=np.float64)
             rotation = Rotation.from_quat(values[3:7]).as_matrix().T
         except ValueError as error:
-            raise ImageError(f"{path}: '{line[:80]}' is no pose: {_WHAT_TO_GIVE}") from error
+            raise ImageError(f"{path}: '{line[:80]}' is not a pose: {_WHAT_TO_GIVE}") from error
         cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
     return cam_from_world

@@ -1,4 +1,4 @@
-"""Errors of tracks against ground truth, by the number of frames they span."""
+"""Errors of tracks against ground truth, by frame distance."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from colmap_av1.tracks.tracks import Tracks
 
 SPANS = (1, 2, 4, 8, 16)
 
-# Carries positions [n, 2] of frame a to frame b: their positions [n, 2] there, and whether the
-# point is visible there.
+# Ground-truth correspondence: maps positions [n, 2] in frame a to positions [n, 2] in frame b, and
+# tells whether each surface point is visible there.
 Transfer = Callable[[NDArray[np.float64], int, int], tuple[NDArray[np.float64], NDArray[np.bool_]]]
 
 
 def pairs_at_span(tracks: Tracks, span: int, *, max_pairs: int | None = None) -> NDArray[np.int64]:
-    """Observations of the same track that lie `span` frames apart.
+    """Pairs of observations of the same track that are `span` frames apart.
 
     Args:
         tracks: the tracks.
-        span: frames between the two observations.
-        max_pairs: keep this many, drawn at random, the same ones each time; None: all.
+        span: distance between the two frames.
+        max_pairs: size of a random sample with a fixed seed; None: all pairs.
 
     Returns:
-        int64 [n, 2] rows of `tracks.frame` and `tracks.xy`, the earlier frame first, in the
-        tracks' order.
+        int64 [n, 2] indices of observations, the earlier frame first, in the order of the tracks.
     """
     track = tracks.track
-    # Tracks are sorted by frame, so these keys ascend.
+    # The observations of a track are sorted by frame, so these keys ascend.
     key = track * (tracks.num_frames + span) + tracks.frame
     first = np.flatnonzero(tracks.frame + span < tracks.num_frames)
     second = np.searchsorted(key, key[first] + span)
@@ -54,18 +53,18 @@ def epipolar_errors(
 ) -> NDArray[np.float64]:
     """Sampson distances of tracks to the true epipolar geometry.
 
-    Only the part of an error across the epipolar line shows.
+    They measure only the component of an error perpendicular to the epipolar line.
 
     Args:
         tracks: the tracks.
         cam_from_world: float64 [num_frames, 3, 4] true poses, NaN where unknown.
         camera: pycolmap.Camera with the true intrinsics.
-        span: frames between the two positions that are compared.
-        max_pairs: pairs of positions at most, drawn at random; None: all.
+        span: distance between the two frames.
+        max_pairs: size of a random sample of pairs; None: all.
 
     Returns:
-        float64 [n] distances in pixels of an undistorted image of the camera's focal length;
-        pairs of frames without known poses or without a baseline are left out.
+        float64 [n] distances in pixels of an undistorted image with the camera's focal length.
+        Pairs of frames with an unknown pose or without a baseline are omitted.
     """
     pairs = pairs_at_span(tracks, span, max_pairs=max_pairs)
     frame = tracks.frame[pairs[:, 0]]
@@ -74,7 +73,7 @@ def epipolar_errors(
         of_a = np.flatnonzero(frame == a)
         pose = cam_from_world[a]
         essential = essential_of_poses(pose, cam_from_world[a + span])
-        # What rounding leaves of a camera at rest is no direction.
+        # The essential matrix of a camera at rest is rounding noise.
         if np.linalg.norm(essential) > 1e-12 * (1 + np.linalg.norm(pose[:, 3])):
             rays = [_rays(camera, tracks.xy[pairs[of_a, side]]) for side in (0, 1)]
             errors[of_a] = camera.mean_focal_length() * sampson_error(essential, *rays)
@@ -86,18 +85,18 @@ def exact_errors(
 ) -> NDArray[np.float64]:
     """Positions of tracks minus the true projections of their surface points.
 
-    A point that another surface hides by then still has a true position: a track that goes on
-    with what hides it is wrong by its distance to that.
+    An occluded point still has a true position, so a track that continues on the occluding surface
+    has an error.
 
     Args:
         tracks: the tracks.
-        transfer: the truth: carries positions of one frame to another.
-        span: frames between the two positions that are compared.
-        max_pairs: pairs of positions at most, drawn at random; None: all.
+        transfer: the ground-truth correspondence between frames.
+        span: distance between the two frames.
+        max_pairs: size of a random sample of pairs; None: all.
 
     Returns:
-        float64 [n, 2] signed errors in pixels, (x right, y down); positions that see no
-        surface are left out.
+        float64 [n, 2] signed errors in pixels (x right, y down). Positions that show no surface
+        are omitted.
     """
     pairs = pairs_at_span(tracks, span, max_pairs=max_pairs)
     frame = tracks.frame[pairs[:, 0]]

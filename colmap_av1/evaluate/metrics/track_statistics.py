@@ -1,4 +1,4 @@
-"""Number and length of tracks, and how they cover the images."""
+"""Number, length and image coverage of tracks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
 
-# Lengths are counted from each of these up to the next.
+# Lower bounds of the classes that track lengths are counted in.
 LENGTHS = (2, 4, 8, 16, 32)
 _CELL = 16
 
@@ -21,13 +21,11 @@ class TrackStatistics:
 
     Attributes:
         num_images: number of images.
-        num_tracks: tracks that two or more images see.
-        mean_length: images that see a track, on average.
-        tracks_by_length: number of tracks by the smallest length of their class, see LENGTHS.
-        observations_per_image: observations of an image on average, and in the image that has
-            the fewest.
-        coverage: share of an image's cells of 16x16 px that hold an observation, on average and
-            in the image that has the lowest.
+        num_tracks: number of tracks that two or more images observe.
+        mean_length: mean number of images that observe a track.
+        tracks_by_length: number of tracks by the lower bound of their class, see LENGTHS.
+        observations_per_image: number of observations of an image, mean and minimum.
+        coverage: share of an image's cells of 16x16 pixels with an observation, mean and minimum.
     """
 
     num_images: int
@@ -43,7 +41,7 @@ def track_statistics(tracks: Tracks, frames: NDArray[np.integer] | None = None) 
 
     Args:
         tracks: the tracks.
-        frames: the frames that are images; every frame of the video if None.
+        frames: the frames that are images; all frames of the video if None.
     """
     images = np.arange(tracks.num_frames) if frames is None else np.unique(frames)
     is_image = np.zeros(tracks.num_frames, dtype=bool)
@@ -51,7 +49,7 @@ def track_statistics(tracks: Tracks, frames: NDArray[np.integer] | None = None) 
     track = tracks.track
     seen = is_image[tracks.frame]
     length = np.bincount(track[seen], minlength=tracks.num_tracks)
-    # What a single image sees is no track.
+    # Drop tracks that only one image observes.
     seen &= length[track] >= 2
     length = length[length >= 2]
 

@@ -1,4 +1,4 @@
-"""Pictures of a comparison: bars, curves, and clouds from one viewpoint."""
+"""Pictures of a comparison: bar charts, curves, and clouds from a common viewpoint."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from colmap_av1.geometry.colmap_model import camera_centres
 
 _Image = NDArray[np.uint8]
 
-# Of the families of front-ends; members differ in lightness.
+# Colours by the family of front-ends, which is a prefix of their names.
 _COLOURS = {
     "av1": ("#0b4f9e", "#3b82d0", "#7fb2e8", "#12355f", "#5aa0c8", "#a9cdf0"),
     "sift": ("#c2410c", "#f59e0b"),
@@ -27,9 +27,10 @@ _COLOURS = {
 }
 _BACKGROUND = 18
 _PATH_COLOUR = (40, 70, 235)  # BGR
-# Drawn so many times larger, then reduced.
+# Pictures are drawn larger by this factor and then reduced, for anti-aliasing.
 _OVERSAMPLING = 2
-# How far the viewpoint lies behind and above the camera, in median depths of the points.
+# Distance of the viewpoint behind and above the camera, in median depths of the points, and its
+# tilt in degrees.
 _BEHIND, _ABOVE, _TILT = 0.25, 0.15, 5.0
 # Quantiles of the points that a plan shows.
 _SHOWN = (0.03, 0.97)
@@ -46,12 +47,12 @@ _STYLE = {
 
 @dataclass(frozen=True)
 class View:
-    """A viewpoint that clouds are drawn from.
+    """A viewpoint for drawing clouds.
 
     Attributes:
         cam_from_world: float64 [3, 4] pose.
-        depth: median depth of the points there.
-        focal_length: in pixels of the images.
+        depth: median depth of the points.
+        focal_length: focal length in pixels of the images.
     """
 
     cam_from_world: NDArray[np.float64]
@@ -61,7 +62,7 @@ class View:
 
 @dataclass(frozen=True)
 class _Panel:
-    """Bars of one figure, by front-end; `values` holds None where it is missing."""
+    """One bar chart; `values` has a number for each front-end, or None if it is missing."""
 
     title: str
     spelling: str
@@ -69,7 +70,7 @@ class _Panel:
 
 
 def colours_of(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each front-end, similar within a family."""
+    """The colour of each front-end, similar within a family."""
     taken = dict.fromkeys(_COLOURS, 0)
     found = {}
     for name in names:
@@ -81,7 +82,7 @@ def colours_of(names: Sequence[str]) -> dict[str, str]:
 
 
 def bar_charts(report: CompareReport) -> bytes:
-    """Bars of the main figures of every front-end, as SVG."""
+    """Bar charts of the main figures of every front-end, as SVG."""
     columns = report.columns
     colours = colours_of([c.name for c in columns])
     models = [(column.model, column.poses, column.cloud) for column in columns]
@@ -133,7 +134,7 @@ def cost_chart(columns: Sequence[Column]) -> bytes:
 
 
 def length_chart(columns: Sequence[Column]) -> bytes:
-    """Curves of the number of points by their least track length, as SVG."""
+    """Curves of the number of points with at least a given track length, as SVG."""
     colours = colours_of([c.name for c in columns])
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10, 3.4), layout="constrained")
@@ -157,21 +158,21 @@ def length_chart(columns: Sequence[Column]) -> bytes:
         axis.set_xscale("log", base=2)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
         axis.set_xlabel("images")
-        axis.set_title("points that so many images or more see", loc="left", fontsize=9)
+        axis.set_title("points observed by at least this many images", loc="left", fontsize=9)
         axis.grid(alpha=0.25)
         _add_legend(axis)
         return _svg(figure)
 
 
 def _add_legend(axis: Any, **how: Any) -> None:
-    if axis.get_legend_handles_labels()[0]:  # else matplotlib warns
+    if axis.get_legend_handles_labels()[0]:  # matplotlib warns about an empty legend.
         axis.legend(frameon=False, fontsize=8, **how)
 
 
 def training_chart(columns: Sequence[Column]) -> bytes | None:
-    """Curves of the renderings' PSNR-Y and VMAF over the training's time, as SVG; None without any.
+    """Curves of PSNR-Y and VMAF over training time, as SVG; None without milestones.
 
-    Where a trainer does not tell the time, they are over its iterations.
+    If a trainer does not report times, the curves are over iterations.
     """
     colours = colours_of([c.name for c in columns])
     trained = [(c.name, c.training.states) for c in columns if c.training and c.training.states]
@@ -196,7 +197,7 @@ def training_chart(columns: Sequence[Column]) -> bytes | None:
 
 
 def crop_window(reference: _Image) -> tuple[slice, slice]:
-    """Rows and columns of the third of a picture, each way, that has the strongest edges."""
+    """Rows and columns of the window with the strongest edges, a third of the picture's size."""
     grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY).astype(np.float32)
     edges = cv2.magnitude(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1))
     height, width = (max(1, n // 3) for n in grey.shape)
@@ -251,7 +252,7 @@ def view_of(cloud: Cloud) -> View:
 
 
 def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
-    """Points and camera path from a viewpoint: uint8 BGR of the shape of the images.
+    """Points and camera path from a viewpoint: uint8 BGR with the aspect ratio of the images.
 
     Args:
         cloud: the cloud, in the coordinates of the viewpoint.
@@ -321,7 +322,7 @@ def _splat(
     shown = shown & (pixel >= 0).all(1) & (pixel < (width - side, height - side)).all(1)
     order = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
     offsets = np.mgrid[:side, :side].reshape(2, -1).T
-    # Of what falls on one pixel the last, nearest stays.
+    # NumPy assigns in order, so the last and nearest point of a pixel remains.
     x, y = (pixel[order][:, None] + offsets).reshape(-1, 2).T
     picture[y, x] = colours[order, ::-1].repeat(len(offsets), axis=0)
 

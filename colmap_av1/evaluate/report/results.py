@@ -1,4 +1,4 @@
-"""What `compare` measures."""
+"""The results of `compare`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ class Column:
     """Results and costs of one front-end.
 
     Attributes:
-        name: the front-end, with " + all tracks" where all tracks are on the poses of its model.
-        error: why figures are missing; empty where none are.
+        name: name of the front-end, with " + all tracks" if all tracks were triangulated on the
+            poses of its model.
+        error: why results are missing; empty if there was no error.
         seconds: wall time of each stage.
-        cpu_seconds: CPU time of the front-end ("matching") and of what makes the model ("mapping").
-        peak_memory: largest resident memory of any stage in bytes; None where unknown.
-        num_models: models that the mapper made; the one with the most images is measured.
-        model_path: its folder; None where there is none.
-        model: its figures.
-        track_lengths: points by the number of images that see them.
-        cloud: distances to the reference's cloud; None where there is none, or it is this one.
-        poses: errors of the poses against the reference's; None likewise.
-        training: 3D Gaussians trained on the model; None where nothing was.
-        training_error: why not, where something was to be.
+        cpu_seconds: CPU time of the stages "matching", "mapping" and "all tracks".
+        peak_memory: largest resident memory of any stage in bytes; None if unknown.
+        num_models: number of models from the mapper; the one with the most images is measured.
+        model_path: folder of this model; None without a model.
+        model: figures of the model.
+        track_lengths: number of points by the number of images that observe them.
+        cloud: distances to the reference cloud; None without one, or if this is the reference.
+        poses: errors against the reference poses; None without them, or if these are the reference.
+        training: result of training 3D Gaussians on the model; None without training.
+        training_error: why a requested training is missing.
     """
 
     name: str
@@ -58,8 +59,8 @@ class Cloud:
         points: float64 [n, 3].
         colours: uint8 [n, 3], red first.
         cam_from_world: float64 [num_images, 3, 4], NaN for images without a pose.
-        focal_length: of the first camera, in pixels.
-        is_aligned: these are the reference's coordinates, not its own.
+        focal_length: focal length of the first camera in pixels.
+        is_aligned: whether the coordinates are those of the reference, not the model's own.
     """
 
     points: NDArray[np.float64]
@@ -71,21 +72,21 @@ class Cloud:
 
 @dataclass(frozen=True)
 class CompareReport:
-    """What `compare` measured.
+    """Result of `compare`.
 
     Attributes:
         output: the folder with `report.html` and `results.json`.
         video: the video.
-        num_frames: its shown frames.
-        num_images: images that every front-end was given.
-        size: (width, height) of the images.
-        fixed_intrinsics: the mapper kept the given intrinsics.
-        forward_motion: the mapper could start with images behind each other.
-        cloud_reference: whose cloud the distances are measured to; empty where to none.
-        pose_reference: whose poses the errors are measured against; empty where against none.
-        is_truth: that is a given truth, in its unit, not the model of a front-end.
-        columns: the front-ends.
-        warnings: what the user should know.
+        num_frames: number of shown frames of the video.
+        num_images: number of images that every front-end got.
+        size: (width, height) of the images in pixels.
+        fixed_intrinsics: whether the mapper kept the given intrinsics.
+        forward_motion: whether the mapper could initialize with pairs of forward motion.
+        cloud_reference: path or front-end of the reference cloud; empty without one.
+        pose_reference: path or front-end of the reference poses; empty without them.
+        is_truth: whether the reference is given ground truth, not the model of a front-end.
+        columns: results of the front-ends.
+        warnings: warnings for the user.
     """
 
     output: Path

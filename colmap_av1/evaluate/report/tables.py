@@ -11,7 +11,7 @@ from pathlib import Path
 from colmap_av1.evaluate.report.results import Column, CompareReport
 from colmap_av1.evaluate.training.splatting import Milestone, quality_after, share_of_time
 
-# What the others' figures are shares of; of trainings, the first that was trained on.
+# The front-end that others are compared with; for trainings, the first of these that was trained.
 BASELINE = "sift-exhaustive"
 _TRAINING_BASELINES = (BASELINE, "sift-sequential")
 _QUALITIES = {"psnr_y": ".2f", "ssim_db": ".2f", "vmaf": ".1f"}
@@ -21,7 +21,7 @@ _LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
 
 @dataclass(frozen=True)
 class Table:
-    """A table under a title, with a line about it."""
+    """A table with a title and an explanation."""
 
     title: str
     about: str
@@ -62,17 +62,17 @@ def _about_models(report: CompareReport) -> str:
     words = (
         "Coverage: share of the images' cells of 16x16 pixels that visible points project into. "
     )
-    words += "Error: reprojection error of the points, as COLMAP states it."
+    words += "Error: reprojection error of the points, as COLMAP reports it."
     if report.pose_reference:
         whose = _whose(report.pose_reference, report.is_truth)
         words += (
-            f" Poses against {whose}: ATE is the RMS distance of the camera centres after "
-            "similarity alignment, as a share of the path's extent; the relative pose error is "
-            "that of the motion from an image to the next, RMS, translation as a share of the "
-            "extent, and rotation."
+            f" Poses are compared with {whose}: ATE is the RMS distance of the camera centres "
+            "after similarity alignment, as a share of the path's extent; the relative pose error "
+            "is the RMS error of the motion between consecutive images, with translation as a "
+            "share of the extent, and rotation."
         )
         if report.is_truth:
-            words += " Before the share, the distance in the truth's unit."
+            words += " The first value of ATE is in the unit of the ground truth."
     if report.cloud_reference:
         whose = _whose(
             report.cloud_reference,
@@ -81,15 +81,15 @@ def _about_models(report: CompareReport) -> str:
         words += (
             f" Distances to the cloud of {whose}, as a share of the extent of its middle 90 %: "
             "Chamfer is the mean distance to the nearest point, averaged over both directions; "
-            "Hausdorff the larger of the 95 % quantiles, with the largest distance behind it. A "
-            "cloud that is denser than the one it is measured against has points where that one "
-            "has none."
+            "Hausdorff is the larger of the two 95th percentiles, with the largest distance in "
+            "parentheses. A cloud denser than the reference also has points where the reference "
+            "has none, which increases its distances."
         )
     return words
 
 
 def _whose(source: str, is_truth: bool) -> str:
-    return f"the given truth ({Path(source).name})" if is_truth else f"{source} as pseudo truth"
+    return f"the ground truth ({Path(source).name})" if is_truth else f"{source} as pseudo truth"
 
 
 def _pose_cells(column: Column, report: CompareReport) -> list[str]:
@@ -112,9 +112,9 @@ def _cloud_cells(column: Column, report: CompareReport) -> list[str]:
 
 
 def cost_table(columns: Sequence[Column]) -> Table:
-    """Seconds and memory of each step."""
-    header = ["front-end", "matching: CPU s", "mapping: CPU s", "all tracks: CPU s", "in all"]
-    header += ["memory", "wall s of each stage"]
+    """CPU time, wall time and memory of each front-end."""
+    header = ["front-end", "matching, CPU s", "mapping, CPU s", "all tracks, CPU s", "total, CPU s"]
+    header += ["peak memory", "wall time of each stage, s"]
     rows = []
     for column in columns:
         cpu = column.cpu_seconds
@@ -129,17 +129,17 @@ def cost_table(columns: Sequence[Column]) -> Table:
         rows.append(row)
     about = (
         "Every stage ran in a separate process; matching includes reading or extraction, matching "
-        "and verification. Where other work runs beside it, wall time means little: read the CPU "
-        "time."
+        "and verification. If the machine was running other work at the same time, compare CPU "
+        "times, not wall times."
     )
-    return Table("What it takes", about, header, rows)
+    return Table("Time and memory", about, header, rows)
 
 
 def lengths_table(columns: Sequence[Column]) -> Table:
     """Track lengths: the number of images that observe a point."""
     bounds = [*_LENGTH_CLASSES, math.inf]
     spans = list(itertools.pairwise(bounds))
-    header = ["points seen by"]
+    header = ["points observed by"]
     for low, high in spans:
         one = high == low + 1
         header.append(f"{low}" if one else f"{low}+" if high == math.inf else f"{low}-{high - 1}")
@@ -155,7 +155,7 @@ def lengths_table(columns: Sequence[Column]) -> Table:
 def renderings_table(columns: Sequence[Column]) -> Table:
     """Renderings of trained Gaussians."""
     header = ["front-end", "PSNR-Y, dB", "SSIM, dB", "LPIPS", "VMAF", "Q", "difference of Q"]
-    header += ["Gaussians", "training, s", "baseline's PSNR-Y after", "its VMAF after"]
+    header += ["Gaussians", "training, s", "time to baseline PSNR-Y", "time to baseline VMAF"]
     baseline, base = _training_baseline(columns)
     rows = []
     words = ""
@@ -183,21 +183,23 @@ def renderings_table(columns: Sequence[Column]) -> Table:
     )
     if base:
         about += (
-            f" The baseline is {baseline}: the time until its last PSNR-Y and VMAF are "
-            "reached, as a share of that of its training."
+            f" The baseline is {baseline}. Time to baseline: training time until the baseline's "
+            "final PSNR-Y or VMAF is reached, as a share of the baseline's training time."
         )
-    return Table("Renderings", f"{about} No LPIPS: {words}." if words else about, header, rows)
+    if words:
+        about += f" LPIPS is not available: {words}."
+    return Table("Renderings", about, header, rows)
 
 
 def _training_baseline(columns: Sequence[Column]) -> tuple[str, Sequence[Milestone]]:
-    """Name and milestones of what other trainings are held against; nothing where it is not."""
+    """Name and milestones of the training that others are compared with; empty without one."""
     trained = {column.name: column.training.states for column in columns if column.training}
     name = next((name for name in _TRAINING_BASELINES if name in trained), "")
     return name, trained.get(name, ())
 
 
 def milestones_table(columns: Sequence[Column]) -> Table | None:
-    """Renderings after fixed numbers of iterations and of seconds; None without milestones."""
+    """Rendering quality after given iterations and training times; None without milestones."""
     trained = [(c.name, c.training.states) for c in columns if c.training and c.training.states]
     if not trained:
         return None
@@ -214,10 +216,10 @@ def milestones_table(columns: Sequence[Column]) -> Table | None:
     about = "PSNR-Y in dB / SSIM in dB / VMAF, means over the test images."
     if times:
         about += (
-            f" The seconds of training are those of {baseline}'s milestones; between its own "
-            "a training counts as rising evenly."
+            f" The training times are those of the milestones of {baseline}; values of other "
+            "trainings are interpolated linearly between their milestones."
         )
-    return Table("Renderings on the way", about, header, rows)
+    return Table("Renderings during training", about, header, rows)
 
 
 def _qualities_cell(state: Milestone | None) -> str:

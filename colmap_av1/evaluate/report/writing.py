@@ -1,4 +1,4 @@
-"""The report of a comparison: one HTML file and JSON."""
+"""Writing the report of a comparison as HTML and JSON."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from colmap_av1.util.plain import plain
 
 @dataclass(frozen=True)
 class _Figure:
-    """A picture, its file format by the ending of its name."""
+    """A picture; the suffix of its name determines the file format."""
 
     name: str
     caption: str
@@ -56,12 +56,10 @@ class _Figure:
 
 
 def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage) -> None:
-    """Write `report.html` and `results.json`.
-
-    The HTML file needs no other and no network.
+    """Write `report.html`, a self-contained page, and `results.json`.
 
     Args:
-        report: what was measured.
+        report: the results.
         clouds: points and cameras of each column that has a model.
         footage: the images.
 
@@ -108,7 +106,7 @@ def _versions() -> dict[str, str]:
 
 
 def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
-    """The same part of a test image and of its renderings."""
+    """The same window of a test image and of its renderings."""
     trained = [(c.name, c.training) for c in columns if c.training is not None]
     shared = (
         [n for n in trained[0][1].names if all(n in t.names for _, t in trained)] if trained else []
@@ -117,7 +115,7 @@ def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
         return []
     name = shared[len(shared) // 2]
     first = trained[0][1]
-    reference = _picture(first.references[first.names.index(name)])
+    reference = read_image(first.references[first.names.index(name)])
     rows, cols = crop_window(reference)
     figures = [_crop("photograph", f"{name}, photograph", reference[rows, cols])]
     for column, training in trained:
@@ -126,7 +124,7 @@ def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
             f"{column}: {training.metrics.psnr_y[i]:.2f} dB, VMAF {training.metrics.vmaf[i]:.1f}"
         )
         figures.append(
-            _crop(column.replace(" ", ""), label, _picture(training.renders[i])[rows, cols])
+            _crop(column.replace(" ", ""), label, read_image(training.renders[i])[rows, cols])
         )
     return figures
 
@@ -136,14 +134,10 @@ def _crop(name: str, caption: str, picture: NDArray[np.uint8]) -> _Figure:
     return _Figure(f"{name}_crop.png", caption, encoded.tobytes())
 
 
-def _picture(path: Path) -> NDArray[np.uint8]:
-    return read_image(path)
-
-
 def _cloud_figures(
     report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage
 ) -> list[_Figure]:
-    """Each cloud from two viewpoints that are the same for all."""
+    """Each cloud from two viewpoints, which are the same for all aligned clouds."""
     like = clouds.get(report.cloud_reference) or next(
         (cloud for cloud in clouds.values() if cloud.is_aligned), None
     )
@@ -169,14 +163,14 @@ def _cloud_figures(
 
 
 def _facts(report: CompareReport) -> str:
-    known = "intrinsics given and kept" if report.fixed_intrinsics else "intrinsics unknown"
+    known = "intrinsics given and fixed" if report.fixed_intrinsics else "intrinsics estimated"
     label = (
         f"{report.num_images} images of {report.num_frames} frames, "
         f"{report.size[0]}x{report.size[1]}; {known}; COLMAP's incremental mapper with the same "
         "settings for every front-end"
     )
     if report.forward_motion:
-        label += ", which may start with images along its direction of motion"
+        label += ", which may initialize with pairs of forward motion"
     return f"{label}."
 
 
@@ -185,21 +179,19 @@ def _notes(report: CompareReport) -> list[str]:
     for column in report.columns:
         if column.num_models > 1:
             notes.append(
-                f"{column.name}: the mapper made {column.num_models} models, the one with the "
+                f"{column.name}: the mapper created {column.num_models} models, the one with the "
                 "most images is measured"
             )
         if column.model is not None and column.model.num_registered < report.num_images:
             missing = report.num_images - column.model.num_registered
-            notes.append(f"{column.name}: {missing} images have no pose")
+            notes.append(f"{column.name}: {missing} images are not registered")
     untrained: dict[str, list[str]] = {}
     for column in report.columns:
         if column.training_error:
             untrained.setdefault(column.training_error, []).append(column.name)
-    notes += [f"nothing rendered of {', '.join(names)}: {e}" for e, names in untrained.items()]
+    notes += [f"no renderings of {', '.join(names)}: {e}" for e, names in untrained.items()]
     if not report.pose_reference:
-        notes.append(
-            "no poses or cloud to measure against: give --reference, or compare sift-exhaustive"
-        )
+        notes.append("no reference poses or cloud: give --reference, or compare sift-exhaustive")
     return [*notes, *report.warnings]
 
 

@@ -1,1 +1,1 @@
-"""Trainers of 3D Gaussians on models."""
+"""Training 3D Gaussians on models, with gsplat or an external trainer."""

@@ -1,4 +1,4 @@
-"""3D Gaussians trained on half of a model's images and evaluated on the other half."""
+"""Training 3D Gaussians with gsplat on half of a model's images, evaluated on the other half."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.processes import bound
 
 _PROGRAM = Path(__file__).with_name("train_gaussians.py")
-# Of other points, whose mean distance is the first size of a point's Gaussian.
+# The mean distance to this many nearest points is the initial size of a point's Gaussian.
 _NUM_NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
 class Milestone:
-    """The state of a training.
+    """State of a training after some iterations.
 
     Attributes:
-        iteration: iterations done.
-        seconds: time spent training until then, rendering of test images not counted; NaN where
-            the trainer does not tell.
-        num_gaussians: Gaussians; None likewise.
-        metrics: of the renderings of the test images.
+        iteration: number of iterations done.
+        seconds: training time until then, without rendering test images; NaN if the trainer does
+            not report it.
+        num_gaussians: number of Gaussians; None if the trainer does not report it.
+        metrics: metrics of the renderings of the test images.
     """
 
     iteration: int
@@ -46,12 +46,12 @@ class Milestone:
     metrics: RenderingMetrics
 
     def mean(self, quality: str) -> float:
-        """Mean over the images of one of the `RenderingMetrics`."""
+        """Mean over the images of one field of `RenderingMetrics`."""
         return float(getattr(self.metrics, quality).mean())
 
 
 def split_images(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The images to train on and those to test on: even and odd ones, in the order of names."""
+    """Training and test images: the even and odd ones in the order of their names."""
     ordered = sorted(names)
     return ordered[::2], ordered[1::2]
 
@@ -71,25 +71,25 @@ def train_gaussians(
     """Train 3D Gaussians by the published recipe, with gsplat on a GPU.
 
     The recipe is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
-    Rendering" (2023); with fewer than its 30,000 iterations, Gaussians are added in the first
-    half of them.
+    Rendering" (2023). With fewer than its 30,000 iterations, densification stops after half of
+    them.
 
     Args:
-        model: folder of a COLMAP model with PINHOLE cameras, or others without distortion.
+        model: folder of a COLMAP model whose cameras have no distortion.
         image_path: folder of its images.
-        output: folder that gets the renderings of the test images, in a folder for each
-            milestone, named by the iteration.
-        iterations: how many.
-        milestones: iterations after which the test images are rendered; the last one always is.
-        seed: of the order of the images.
+        output: folder for the renderings of the test images, in one folder for each milestone,
+            named by the iteration.
+        iterations: number of iterations.
+        milestones: iterations after which the test images are rendered, in addition to the last.
+        seed: random seed for the order of the images.
         progress: called with the number of iterations done so far.
-        python: the interpreter that has torch and gsplat.
-        program: what it runs.
+        python: the Python interpreter, with torch and gsplat installed.
+        program: the training program that it runs.
 
     Raises:
         ModelError: the model cannot be read, its cameras have distortion, or it has fewer than
             two images or five points.
-        OptionError: an option has a value that cannot work.
+        OptionError: iterations or milestones are out of range.
         EvaluationError: packages or the GPU are missing, or the training failed.
     """
     if iterations < 1 or any(not 1 <= m <= iterations for m in milestones):
@@ -120,13 +120,15 @@ def share_of_time(
 ) -> float | None:
     """Time until the baseline's final quality is reached, as a share of the baseline's time.
 
-    Between milestones it counts as rising evenly. None where it is never reached, or a time is not
-    known.
+    Quality is interpolated linearly between milestones.
 
     Args:
-        milestones: of a training, in order.
-        baseline: of the training whose end it is held against.
-        quality: which of `RenderingMetrics`, its mean over the images.
+        milestones: milestones of a training, in order.
+        baseline: milestones of the training to compare with.
+        quality: field of `RenderingMetrics`, of which the mean over the images counts.
+
+    Returns:
+        The share; None if the quality is never reached or a time is unknown.
     """
     if any(math.isnan(milestone.seconds) for milestone in (*milestones, baseline[-1])):
         return None
@@ -147,10 +149,10 @@ def share_of_time(
 def quality_after(
     milestones: Sequence[Milestone], seconds: float, quality: str = "psnr_y"
 ) -> float | None:
-    """Quality after so many seconds of training, as `share_of_time` has it between milestones.
+    """Quality after a training time, interpolated linearly between milestones.
 
-    What was complete by then counts as it ended. None before the first milestone, or where a time
-    is not known.
+    A training that had finished by then counts with its final quality. None before the first
+    milestone, or if a time is unknown.
     """
     times = [milestone.seconds for milestone in milestones]
     if not times or any(math.isnan(time) for time in times) or seconds < times[0]:
@@ -159,9 +161,9 @@ def quality_after(
 
 
 def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
-    """Write cameras and points of a model as plain arrays, readable without pycolmap.
+    """Write cameras and points of a model as plain arrays, for the program without pycolmap.
 
-    The file holds, for n images and m points: `files` [n], `is_test` bool [n], `cam_from_world`
+    The file contains, for n images and m points: `files` [n], `is_test` bool [n], `cam_from_world`
     float32 [n, 4, 4], `K` float32 [n, 3, 3]; `points` float32 [m, 3], `colors` float32 [m, 3]
     from 0 to 1, `spacing` float32 [m], the mean distance to the three nearest other points.
 
@@ -174,7 +176,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
         The files of the test images.
 
     Raises:
-        ModelError: as `train_gaussians` says.
+        ModelError: see `train_gaussians`.
     """
     reconstruction = read_model(model)
     images = sorted(reconstruction.images.values(), key=lambda image: str(image.name))
@@ -212,7 +214,7 @@ def _intrinsics(model: Path, camera: pycolmap.Camera) -> NDArray[np.float64]:
 
 
 def _spacing(xyz: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Mean distance of each point to the nearest others."""
+    """Mean distance of each point to its nearest neighbours."""
     distance, _ = scipy.spatial.KDTree(xyz).query(xyz, k=_NUM_NEIGHBOURS + 1)
     return np.asarray(distance[:, 1:].mean(axis=1), dtype=np.float32)
 
@@ -220,7 +222,7 @@ def _spacing(xyz: NDArray[np.float64]) -> NDArray[np.float32]:
 def _run(
     command: list[str], log: Path, progress: Callable[[int], None] | None
 ) -> list[dict[str, Any]]:
-    """Run the program, and return the milestones that it reports."""
+    """Run the training program; returns the milestones that it reports."""
     states = []
     with (
         log.open("w+", encoding="utf-8", errors="replace") as errors,
@@ -241,6 +243,6 @@ def _run(
             raise
         if process.wait() != 0:
             errors.seek(0)
-            said = errors.read().strip().splitlines()
-            raise EvaluationError(said[-1] if said else f"{command[1]} ended without a word")
+            lines = errors.read().strip().splitlines()
+            raise EvaluationError(lines[-1] if lines else f"{command[1]} failed without a message")
     return states

@@ -1,11 +1,13 @@
-"""Train 3D Gaussians on a scene, as a program: torch must not share a process with pycolmap.
+"""Program that trains 3D Gaussians on a scene.
 
     train_gaussians.py SCENE.npz OUTPUT ITERATIONS SEED MILESTONE [MILESTONE ...]
 
-SCENE.npz is what `colmap_av1.evaluate.training.splatting` writes and says. Standard output gets
-a JSON line for every hundredth iteration and every milestone; after a milestone `OUTPUT/ITERATION/`
-holds the renderings of the test images. Where packages or the GPU are missing, one line on
-standard error says so, with exit status 3. Imports nothing of the package.
+It runs in a separate process because torch and pycolmap must not share one, and imports nothing
+from this package. SCENE.npz is described at `write_scene` in
+`colmap_av1.evaluate.training.splatting`. Standard output gets a JSON line for every hundredth
+iteration and every milestone; after a milestone `OUTPUT/ITERATION/` has the renderings of the test
+images. If packages or the GPU are missing, the program prints one line on standard error and exits
+with status 3.
 
 The recipe is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
 Rendering", ACM Transactions on Graphics 42 (2023), with gsplat's rasterizer and densification.
@@ -41,21 +43,22 @@ _SH_0 = 0.5 / math.sqrt(math.pi)
 _INITIAL_OPACITY = 0.1
 _SSIM_WEIGHT = 0.2
 _RATES = {
-    "means": 1.6e-4,  # times the size of the scene
+    "means": 1.6e-4,  # Multiplied by the size of the scene.
     "scales": 5e-3,
     "quats": 1e-3,
     "opacities": 5e-2,
     "sh0": 2.5e-3,
     "shN": 2.5e-3 / 20,
 }
-# What the rate of the means falls to in the end.
+# Final learning rate of the means, as a share of the initial one.
 _LAST_RATE = 0.01
-# Iterations of the published schedule; shorter runs densify in their first half only.
+# Iterations of the published schedule. Shorter runs densify in their first half only.
 _DENSIFY_FROM, _DENSIFY_UNTIL, _RESET_EVERY, _DEGREE_EVERY = 500, 15_000, 3000, 1000
-_TELL_EVERY = 100
+_REPORT_EVERY = 100
 
 Gaussians = dict[str, torch.nn.Parameter]
-# Renders (parameters, view, degree of the harmonics): [height, width, 3], and gsplat's `info`.
+# Renders (Gaussians, view, degree of the spherical harmonics); returns the image
+# [height, width, 3] and gsplat's `info`.
 Rasterizer = Callable[[Gaussians, "View", int], tuple[torch.Tensor, dict[str, Any]]]
 
 
@@ -83,8 +86,8 @@ def initial_gaussians(
 
     Args:
         points: float32 [n, 3].
-        colors: float32 [n, 3], 0 to 1.
-        spacing: float32 [n] mean distance to the nearest other points.
+        colors: float32 [n, 3], from 0 to 1.
+        spacing: float32 [n] mean distance to the nearest neighbours.
     """
     n = len(points)
     opacity = torch.logit(torch.full((n,), _INITIAL_OPACITY, device=points.device))
@@ -100,7 +103,7 @@ def initial_gaussians(
 
 
 def photometric_loss(rendered: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Weighted sum of absolute difference and 1 - SSIM of two [height, width, 3] images."""
+    """Weighted sum of mean absolute difference and 1 - SSIM of two [height, width, 3] images."""
     difference = (rendered - image).abs().mean()
     a, b = (x.permute(2, 0, 1)[None] for x in (rendered, image))
     structure = 1 - ssim(a, b, data_range=1.0)
@@ -108,7 +111,7 @@ def photometric_loss(rendered: torch.Tensor, image: torch.Tensor) -> torch.Tenso
 
 
 def scene_size(views: list[View]) -> float:
-    """1.1 times the largest distance of a camera from their mean."""
+    """1.1 times the largest distance of a camera from the mean of all cameras."""
     poses = torch.stack([view.cam_from_world for view in views])
     centres = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
     size = 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())
@@ -125,11 +128,11 @@ def train(
     """Optimise the Gaussians in place, and yield (iteration, loss) after each iteration.
 
     Args:
-        gaussians: parameters by name, as of `initial_gaussians`.
-        views: images to train on; each is seen once before one is seen again.
+        gaussians: parameters by name, see `initial_gaussians`.
+        views: training images; each is used once in a random order before any is used again.
         rasterize: renders a view.
-        iterations: how many.
-        seed: of the order of the images.
+        iterations: number of iterations.
+        seed: random seed for the order of the images.
     """
     size = scene_size(views)
     optimizers = {
@@ -166,15 +169,15 @@ def train(
 
 
 def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[View]]:
-    """The initial Gaussians, the views to train on and those to test on."""
+    """The initial Gaussians, the training views and the test views."""
     with np.load(path) as scene:
         arrays = {name: scene[name] for name in scene.files}
     views = []
     for i, file in enumerate(arrays["files"].tolist()):
-        # OpenCV opens no path that is not UTF-8.
+        # cv2.imread cannot open paths that are not UTF-8.
         image = cv2.imdecode(np.fromfile(file, dtype=np.uint8), cv2.IMREAD_COLOR)
         if image is None:
-            raise FileNotFoundError(f"{file}: is not an image")
+            raise FileNotFoundError(f"{file}: is missing or not an image")
         views.append(
             View(
                 name=Path(file).name,
@@ -199,7 +202,7 @@ def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: 
     seconds, started = 0.0, time.perf_counter()
     for iteration, loss in train(gaussians, train_views, rasterize, iterations, seed):
         is_milestone = iteration in milestones
-        if not is_milestone and iteration % _TELL_EVERY:
+        if not is_milestone and iteration % _REPORT_EVERY:
             continue
         if device == "cuda":
             torch.cuda.synchronize()
@@ -222,12 +225,12 @@ def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: 
             "milestone": is_milestone,
         }
         print(json.dumps(words), flush=True)
-        # The time of rendering the test images is not the training's.
+        # Do not count the time of rendering test images.
         started = time.perf_counter()
 
 
 def gsplat_rasterizer() -> Rasterizer:
-    """gsplat's, on a GPU."""
+    """A rasterizer that uses gsplat on a GPU."""
     from gsplat import rasterization  # noqa: PLC0415 - needs CUDA
 
     def rasterize(
@@ -253,10 +256,10 @@ def gsplat_rasterizer() -> Rasterizer:
 
 
 def main() -> int:
-    """Train on the scene named in the arguments."""
+    """Train on the scene given by the command line."""
     if not torch.cuda.is_available():
         print(
-            "3D Gaussians are trained on an NVIDIA GPU with CUDA, and there is none here",
+            "3D Gaussians are trained on an NVIDIA GPU with CUDA, and there is none",
             file=sys.stderr,
         )
         return _NOT_HERE

@@ -1,4 +1,4 @@
-"""Folders for trainers of 3D Gaussians, runs of trainers on them, and their renderings."""
+"""Running trainers of 3D Gaussians on the model of a front-end, and measuring their renderings."""
 
 from __future__ import annotations
 
@@ -28,21 +28,22 @@ from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
 from colmap_av1.util.stages import run_stage_in
 
-# What it says about a training; an upgrade of the rest repeats none.
+# Only changes of this code affect the results of a training. Changes elsewhere in the package do
+# not repeat trainings.
 _CODE = ("evaluate/training", "evaluate/metrics")
-# What a command tells of its milestones, beside their renderings.
+# File with the training times of a command's milestones, in the folder of the renderings.
 _TIMES = "times.csv"
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
 class Split:
-    """A model with undistorted images, as a whole and in two halves.
+    """A model with undistorted images, complete and split into training and test images.
 
     Attributes:
-        data: folder with all images and the model in `images/` and `sparse/0/`.
-        train: the same with the images to train on, the even ones in the order of their names.
-        test: the same with the others.
+        data: folder with all images in `images/` and the model in `sparse/0/`.
+        train: the same with the training images, the even ones in the order of their names.
+        test: the same with the test images.
     """
 
     data: Path
@@ -51,22 +52,22 @@ class Split:
 
     @property
     def references(self) -> list[Path]:
-        """The pictures that renderings are compared with, in the order of their names."""
+        """The photographs of the test views, in the order of their names."""
         return sorted(path for path in (self.test / "images").rglob("*") if path.is_file())
 
 
 @dataclass(frozen=True)
 class Training:
-    """3D Gaussians trained on a model.
+    """Result of training 3D Gaussians on a model.
 
     Attributes:
         seconds: wall time of the training.
         states: milestones of the training, the last at its end; empty for commands without
             `{milestones}`.
-        names: the test images.
-        references: the picture of each.
-        renders: its rendering.
-        metrics: of these.
+        names: names of the test images.
+        references: the photograph of each test image.
+        renders: the rendering of each test image.
+        metrics: metrics of the renderings.
     """
 
     seconds: float
@@ -81,7 +82,7 @@ def check_trainer(trainer: str) -> None:
     """Refuse a trainer that cannot run.
 
     Raises:
-        EvaluationError: a package that gsplat needs is missing, or there is no such program.
+        EvaluationError: a package that gsplat needs is missing, or the program does not exist.
     """
     if trainer == GSPLAT:
         check_packages("the trainer gsplat", ("torch", "gsplat", "pytorch_msssim"), "splatting")
@@ -94,18 +95,18 @@ def check_trainer(trainer: str) -> None:
 
 
 def write_split(model: Path, image_path: Path, folder: Path) -> Split:
-    """Undistort the images of a model and write them as trainers open them, whole and halved.
+    """Undistort the images of a model and split them for training and test.
 
-    All points are in both halves, without the observations of the other half's images.
+    Both halves have all points, with the observations of their own images only.
 
     Args:
         model: folder of the model.
         image_path: folder of its images.
-        folder: gets `data/`, `train/` and `test/`; kept where they are of this model.
+        folder: gets `data/`, `train/` and `test/`; existing ones of the same model are kept.
 
     Raises:
         ModelError: the model cannot be read.
-        EvaluationError: the images cannot be undistorted; there are fewer than two.
+        EvaluationError: the images cannot be undistorted, or there are fewer than two.
     """
     split = Split(folder / "data", folder / "train", folder / "test")
     registered = sorted(posed_images(read_model(model)))
@@ -144,21 +145,26 @@ def train(
     """Train 3D Gaussians and measure their renderings; a finished training is not repeated.
 
     Args:
-        trainer: "gsplat", or a command, see `words_of_trainer`: `{data}` and `{test}` are the
-            halves, `{gaussians}` a file of initial Gaussians of the points as the first half sees
-            them, `{output}` an empty folder, `{renders}` the one that gets the renderings of the
-            test images, `{iterations}` and `{name}` what they say. With `{milestones}`, those and
-            the last iteration, it renders into a folder of `{renders}` for each, named by its
-            number; `times.csv` beside these may tell of each its `iterations`, `seconds` of
-            training until then and number of `gaussians`.
+        trainer: "gsplat", or a command with placeholders, see `words_of_trainer`:
+
+            - `{data}` and `{test}`: folders with the training and the test images,
+            - `{gaussians}`: file of initial Gaussians, from the points and the training images,
+            - `{output}`: an empty folder,
+            - `{renders}`: folder for the renderings of the test images,
+            - `{iterations}`: number of iterations,
+            - `{milestones}`: iterations after which to render, including the last. The command must
+              write the renderings to a folder of `{renders}` named by the iteration, and may write
+              `{renders}/times.csv` with columns `iterations`, `seconds` (training time until then)
+              and `gaussians` (their number),
+            - `{name}`: name of the column.
         split: the data.
         folder: gets `output/`, `renders/`, `log.txt` and the figures.
-        name: the column.
-        iterations: how many.
-        milestones: iterations after which the test images are rendered, too.
+        name: name of the column.
+        iterations: number of iterations.
+        milestones: iterations after which the test images are rendered, in addition to the last.
 
     Raises:
-        ColmapAv1Error: the trainer failed, or rendered no test images.
+        ColmapAv1Error: the trainer failed, or did not render the test images.
     """
     renders, references = folder / "renders", split.references
     inputs = [p for part in ("sparse/0", "images") for p in (split.data / part).rglob("*")]
@@ -191,7 +197,7 @@ def train(
         command = [word.format(**values) for word in words_of_trainer(trainer)]
         measured = run_measured(_run, command, folder / "log.txt", log=folder / "log.txt")
         if not stops:
-            match_renders(renders, references)  # refuses others before they are kept
+            match_renders(renders, references)  # Raise before the result is marked as finished.
         states = [_plain(state) for state in _states(renders, stops, references)]
         return {"seconds": measured.seconds, "states": states}
 
@@ -208,10 +214,10 @@ def train(
 
 
 def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
-    """The rendering of each reference: by its name, else by the order of as many pictures.
+    """The rendering of each reference: by file name, else by order if the numbers are equal.
 
     Raises:
-        EvaluationError: the folder does not hold them.
+        EvaluationError: the folder does not have a rendering of each reference.
     """
     found = [p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES]
     by_stem = {path.stem: path for path in found}
@@ -220,28 +226,28 @@ def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
     if len(found) == len(references):
         return sorted(found, key=_natural)
     raise EvaluationError(
-        f"{folder}: holds {len(found)} renderings for {len(references)} test images: let the "
+        f"{folder}: has {len(found)} renderings for {len(references)} test images: let the "
         "trainer's command write one for each into {renders}"
     )
 
 
 def _states(renders: Path, stops: Sequence[int], references: Sequence[Path]) -> list[Milestone]:
-    """The milestones that a command rendered, with what it tells of them.
+    """The milestones that a command rendered, with their times if it reported them.
 
     Raises:
-        EvaluationError: renderings are missing, or `times.csv` is not what it should be.
+        EvaluationError: renderings are missing, or `times.csv` cannot be read.
     """
-    told = _read_times(renders / _TIMES) if stops else {}
+    times = _read_times(renders / _TIMES) if stops else {}
     states = []
     for stop in stops:
         files = match_renders(renders / str(stop), references)
-        seconds, gaussians = told.get(stop, (math.nan, None))
+        seconds, gaussians = times.get(stop, (math.nan, None))
         states.append(Milestone(stop, seconds, gaussians, rendering_metrics(files, references)))
     return states
 
 
 def _read_times(path: Path) -> dict[int, tuple[float, int | None]]:
-    """Seconds and number of Gaussians by iterations; nothing where there is no file."""
+    """Training time and number of Gaussians by iteration; empty without a file."""
     if not path.is_file():
         return {}
     try:
@@ -255,7 +261,7 @@ def _read_times(path: Path) -> dict[int, tuple[float, int | None]]:
             }
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise EvaluationError(
-            f"{path}: cannot be read: let the trainer's command write a line "
+            f"{path}: cannot be read: let the trainer's command write a header "
             "'iterations,seconds' or 'iterations,seconds,gaussians', then a line of numbers for "
             "each milestone"
         ) from error
@@ -317,7 +323,7 @@ def _run(command: Sequence[str], log: Path) -> None:
 
 
 def _undistort(model: Path, image_path: Path, output: Path, names: Sequence[str]) -> None:
-    """All images of a model without distortion, in `images/` and `sparse/0/`."""
+    """Undistort all images of a model into `images/` and `sparse/0/`."""
     made = output.with_name("undistorted")
     pycolmap.undistort_images(made, model, image_path, image_names=list(names))
     (output / "sparse").mkdir(parents=True)
@@ -329,12 +335,12 @@ def _undistort(model: Path, image_path: Path, output: Path, names: Sequence[str]
 def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without links
+    except OSError:  # The file system does not support links.
         shutil.copyfile(source, target)
 
 
 def _write_part(model: Path, output: Path, names: Collection[str]) -> None:
-    """Write a model with some of its images and all its points."""
+    """Write a model with some of the images and all points."""
     whole = read_model(model)
     posed = posed_images(whole)
     images = [posed[name] for name in sorted(posed) if name in names]
