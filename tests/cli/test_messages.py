@@ -89,7 +89,7 @@ def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str])
 def test_operating_points_that_this_stream_has_not(
     clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for video, point, points in ((clip, 1, "point 0 alone"), (LAYERS, 2, "points 0 to 1")):
+    for video, point, points in ((clip, 1, "only point 0"), (LAYERS, 2, "points 0 to 1")):
         error = told(["info", "--video", str(video), "--operating_point", str(point)], capsys)
         assert f"{video}: has no operating_point {point}: the stream has {points}\n" in error
 
