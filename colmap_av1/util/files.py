@@ -187,10 +187,8 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
         _undo_exchange(folder / before)
     for leftover in glob.glob(f"{pattern}.partial", root_dir=folder):
         path = folder / leftover
-        with (
-            _left(path) as is_left,
-            contextlib.suppress(OSError),
-        ):  # leftovers are harmless
+        # Leftovers that cannot be removed are harmless.
+        with _left(path) as is_left, contextlib.suppress(OSError):
             if is_left:
                 shutil.rmtree(path) if _is_folder(path) else path.unlink()
 
