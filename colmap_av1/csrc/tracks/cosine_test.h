@@ -26,9 +26,9 @@ class CosineTest {
   // Sets the dominant motion of a link.
   void prepare(const ChainedFrame& current, Link& link);
   // Tests the step of a track from `from` to `moved`, in coded pixels of the frame that has the
-  // displacement; `cell` is in the link's other frame. Returns the track's relative velocity after
-  // the step, in pixels of the current picture; nothing if the test fails. If the test is off, any
-  // velocity is returned.
+  // displacement; `other_cell` is in the link's other frame. Returns the track's relative velocity
+  // after the step, in pixels of the current picture; nothing if the test fails. If the test is
+  // off, any velocity is returned.
   std::optional<Point> passed(const Link& link, int other_cell, Point from, Point moved) const;
 
  private:
