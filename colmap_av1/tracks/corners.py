@@ -67,7 +67,7 @@ def follow_corners(
     Large pictures are downscaled for the search, as large videos are for their motion.
 
     Args:
-        guide: tracks of the same video: a corner is searched where the nearest track moves.
+        guide: tracks of the same video: a corner is searched for where the nearest track moves.
         pictures: (frame, picture) in the order of frames, uint8 BGR [height, width, 3] of one size.
         counts: which positions are used, see `Counts`; for masks.
         progress: called after each picture with the number of pictures so far.
@@ -146,7 +146,7 @@ def _nearest(start: _Floats, motion: _Floats, at: _Floats) -> _Floats:
 def _follow(
     before: NDArray[np.uint8], now: NDArray[np.uint8], at: _Floats, motion: _Floats
 ) -> tuple[_Floats, NDArray[np.bool_]]:
-    """Search corners near the positions to which their expected motion leads.
+    """Search for corners near the positions to which their expected motion leads.
 
     Returns:
         Their positions, and which were found and passed a forward-backward check.

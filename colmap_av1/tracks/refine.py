@@ -53,7 +53,7 @@ def refine_tracks(
     """Correct track positions by Lucas-Kanade on the decoded pictures.
 
     Every track has a template, which is the picture around an earlier observation. An observation
-    is searched near the position to which the step in the bitstream leads: first with the
+    is searched for near the position to which the step in the bitstream leads: first with the
     template, which does not drift, then with the picture around the previous observation. If only
     the second search finds it, it becomes the new template. If neither finds it, it keeps the
     bitstream's step and its larger expected error, and is not marked as confirmed. No observation
