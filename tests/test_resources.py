@@ -55,7 +55,7 @@ def test_list_without_an_end(tmp_path: Path) -> None:
     refused(
         lambda: check_frame_list(ImageOptions(frame_list="/dev/zero")),
         ImageError,
-        "no regular file",
+        "not a regular file",
     )
     large = tmp_path / "large.txt"
     with large.open("wb") as file:

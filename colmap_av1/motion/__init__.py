@@ -1,1 +1,1 @@
-"""Motion of every coded frame, read from the bitstream."""
+"""Motion of every coded frame, read from the AV1 bitstream."""

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 
-# The record of a block: every value that its syntax gives, under the specification's names.
+# The record of a block: all values of its syntax, under the specification's names.
 BLOCK = _core.block_dtype()
 
 _Value = TypeVar("_Value", bound=np.generic)
 
 
 class _PerUnit(cached_property[NDArray[_Value]], Generic[_Value]):
-    """A field of the blocks, spread over their units when it is first asked for."""
+    """A field of the blocks as an array with one entry per unit, made on first access."""
 
     def __init__(self) -> None:
         super().__init__(self._spread)
@@ -32,16 +32,16 @@ class _PerUnit(cached_property[NDArray[_Value]], Generic[_Value]):
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """Block data of one coded frame (never of a repeated showing).
+    """Block data of one coded frame. A frame that is shown again is not repeated.
 
     Arrays named after the AV1 specification hold one entry per 4x4 luma unit,
     shape [mi_rows, mi_cols]. Units may lie beyond the picture edge (MiRows and
-    MiCols are even). They are made of `blocks` and `block_index` and cannot be written.
+    MiCols are even). The arrays are made from `blocks` and `block_index` and are read-only.
 
     Attributes:
-        decode_index: number of the frame among the events (decoded frames and
+        decode_index: index of the frame among the events (decoded frames and
             show_existing_frame headers) of the stream, from 0, in bitstream order.
-        display_index: number of the frame among the shown frames, in output order,
+        display_index: index of the frame among the shown frames, in output order,
             from 0; -1 for a frame that is never shown.
         width: width in pixels of the picture after super-resolution (UpscaledWidth).
         height: height in pixels (FrameHeight).
@@ -49,13 +49,13 @@ class FrameMotion:
             snake_case, as Python ints or int32 arrays.
         ref_decode_index: [8] decode_index of the frame behind RefFrame 0..7
             (entry 0, INTRA_FRAME, and absent references: -1).
-        ref_display_index: [8] display_index of the same frames, -1 where never shown.
-        ref_size: [8, 2] (width, height) in pixels of the same frames, 0 where absent.
+        ref_display_index: [8] display_index of the same frames, -1 if never shown.
+        ref_size: [8, 2] (width, height) in pixels of the same frames, 0 if absent.
         slot_decode_index: [8] decode_index of the frame in each reference slot after
             this frame's reference frame update process; -1 for an empty slot.
         blocks: BLOCK [n] records of the frame's blocks, in decoding order; their fields are
-            those below and more of the block syntax.
-        block_index: int32 [mi_rows, mi_cols] index of the block that a unit is in.
+            those below and further values of the block syntax.
+        block_index: int32 [mi_rows, mi_cols] index of the block that contains each unit.
         local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
         ref_frame: int8 [mi_rows, mi_cols, 2] RefFrame: 0 INTRA, 1..7 LAST..ALTREF, -1 none.
         mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list][0 = row, 1 = column] in 1/8 px.
@@ -101,15 +101,15 @@ class FrameMotion:
     warp_index = _PerUnit[np.int32]()
 
     def displacement(self, list_index: int) -> NDArray[np.float32]:
-        """Displacement of every unit's centre into the frame its list references.
+        """Displacement of every unit's centre into the frame that its list references.
 
         Args:
             list_index: 0 or 1, the reference list.
 
         Returns:
             float32 [mi_rows, mi_cols, 2], (x, y) in pixels of the coded frame (before
-            super-resolution), local and
-            global warp applied; NaN where the unit has no reference in this list.
+            super-resolution), with local and global warp applied; NaN if the unit has no
+            reference in this list.
         """
         return _core.displacement(self, list_index)
 

@@ -23,12 +23,12 @@ from colmap_av1.video.facts import Video, read_video
 
 _KEY_FRAME, _INTRA_ONLY_FRAME = 0, 2
 
-# Below these a stream gives few or poor tracks. Measured streams: 85 % inter units for
-# ordinary motion, about 50 % at 28 px a frame; 0.8 bits a pixel at crf 20, 0.3 at crf 35.
-_LEAST_INTER_SHARE = 0.35
-_LEAST_BITS_PER_PIXEL = 0.03
-_LEAST_KEY_FRAME_DISTANCE = 12
-_LEAST_MOTION = 0.1
+# A stream below these values gives few or poor tracks. Typical values are 85 % inter units for
+# ordinary motion and about 50 % at 28 px per frame, 0.8 bits per pixel at crf 20 and 0.3 at crf 35.
+_MIN_INTER_SHARE = 0.35
+_MIN_BITS_PER_PIXEL = 0.03
+_MIN_KEY_FRAME_DISTANCE = 12
+_MIN_MOTION = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,21 +41,21 @@ class StreamReport:
         width: picture width in pixels as stored.
         height: picture height in pixels.
         display: how players show the pictures.
-        frame_rate: frames per second; None where unknown.
-        num_coded: frames with block data.
-        num_shown: frames that the bitstream shows.
-        num_cut: those of them that an edit list hides.
-        num_hidden: coded frames that are never shown.
-        num_key_frames: key frames and intra-only frames among the coded ones.
-        inter_share: share of inter units in all frames but the first.
+        frame_rate: frames per second; None if unknown.
+        num_coded: number of frames with block data.
+        num_shown: number of frames that the bitstream shows.
+        num_cut: number of these frames that an edit list hides.
+        num_hidden: number of coded frames that are never shown.
+        num_key_frames: number of key frames and intra-only frames.
+        inter_share: share of inter units in all frames after the first.
         reference_distances: share of references by signed display distance, counted in
-            units; negative is the past.
+            units; negative distances are in the past.
         hidden_reference_share: share of references to frames that are never shown.
         median_motion: median length of the units' displacements in pixels per shown frame; NaN
-            where none refers to a shown frame.
+            if no unit refers to a shown frame.
         bytes_per_frame: size of the stream per shown frame.
         bits_per_pixel: the same in bits per pixel.
-        reasons: why the stream is poor for matching; empty where it is good.
+        reasons: why the stream is poor for matching; empty if it is good.
     """
 
     path: Path
@@ -96,18 +96,18 @@ def inspect(
         progress: called with the number of coded frames so far.
 
     Raises:
-        VideoError: the video cannot be read or holds no frame.
+        VideoError: the video cannot be read or shows no frame.
         BitstreamError: the stream is damaged and `options.strict` is set.
     """
     options = options if options is not None else ReadOptions()
     counts = _count(read_motion(video, options), progress)
     structure = counts.structure
     if structure.num_shown > 0:
-        # A stream may end in pictures that are shown again, which are no coded frames.
+        # Frames that are shown again are not coded frames, and a stream may end with them.
         structure.num_shown = max(structure.num_shown, count_shown_pictures(video, options))
     if structure.num_shown == 0:
-        raise VideoError(f"{video}: shows no frame: give a video with pictures")
-    # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
+        raise VideoError(f"{video}: shows no frames: give another video")
+    # The bitstream is read first because only its parser limits the frame size.
     opened = read_video(video)
     if opened.doubtful_times is not None:
         warnings.warn(f"{video}: {opened.doubtful_times}", stacklevel=2)
@@ -120,7 +120,7 @@ def inspect(
     references = sum(counts.references.values()) + counts.hidden_references
     median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
     reasons = structure.reasons(bits_per_pixel)
-    if median_motion < _LEAST_MOTION:
+    if median_motion < _MIN_MOTION:
         reasons += (
             f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
             "there is no parallax",
@@ -154,11 +154,11 @@ class Structure:
     """Counts that describe how a stream is coded, as far as it matters for matching.
 
     Attributes:
-        num_coded: frames with block data.
-        num_shown: frames that the bitstream shows.
-        num_key_frames: key frames and intra-only frames among the coded ones.
-        later_units: units of all frames but the first.
-        inter_units: those of them that are inter coded.
+        num_coded: number of frames with block data.
+        num_shown: number of frames that the bitstream shows.
+        num_key_frames: number of key frames and intra-only frames.
+        later_units: number of units in all frames after the first.
+        inter_units: number of these units that are inter coded.
         inter_share_of: share of inter units in each shown frame, by its display index.
     """
 
@@ -171,11 +171,11 @@ class Structure:
 
     @property
     def inter_share(self) -> float:
-        """Share of inter units in all frames but the first."""
+        """Share of inter units in all frames after the first."""
         return self.inter_units / self.later_units if self.later_units else 0.0
 
     def add(self, frame: FrameMotion) -> None:
-        """Count a frame; frames come in bitstream order."""
+        """Count a frame. Frames are given in bitstream order."""
         self.num_coded += 1
         self.num_shown = max(self.num_shown, frame.display_index + 1)
         self.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
@@ -188,27 +188,27 @@ class Structure:
             self.inter_units += inter_units
 
     def reasons(self, bits_per_pixel: float) -> tuple[str, ...]:
-        """Why streams of such a structure and rate are poor for matching; empty if they are not."""
+        """Why a stream with this structure and rate is poor for matching; empty if it is good."""
         if self.num_shown < 3:
             frames = "1 frame is" if self.num_shown == 1 else f"{self.num_shown} frames are"
             return (f"only {frames} shown: a track needs more",)
         if self.inter_units == 0:
             return ("every frame is intra coded, so there is no motion: encode it with -g 9999",)
         reasons = []
-        if self.inter_share < _LEAST_INTER_SHARE:
+        if self.inter_share < _MIN_INTER_SHARE:
             reasons.append(
                 f"only {self.inter_share:.0%} of the units after the first frame are inter coded: "
-                "the camera moves too far between frames, or the scene itself moves"
+                "the camera moves too far between frames, or the scene is dynamic"
             )
-        if self.num_shown < _LEAST_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
+        if self.num_shown < _MIN_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
             reasons.append(
                 f"a key frame every {self.num_coded / self.num_key_frames:.1f} frames cuts "
                 "every track: encode it with -g 9999"
             )
-        if bits_per_pixel < _LEAST_BITS_PER_PIXEL:
+        if bits_per_pixel < _MIN_BITS_PER_PIXEL:
             reasons.append(
-                f"{bits_per_pixel:.3f} bits per pixel is a low rate, vectors are coarse: encode "
-                "the source with a lower -crf"
+                f"{bits_per_pixel:.3f} bits per pixel is a low rate with coarse motion vectors: "
+                "encode the source with a lower -crf"
             )
         return tuple(reasons)
 
@@ -259,7 +259,7 @@ def _count_references(frame: FrameMotion, counts: _Counts) -> None:
 
 
 def _num_bytes(video: Video) -> int:
-    """Size of the stream up to its end or the first damage, which reading has reported."""
+    """Size of the stream in bytes, up to the first damage if there is one."""
     total = 0
     with open_stream(video) as stream, contextlib.suppress(BitstreamError):
         for packet in stream.packets():

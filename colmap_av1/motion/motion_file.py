@@ -1,4 +1,4 @@
-"""Files that hold the motion of a video."""
+"""Write the motion of a video to a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from colmap_av1.options import ReadOptions
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import new_hdf5
 
-# Zip members carry a date; a fixed one keeps the bytes the same.
+# Zip members have a date. A fixed one makes the bytes of the file reproducible.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -34,25 +34,24 @@ def export_motion(
 ) -> int:
     """Write the motion of every coded frame to a .npz or .h5 file.
 
-    Coded frame i (in bitstream order, from 0) has its arrays under '%06d/' % i, named after
-    those of `FrameMotion` (per unit, not per block), with its header values under
-    '%06d/header/'. Frames are
-    written one by one, so memory does not grow with the video. The file appears under its
-    name only when complete.
+    The arrays of coded frame i (in bitstream order, from 0) are stored under '%06d/' % i, with the
+    names of `FrameMotion` (per unit, not per block), and its header values under '%06d/header/'.
+    Frames are written one by one, so memory does not grow with the video. The file appears under
+    its name only when it is complete.
 
     Args:
         video: the video file.
-        output: the file; its extension .npz, .h5 or .hdf5 says the format.
+        output: the file; its extension .npz, .h5 or .hdf5 selects the format.
         options: how the bitstream is read.
         progress: called with the number of frames written so far.
-        overwrite: replace an output that exists.
+        overwrite: replace an existing output.
 
     Returns:
         The number of coded frames.
 
     Raises:
-        OptionError: another extension, or the file cannot be written, or must not.
-        VideoError: the video cannot be read or holds no frame.
+        OptionError: the extension is unknown, the file exists, or it cannot be written.
+        VideoError: the video cannot be read or has no frames.
         BitstreamError: the stream is damaged and `options.strict` is set.
     """
     path = Path(output)
@@ -72,7 +71,7 @@ def export_motion(
                     if progress is not None:
                         progress(count)
             if count == 0:
-                raise VideoError(f"{video}: holds no frame: give a video with pictures")
+                raise VideoError(f"{video}: has no frames: give another video")
     except OSError as error:
         raise OptionError(cannot_write(path, error)) from error
     return count

@@ -22,19 +22,21 @@ from colmap_av1.options import ReadOptions
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.container import check_process, open_stream
 
-# Bytes of block data that threads may read ahead of their use, all together.
+# Limit in bytes of the block data that all threads together read ahead.
 _READ_AHEAD = 1 << 28
-_BYTES_PER_UNIT = 24  # 4 and a share of its block's 60: 8 in most video
-_SMALL_AHEAD = 4  # frames
+_BYTES_PER_UNIT = 24  # 4 for its index and a share of the 60 of its block; 8 in most videos
+_SMALL_AHEAD = 4  # number of frames
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Packets from a shown key frame on, which refer to none before: threads read them alone.
+    """Packets from a shown key frame to the next, which refer to no packet before them.
+
+    Threads can therefore read groups independently.
 
     Attributes:
         first_packet: index of the first packet.
-        start: where the parser stood before it; None at the start of the stream.
+        start: state of the parser before it; None at the start of the stream.
     """
 
     first_packet: int
@@ -43,12 +45,12 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Index:
-    """What the headers say.
+    """Facts from the headers of a stream.
 
     Attributes:
         shown: for each shown frame, in output order, the event that decoded it.
-        groups: the groups.
-        num_units: units of the largest frame.
+        groups: the groups in bitstream order.
+        num_units: number of units of the largest frame.
     """
 
     shown: list[int]
@@ -61,23 +63,22 @@ def read_motion(
 ) -> Iterator[FrameMotion]:
     """Read the motion of every coded frame of an AV1 video, in bitstream order.
 
-    No pixel is decoded. The headers are read once before, for the display order: which
-    picture a hidden frame becomes is said by a later header. Memory does not grow with the
-    length of the video, but for a few bytes a frame.
+    No pixel is decoded. The headers are read in a first pass to find the display order, because
+    a later header determines when a hidden frame is shown. Memory grows with the length of the
+    video by only a few bytes per frame.
 
     Args:
-        video: a file that `colmap_av1.video.container.open_stream` takes.
-        options: how to read.
+        video: a file that `colmap_av1.video.container.open_stream` can open.
+        options: how the bitstream is read.
 
     Yields:
-        One FrameMotion per coded frame. A damaged stream yields the frames before the
-        damage, and a warning names the damage; see Raises. Tiles that end with other bits than
-        the specification demands, as some encoders write them, are read as decoders read them,
-        and a warning says so.
+        One FrameMotion per coded frame. From a damaged stream the frames before the damage are
+        yielded, with a warning; see Raises. Some encoders end tiles with other bits than the
+        specification requires; these tiles are read as decoders read them, with a warning.
 
     Raises:
         BitstreamError: the stream is damaged before its first frame is complete; with
-            `options.strict`, it is damaged anywhere or a tile ends otherwise than specified.
+            `options.strict`, it is damaged anywhere or a tile does not end as specified.
         LimitError: a frame is larger than `options.max_frame_size`.
         OptionError: the stream does not have `options.operating_point`.
         VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
@@ -104,7 +105,7 @@ def read_motion(
     if num_irregular:
         warnings.warn(
             f"{video}: {num_irregular} of {count} frames have tiles that do not end with the bits "
-            "the specification demands; they are used as decoders use them",
+            "the specification requires; they are read as decoders read them",
             stacklevel=2,
         )
 
@@ -121,7 +122,7 @@ def count_shown_pictures(video: str | PathLike[str], options: ReadOptions) -> in
 def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
     """Read the headers of a video up to the first damage.
 
-    Of a temporal unit with several spatial layers the highest is output (7.18.1).
+    A temporal unit with several spatial layers outputs only the highest one (7.18.1).
     """
     shown: list[int] = []
     groups = [_Group(0, None)]
@@ -156,7 +157,7 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
     if sequence is not None:
         point, last = options.operating_point, sequence["operating_points_cnt_minus_1"]
         if point > last:
-            points = f"points 0 to {last}" if last else "point 0 alone"
+            points = f"points 0 to {last}" if last else "only point 0"
             raise OptionError(f"{video}: has no operating_point {point}: the stream has {points}")
     return _Index(shown, groups, num_units)
 
@@ -164,7 +165,7 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
 def _restart_point(parser: _core.Parser) -> _core.RestartPoint | None:
     try:
         return parser.restart_point()
-    except _core.BitstreamError:  # inside a frame
+    except _core.BitstreamError:  # the parser is inside a frame
         return None
 
 
@@ -174,7 +175,7 @@ def _parse(
     video: str | PathLike[str],
     options: ReadOptions,
 ) -> Iterator[_core.Event]:
-    """Parse a packet; the events before an error come first."""
+    """Parse a packet; the events before an error are yielded before it is raised."""
     try:
         parser.parse(data)
     except _core.BitstreamError as error:
@@ -191,7 +192,7 @@ def _parse(
 def _read_events(
     video: str | PathLike[str], options: ReadOptions, index: _Index
 ) -> Generator[_core.Event, None, None]:
-    """Events of the parser in bitstream order; those before an error come first."""
+    """Events of the parser in bitstream order; those before an error are yielded first."""
     num_threads = threads_or_cpus(options.num_threads)
     if num_threads == 1:
         for _, event in _read_groups(video, options, index.groups, num_threads=num_threads):
@@ -199,7 +200,7 @@ def _read_events(
                 yield event
         return
     num_readers = min(num_threads, len(index.groups))
-    depth = _SMALL_AHEAD  # one reader: enough to work while the frames are used
+    depth = _SMALL_AHEAD  # enough for one reader to work while the caller uses the frames
     if num_readers > 1:
         depth = max(2, _READ_AHEAD // (num_readers * _BYTES_PER_UNIT * max(1, index.num_units)))
     stop = threading.Event()
@@ -219,7 +220,7 @@ def _read_events(
                 ahead[reader].put(item)
                 if stop.is_set():
                     return
-        except Exception as error:  # raised again where the frames are used
+        except Exception as error:  # raised again in the caller's thread
             ahead[reader].put((-1, error))
         finally:
             items.close()
@@ -234,8 +235,8 @@ def _read_events(
 
     process = os.getpid()
     readers = [threading.Thread(target=work, args=(i,), daemon=True) for i in range(num_readers)]
-    # The interpreter ends threads that still run, of a generator that is left open, where they are,
-    # which C++ takes for an unknown exception.
+    # If the generator is left open, its threads still run when the interpreter exits. It would
+    # unwind them, which C++ treats as an unknown exception, so they are ended before.
     atexit.register(end)
     for thread in readers:
         thread.start()
@@ -248,7 +249,7 @@ def _read_events(
                     try:
                         raise item
                     finally:
-                        del item  # it refers to this frame
+                        del item  # breaks the reference cycle of the exception and this frame
                 if item is None:
                     break
                 yield item
@@ -268,10 +269,10 @@ def _read_groups(
 ) -> Generator[tuple[int, _core.Event | None], None, None]:
     """Read every `num_readers`-th group from number `reader` on.
 
-    Each reader demuxes the whole file, which costs about a hundredth of parsing it.
+    Each reader demuxes the whole file, which takes about a hundredth of the time of parsing it.
 
     Yields:
-        (number of the group, event), and None for the event at the group's end.
+        (index of the group, event); at the end of a group the event is None.
     """
     parser = _core.Parser(
         operating_point=options.operating_point,
@@ -298,9 +299,9 @@ def _read_groups(
                     for event in _parse(parser, packet.data, video, options):
                         yield group, event
                 elif group + (reader - group) % num_readers >= len(groups):
-                    return  # this reader's last group is over
+                    return  # this reader has read its last group
     except BitstreamError:
-        # What damages a group that another reader has is that reader's to report.
+        # Damage in the group of another reader is reported by that reader.
         if group % num_readers == reader:
             raise
         return

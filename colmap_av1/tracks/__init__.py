@@ -1,1 +1,1 @@
-"""Motion chained into tracks, corrected and chosen."""
+"""Chain motion into tracks, correct them on pictures, and select some of them."""

@@ -1,10 +1,10 @@
-"""Corners followed from picture to picture, for poses where the motion of a stream misleads.
+"""Corners followed from picture to picture, for poses where the motion vectors are misleading.
 
-Where a camera jerks, or a shutter's read-out bends a picture, an encoder takes what compresses
-well: whole regions agree on motion that is not there, and the pose of that one image is off by
-pixels while its residuals stay small. Corners of the pictures (Shi and Tomasi, "Good Features to
-Track", 1994) followed by pyramidal Lucas-Kanade are few, take some hundredths of a second an image,
-and say where it is.
+Where a camera jerks, or a rolling shutter bends a picture, an encoder chooses the motion that
+compresses well. Whole regions then agree on false motion, and the pose of that image is off by
+pixels although its residuals are small. Corners of the pictures (Shi and Tomasi, "Good Features to
+Track", 1994) that are followed by pyramidal Lucas-Kanade are few, take some hundredths of a second
+per image, and show the true pose.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
-# Which positions [n, 2] count in a frame, by its index, whose picture is (width, height) large.
+# Decides which positions [n, 2] are used, given the index of a frame and the (width, height) of its
+# picture.
 Counts = Callable[[int, _Floats, tuple[int, int]], NDArray[np.bool_]]
 
-# Share of the strongest corner's strength that one has at least.
+# Smallest strength of a corner, relative to the strongest one of the picture.
 _QUALITY = 0.01
-# New ones are looked for where fewer than this share of them are left.
+# New corners are detected when fewer than this share of the largest number are left.
 _FEW = 0.8
 _WINDOW = (15, 15)
 _LEVELS = 3
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
-# Pixels by which the way there and back may miss its start.
+# Largest forward-backward error in pixels.
 _MAX_RETURN = 0.15
-# Images that see a corner at least.
-_LEAST_IMAGES = 3
-# Expected error in pixels of the picture that is looked at.
+# Smallest number of images in which a corner is observed.
+_MIN_IMAGES = 3
+# Expected error in pixels of the searched picture, which may be downscaled.
 _SIGMA = 0.25
 
 
@@ -44,8 +45,8 @@ class CornerDensity:
     """How many corners are followed.
 
     Attributes:
-        most: corners of an image.
-        spacing: pixels between them, of the picture that is looked at.
+        most: largest number of corners in an image.
+        spacing: smallest distance between them in pixels of the searched picture.
     """
 
     most: int = 650
@@ -63,19 +64,19 @@ def follow_corners(
 ) -> Tracks:
     """Follow corners from each picture to the next one.
 
-    Large pictures are looked at in smaller ones, as the motion of large videos is.
+    Large pictures are downscaled for the search, as large videos are for their motion.
 
     Args:
-        guide: tracks of the same video: a corner is looked for where the track next to it goes.
+        guide: tracks of the same video: a corner is searched for where the nearest track moves.
         pictures: (frame, picture) in the order of frames, uint8 BGR [height, width, 3] of one size.
-        counts: which positions count, see `Counts`: masks leave out others.
+        counts: which positions are used, see `Counts`; for masks.
         progress: called after each picture with the number of pictures so far.
-        density: how many.
-        keep: called with each frame and the grey picture of it that is looked at.
+        density: how many corners to follow.
+        keep: called with each frame and its grey picture that is searched.
 
     Returns:
-        Tracks of three and more of the pictures, in the frames of `guide` and pixels of the
-        pictures.
+        Tracks with observations in at least three pictures; their frames are those of `guide` and
+        their positions are in pixels of the pictures.
     """
     by_frame = guide.order_by_frame()
     bounds = np.searchsorted(guide.frame[by_frame], np.arange(guide.num_frames + 1))
@@ -93,10 +94,10 @@ def follow_corners(
         if keep is not None:
             keep(frame, grey)
         scale = (np.array(picture.shape[1::-1]) / grey.shape[::-1]).astype(np.float32)
-        inside = partial(_counts, counts, frame, grey.shape[::-1])
+        inside = partial(_are_used, counts, frame, grey.shape[::-1])
         if before is not None and len(at):
-            start, way = _motion(observations(before[0]), observations(frame), guide.xy, track)
-            expected = _nearest(start / scale, way / scale, at)
+            start, motion = _motion(observations(before[0]), observations(frame), guide.xy, track)
+            expected = _nearest(start / scale, motion / scale, at)
             at, followed = _follow(before[1], grey, at, expected)
             followed &= inside(at)
             number, at = number[followed], at[followed]
@@ -118,7 +119,14 @@ def _motion(
     xy: _Floats,
     track: NDArray[np.int64],
 ) -> tuple[_Floats, _Floats]:
-    """Where the tracks are that two frames see, by their observations, and their ways between."""
+    """Position in the first frame, and motion to the second, of the tracks observed in both.
+
+    Args:
+        before: indices of the observations in the first frame.
+        now: indices of the observations in the second frame.
+        xy: positions of all observations.
+        track: track of each observation.
+    """
     _, first, second = np.intersect1d(
         track[before], track[now], assume_unique=True, return_indices=True
     )
@@ -126,29 +134,29 @@ def _motion(
     return start, xy[now[second]] - start
 
 
-def _nearest(start: _Floats, way: _Floats, at: _Floats) -> _Floats:
-    """The way of the nearest of some tracks; none where there are no tracks."""
+def _nearest(start: _Floats, motion: _Floats, at: _Floats) -> _Floats:
+    """The motion of the track nearest to each position; 0 if there are no tracks."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
 
     if len(start) == 0:
         return np.zeros_like(at)
-    return np.asarray(way[cKDTree(start).query(at)[1]], np.float32)
+    return np.asarray(motion[cKDTree(start).query(at)[1]], np.float32)
 
 
 def _follow(
-    before: NDArray[np.uint8], now: NDArray[np.uint8], at: _Floats, way: _Floats
+    before: NDArray[np.uint8], now: NDArray[np.uint8], at: _Floats, motion: _Floats
 ) -> tuple[_Floats, NDArray[np.bool_]]:
-    """Look for corners near the ends of their expected ways.
+    """Search for corners near the positions to which their expected motion leads.
 
     Returns:
-        Where they are, and which are found: those that lead back to where they were.
+        Their positions, and which were found and passed a forward-backward check.
     """
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
 
-    def look(
+    def search(
         source: NDArray[np.uint8], target: NDArray[np.uint8], p: _Floats, to: _Floats, levels: int
     ) -> tuple[_Floats, NDArray[np.bool_]]:
-        # OpenCV counts from the centre of the first pixel.
+        # OpenCV's origin is the centre of the first pixel.
         found, ok, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,
@@ -161,22 +169,22 @@ def _follow(
         )
         return np.asarray(found + np.float32(0.5), np.float32), ok.ravel() == 1
 
-    found, there = look(before, now, at, at + way, _LEVELS)
-    # From where it should end: it is asked whether it stays there, not whether it is found.
-    back, home = look(now, before, found, at, 0)
+    found, forward = search(before, now, at, at + motion, _LEVELS)
+    # The backward search starts at the original position: it only checks that the corner stays.
+    back, backward = search(now, before, found, at, 0)
     missed = np.abs(back - at).max(axis=1)
-    return found, there & home & (missed <= _MAX_RETURN)
+    return found, forward & backward & (missed <= _MAX_RETURN)
 
 
-def _counts(counts: Counts, frame: int, size: tuple[int, int], at: _Floats) -> NDArray[np.bool_]:
-    """Whether positions lie in the picture of a frame, and count."""
+def _are_used(counts: Counts, frame: int, size: tuple[int, int], at: _Floats) -> NDArray[np.bool_]:
+    """Whether positions lie inside the picture of a frame and are used."""
     inside = np.asarray(((at >= 0) & (at <= size)).all(axis=1))
     inside[inside] = counts(frame, at[inside], size)
     return inside
 
 
 def _new_corners(grey: NDArray[np.uint8], at: _Floats, density: CornerDensity) -> _Floats:
-    """Corners of a picture apart from those that are followed already."""
+    """Detect corners that keep their distance from those that are already followed."""
     free = np.full(grey.shape, 255, np.uint8)
     for x, y in at.astype(np.int64).tolist():
         cv2.circle(free, (x, y), density.spacing, 0, -1)
@@ -190,15 +198,15 @@ def _new_corners(grey: NDArray[np.uint8], at: _Floats, density: CornerDensity) -
 def _as_tracks(
     guide: Tracks, seen: list[tuple[int, NDArray[np.int64], _Floats]], scale: _Floats
 ) -> Tracks:
-    """The corners that enough images saw, as tracks."""
+    """The corners that are observed in enough images, as tracks."""
     number = np.concatenate([[], *(n for _, n, _ in seen)]).astype(np.int64)
     xy = np.concatenate([np.empty((0, 2), np.float32), *(at for _, _, at in seen)]) * scale
     frame = np.repeat([f for f, _, _ in seen], [len(n) for _, n, _ in seen]).astype(np.int32)
     lengths = np.bincount(number)
-    # Frames stay in their order.
+    # A stable sort keeps the frames of a track in order.
     order = np.argsort(number, kind="stable")
-    order = order[lengths[number[order]] >= _LEAST_IMAGES]
-    lengths = lengths[lengths >= _LEAST_IMAGES]
+    order = order[lengths[number[order]] >= _MIN_IMAGES]
+    lengths = lengths[lengths >= _MIN_IMAGES]
     return Tracks(
         num_frames=guide.num_frames,
         width=guide.width,

@@ -1,4 +1,4 @@
-"""Tracks of overlays, which are not part of the scene: logos, dashboards."""
+"""Remove tracks of overlays, such as logos and dashboards, which are not part of the scene."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
-# Pixels that nothing over the picture moves by: the finest step of a motion vector.
+# Largest motion of an overlay in pixels: the finest step of a motion vector.
 _STILL = 0.125
-# Pixels that the picture moves by along a track, before standing still means anything. Far points
-# stand still for a while before a camera that moves sideways.
+# A track that stands still is an overlay only if the picture moves by this many pixels meanwhile.
+# Distant points stand still for a while when a camera moves sideways.
 _MOVED = 4.0
-# Steps to a frame that their median is taken of, on average, where there are more.
+# The median motion into a frame is taken from this many steps on average, if there are more.
 _NUM_STEPS = 1000
 
 
 def remove_overlays(tracks: Tracks) -> Tracks:
     """Remove the tracks that stand still while the picture moves.
 
-    A picture moves by the median step of its tracks, of a thousand or more where there are so many,
-    from frame to frame. Where the camera rests nothing is left out.
+    The motion of the picture from frame to frame is the median step of its tracks, or of a sample
+    of about a thousand of them. No track is removed while the camera rests.
 
     Args:
         tracks: any tracks.
 
     Returns:
-        The other tracks in their former order; the same object where nothing is left out.
+        The other tracks in the same order; the same object if no track is removed.
     """
     if tracks.num_tracks == 0:
         return tracks
     first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
     travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(tracks))])
     moved = travelled[tracks.frame[last] + 1] - travelled[tracks.frame[first] + 1]
-    # Few tracks end where they began, and only these can have stood still.
+    # Only tracks that end where they began can have stood still, and they are few.
     ends_still = _length(tracks.xy[last] - tracks.xy[first]) <= _STILL
-    over_picture = ends_still & (moved >= _MOVED)
-    for index in np.flatnonzero(over_picture):
+    is_overlay = ends_still & (moved >= _MOVED)
+    for index in np.flatnonzero(is_overlay):
         xy = tracks.xy[first[index] : last[index] + 1]
-        over_picture[index] = _length(xy - xy[0]).max() <= _STILL
-    return tracks.keep_tracks(~over_picture)
+        is_overlay[index] = _length(xy - xy[0]).max() <= _STILL
+    return tracks.keep_tracks(~is_overlay)
 
 
 def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
-    """Median motion of tracks into each frame in pixels: float64 [num_frames], 0 without any."""
+    """Median motion of tracks into each frame in pixels: float64 [num_frames], 0 without tracks."""
     starts = np.zeros(tracks.num_observations, dtype=np.bool_)
     starts[tracks.offsets[:-1]] = True
-    # Every n-th: steps of a track follow each other, so all tracks have their part.
+    # Every n-th step is used. The steps of a track are stored together, so this samples all tracks.
     stride = max(1, tracks.num_observations // (_NUM_STEPS * tracks.num_frames))
     to = np.arange(0, tracks.num_observations, stride)
     to = to[~starts[to]]
@@ -55,7 +55,7 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     step /= frame - tracks.frame[to - 1]
     count = np.bincount(frame, minlength=tracks.num_frames)
     by_frame = np.split(step[order_by_frame(frame, tracks.num_frames)], np.cumsum(count)[:-1])
-    # Frames since the last one that any observation is kept in.
+    # For each frame with observations, the number of frames since the previous one with any.
     observed = np.flatnonzero(np.bincount(tracks.frame))
     since = dict(zip(observed[1:].tolist(), np.diff(observed).tolist(), strict=True))
     motion = np.zeros(tracks.num_frames)
@@ -66,6 +66,6 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
 
 
 def _length(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Length of each of [n, 2] vectors; NumPy's own norm takes many times as long for two."""
+    """Lengths of vectors [n, 2]. `np.linalg.norm` takes many times as long for two columns."""
     x, y = vectors[:, 0], vectors[:, 1]
     return np.sqrt(x * x + y * y)

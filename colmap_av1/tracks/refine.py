@@ -1,4 +1,4 @@
-"""Sub-pixel correction of tracks on decoded pictures, the first stage that needs pixels."""
+"""Sub-pixel correction of tracks on decoded pictures. This is the first stage that needs pixels."""
 
 from __future__ import annotations
 
@@ -17,26 +17,28 @@ from colmap_av1.tracks.selection import spread_observations
 from colmap_av1.tracks.texture import texture_at
 from colmap_av1.tracks.tracks import Tracks
 
-# Pixels around a template's window: one for its gradients, two for the way back.
+# Pixels around the window of a template: one for its gradients, two for the backward search.
 _MARGIN = 3
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.01)
-# Frames without a confirmation after which a track is given a new template.
+# A track that is not confirmed in more than this many frames gets a new template.
 _MAX_MISSES = 3
-# Grey levels by which windows that match differ, beside the share of their contrast.
+# Largest mean difference of matching windows in grey levels, in addition to a share of their
+# contrast.
 _GREY_TOLERANCE = 2.0
-# Pixels by which the way there and back may miss its start.
+# Largest forward-backward error in pixels.
 _MAX_RETURN = 0.25
-# Flatter windows confirm nothing: a grey level of noise moves them by more.
+# A window with less texture confirms nothing: noise of one grey level would move its match by more
+# than this many pixels.
 _MAX_SOFTNESS = 0.15
-# Logarithm of a match's variance in px^2: constant, slope with the logarithm of the error that the
-# windows' difference lets expect, slope with that of the variance of the bitstream's motion since
-# the template; fitted by examples/benchmarks/fit_trust.py.
+# The logarithm of the variance of a match in px^2 is a constant plus a slope for each of two
+# logarithms: of the error that the difference of the windows suggests, and of the variance of the
+# bitstream's motion since the template. Fitted by examples/benchmarks/fit_trust.py.
 _MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.49, 1.17, 0.80
-# Standard deviation in pixels that is added where there is texture but nothing like the template:
-# hidden, or followed wrongly.
+# Standard deviation in pixels that is added where there is texture but no match with the template:
+# the point is occluded, or was followed wrongly.
 _REFUSED_SIGMA = 0.7
-# Observations corrected for poses: more than a mapper or a bundle adjustment is given, which choose
-# anew among them.
+# Density of the observations that are corrected for poses: more than a mapper or a bundle
+# adjustment gets, because the observations for these are selected among them.
 _SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.0, max_sigma=0.0)
 
 
@@ -50,14 +52,15 @@ def refine_tracks(
 ) -> Tracks:
     """Correct track positions by Lucas-Kanade on the decoded pictures.
 
-    Every track carries the picture around an earlier observation, its template. An observation
-    is looked for from where the bitstream's step leads, first by the template, which does not
-    drift, then by the observation before; found by the latter only, it becomes the new
-    template. What neither finds keeps the bitstream's step and its larger expected error, and
-    is not marked as confirmed: nothing is left out.
+    Every track has a template, which is the picture around an earlier observation. An observation
+    is searched for near the position to which the step in the bitstream leads: first with the
+    template, which does not drift, then with the picture around the previous observation. If only
+    the second search finds it, it becomes the new template. If neither finds it, it keeps the
+    bitstream's step and its larger expected error, and is not marked as confirmed. No observation
+    is removed.
 
-    Frames are consumed one by one; memory holds two pictures and one template for each
-    track of a frame, besides the tracks.
+    Frames are consumed one by one. In addition to the tracks, memory holds two pictures and one
+    template for each track of a frame.
 
     Args:
         tracks: tracks of the whole video.
@@ -66,9 +69,9 @@ def refine_tracks(
             missing keep the bitstream's step.
         options: how to refine; the defaults of RefineOptions if None.
         progress: called after each frame with the number of frames so far.
-        expected: bool [num_observations] which are places that something else lets expect, and
-            nothing has seen; None: none. Where such a one is not found, nothing is looked for by
-            what its picture shows. They are not the first of their tracks.
+        expected: bool [num_observations] observations that are only predicted, not observed;
+            None: none. If such an observation is not found, the picture around it is not used to
+            search for others. The first observation of a track is never a predicted one.
 
     Returns:
         The same tracks and observations with corrected positions, their expected errors and
@@ -96,7 +99,7 @@ def refine_spread_tracks(
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     progress: Callable[[int], None] | None = None,
 ) -> Tracks:
-    """Correct long tracks, spread over every image, in these images by Lucas-Kanade.
+    """Correct long tracks that are spread over every image, in the images only, by Lucas-Kanade.
 
     The corrected observations have smaller expected errors, so that a later selection prefers
     them.
@@ -108,7 +111,7 @@ def refine_spread_tracks(
         progress: called after each picture with the number of pictures so far.
 
     Returns:
-        The same tracks and observations; those that are not corrected are as they were.
+        The same tracks and observations; those that are not corrected are unchanged.
 
     Raises:
         ImageError: as `refine_tracks`.
@@ -139,9 +142,9 @@ def match_tracks(
     *,
     expected: NDArray[np.bool_] | None = None,
 ) -> RefinedTracks:
-    """Do the work of `refine_tracks`, and return how every observation was found.
+    """Do the work of `refine_tracks`, and return how each observation was found.
 
-    Args and errors are those of `refine_tracks`.
+    Arguments and errors are those of `refine_tracks`.
     """
     state = RefinedTracks.start(tracks, options, expected)
     by_frame = tracks.order_by_frame()
@@ -175,10 +178,10 @@ class RefinedTracks:
         xy: float32 [num_observations, 2] corrected positions in pixels.
         variance: float64 [num_observations] their expected variance in px^2.
         confirmed: bool [num_observations].
-        source: int64 [num_observations] the observation whose picture each was found by; -1 for
-            those that are not confirmed.
+        source: int64 [num_observations] the observation whose picture each one was matched with;
+            -1 if it is not confirmed.
         noise: float32 [num_observations] error in pixels that the difference of the matched
-            pictures would make if it were noise; 0 for those that are not confirmed.
+            windows would cause if it were noise; 0 if the observation is not confirmed.
         bitstream_variance: float64 [num_observations] variance before refinement.
     """
 
@@ -187,8 +190,8 @@ class RefinedTracks:
     track: NDArray[np.int64]  # of each observation
     is_first: NDArray[np.bool_]
     is_last: NDArray[np.bool_]
-    shown: NDArray[np.bool_]  # whether it was seen, or is found: its picture is of the track
-    step: NDArray[np.float32]  # by which the bitstream led to each observation
+    shown: NDArray[np.bool_]  # observed or found, so that the picture there shows the track
+    step: NDArray[np.float32]  # the bitstream's motion from the previous observation
     step_variance: NDArray[np.float64]
     bitstream_variance: NDArray[np.float64]
     xy: NDArray[np.float32]
@@ -204,14 +207,14 @@ class RefinedTracks:
     def start(
         cls, tracks: Tracks, options: RefineOptions, expected: NDArray[np.bool_] | None
     ) -> RefinedTracks:
-        """What is known before the first frame."""
+        """The state before the first frame."""
         num_observations = tracks.num_observations
         is_first = np.zeros(num_observations, dtype=np.bool_)
         is_first[tracks.offsets[:-1]] = True
         is_last = np.zeros(num_observations, dtype=np.bool_)
         is_last[tracks.offsets[1:] - 1] = True
         variance = tracks.sigma.astype(np.float64) ** 2
-        # Hidden frames may leave a step without a growth of the error.
+        # The error may not grow in a step through hidden frames.
         step_variance = np.maximum(np.diff(variance, prepend=0.0), 0.0)
         alive = np.bincount(tracks.frame[is_first], minlength=tracks.num_frames + 1)
         alive[1:] -= np.bincount(tracks.frame[is_last], minlength=tracks.num_frames + 1)[:-1]
@@ -234,13 +237,13 @@ class RefinedTracks:
         )
 
     def skip(self, seen: NDArray[np.int64]) -> None:
-        """Carry the observations of a frame without a picture on by the bitstream's steps."""
+        """Move the observations in a frame without a picture by the bitstream's steps."""
         later = seen[~self.is_first[seen]]
         self._follow(later)
         self.templates.drop(self.track[seen[self.is_last[seen]]])
 
     def refine(self, seen: NDArray[np.int64], image: NDArray[np.uint8]) -> None:
-        """Correct the observations of the frame whose picture is `image`."""
+        """Correct the observations in the frame whose picture is `image`."""
         frame = int(self.tracks.frame[seen[0]]) if len(seen) else -1
         self.templates.drop(self.track[seen[self.is_last[seen] & self.is_first[seen]]])
         later = seen[~self.is_first[seen]]
@@ -248,7 +251,7 @@ class RefinedTracks:
         templates = self.templates
         canvas = templates.canvas(image)
 
-        # By the template.
+        # Search with the template.
         tracked = later[templates.slot[self.track[later]] >= 0]
         track = self.track[tracked]
         found = _match(
@@ -258,7 +261,7 @@ class RefinedTracks:
         templates.misses[track[sure]] = 0
         templates.misses[track[~sure]] += 1
 
-        # By the observation before, which then becomes the template.
+        # Search with the picture of the previous observation; what is found becomes the template.
         lost = tracked[~sure]
         fresh = np.empty(0, dtype=np.int64)
         if self.last_image is not None:
@@ -281,7 +284,7 @@ class RefinedTracks:
         self.last_image, self.last_frame = image, frame
 
     def _follow(self, later: NDArray[np.int64]) -> None:
-        """Carry observations on from those before by the bitstream's steps."""
+        """Predict observations from the previous ones by the bitstream's steps."""
         limits = np.array([self.tracks.width, self.tracks.height], np.float32)
         self.xy[later] = np.clip(self.xy[later - 1] + self.step[later], 0, limits)
         self.variance[later] = self.variance[later - 1] + self.step_variance[later]
@@ -292,12 +295,12 @@ class RefinedTracks:
         found: _Matches,
         source: NDArray[np.int64],
     ) -> NDArray[np.bool_]:
-        """Take over the matches that are good enough; returns which are.
+        """Use the matches that are good enough, and return which ones are.
 
         Args:
             observations: int64 [n].
             found: their matches.
-            source: int64 [n] the observations whose pictures were looked for.
+            source: int64 [n] the observations whose pictures were searched for.
         """
         track = self.track[observations]
         contrast = self.templates.contrast[track]
@@ -319,20 +322,20 @@ class RefinedTracks:
 class _Templates:
     """The pictures around one earlier observation of each live track, as tiles of one picture.
 
-    One picture lets Lucas-Kanade look for all tracks at once, whichever frames their templates
-    are from.
+    With all tiles in one picture, the atlas, a single call of Lucas-Kanade searches for all tracks,
+    although their templates come from different frames.
     """
 
     tile: int  # width of a tile in pixels
     columns: int
     atlas: NDArray[np.uint8]
-    free: NDArray[np.int64]  # slots, the last to be given out first
+    free: NDArray[np.int64]  # free slots, a stack
     num_free: int
-    slot: NDArray[np.int64]  # of each track, -1: none
-    point: NDArray[np.float32]  # of each track in the atlas, first pixel's centre (0, 0)
-    source: NDArray[np.int64]  # observation of each track that its template shows
-    contrast: NDArray[np.float32]  # mean absolute deviation, in grey levels
-    softness: NDArray[np.float32]  # pixels of matching error for a grey level of noise
+    slot: NDArray[np.int64]  # of each track; -1: none
+    point: NDArray[np.float32]  # of each track in the atlas; the first pixel's centre is (0, 0)
+    source: NDArray[np.int64]  # the observation of each track that its template shows
+    contrast: NDArray[np.float32]  # mean absolute deviation in grey levels
+    softness: NDArray[np.float32]  # matching error in pixels for noise of one grey level
     misses: NDArray[np.int32]  # frames without a confirmation
 
     @classmethod
@@ -356,7 +359,7 @@ class _Templates:
         )
 
     def canvas(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture, enlarged to the atlas's size: Lucas-Kanade wants two of one size."""
+        """Pad the picture to the size of the atlas: Lucas-Kanade needs two pictures of one size."""
         bottom = self.atlas.shape[0] - image.shape[0]
         right = self.atlas.shape[1] - image.shape[1]
         framed = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
@@ -375,7 +378,7 @@ class _Templates:
         track: NDArray[np.int64],
         xy: NDArray[np.float32],
     ) -> None:
-        """Make the picture around positions the tracks' templates, where there is texture."""
+        """Store the picture around positions as templates of tracks, if there is texture."""
         self.drop(track)
         if len(track) == 0:
             return
@@ -404,8 +407,8 @@ class _Templates:
 @dataclass(frozen=True)
 class _Matches:
     ok: NDArray[np.bool_]
-    position: NDArray[np.float32]  # [n, 2], corner origin
-    difference: NDArray[np.float32]  # [n] mean absolute difference, in grey levels
+    position: NDArray[np.float32]  # [n, 2], origin at the picture's corner
+    difference: NDArray[np.float32]  # [n] mean absolute difference in grey levels
 
 
 def _match(
@@ -415,14 +418,14 @@ def _match(
     expected: NDArray[np.float32],
     options: RefineOptions,
 ) -> _Matches:
-    """Look for what `source` shows at some points near expected positions in `target`.
+    """Search `target` near expected positions for what `source` shows at some points.
 
     Args:
         source: picture with the points.
         target: picture of the same size.
-        point: float32 [n, 2] in source, first pixel's centre (0, 0).
-        expected: float32 [n, 2] in target, corner origin.
-        options: how.
+        point: float32 [n, 2] in source; the first pixel's centre is (0, 0).
+        expected: float32 [n, 2] in target; the origin is the picture's corner.
+        options: window size and largest correction.
     """
     if len(point) == 0:
         none = np.empty(0, np.float32)
@@ -448,7 +451,7 @@ def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> N
     """Expected variance in px^2 of matches.
 
     Args:
-        noise: error in pixels that the difference of the windows would make if it were noise.
+        noise: error in pixels that the difference of the windows would cause if it were noise.
         prior: variance in px^2 of the bitstream's motion over the same frames.
     """
     exponent = _MATCH_CONSTANT + _MATCH_NOISE * np.log(0.02 + noise)

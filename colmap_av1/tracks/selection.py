@@ -1,4 +1,4 @@
-"""Selection of tracks: few accurate ones for poses, more for maps, all for dense clouds."""
+"""Select tracks: few accurate ones for poses, more for maps, all for dense clouds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
 @dataclass(frozen=True)
 class _Limits:
-    """The limits in force, see `DensityOptions`; 0 is none."""
+    """The limits to apply, see `DensityOptions`; 0: no limit."""
 
     max_tracks_per_image: int
     spacing: float
@@ -24,43 +24,46 @@ class _Limits:
     wide_tracks: int
 
 
-# max_sigma is for images of every frame; where images lie n frames apart it is sqrt(n) times that,
-# as errors grow from step to step.
+# max_sigma is for images of every frame. For images that are n frames apart it is multiplied by
+# sqrt(n), because errors grow from step to step.
 PRESETS = {
-    # Poses need wide baselines; points do not, and long tracks take a mapper's time.
+    # Poses need wide baselines. Points do not, and long tracks slow down a mapper.
     "sparse": _Limits(1500, spacing=12.0, min_images=3, max_sigma=0.8, wide_tracks=1000),
     "default": _Limits(3500, spacing=7.5, min_images=3, max_sigma=0.8, wide_tracks=300),
     "dense": _Limits(0, spacing=0.0, min_images=1, max_sigma=0.0, wide_tracks=0),
 }
 
-# Error in pixels that an observation has however accurate its motion is; keeps one sure
-# observation from outweighing many good ones.
+# Error in pixels that is added to every observation. It keeps one accurate observation from
+# outweighing many good ones.
 _SIGMA_FLOOR = 0.3
-# What an observation says of the cameras is its motion relative to its error: one that moved far
-# may be less accurate, up to this share of the distance.
+# How much an observation constrains the cameras depends on its motion relative to its error, so one
+# that moved far may be less accurate. Its error is at most this share of the distance.
 _MAX_ERROR_SHARE = 1 / 30
-# An observation is wide that moved at least this share of what those that moved farthest did.
+# An observation has a wide baseline if it moved at least this share of the largest distances.
 _WIDE = 0.8
 
 
 def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
-    """Choose tracks that are long, accurate and spread over every image.
+    """Select tracks that are long, accurate and spread over every image.
 
-    Observations with an error above `max_sigma`, relative to the first one of their track, are left
-    out but for those with a wide baseline: of each image, `wide_tracks` that moved nearly as far
-    from there as any of its do, those with the least error for their distance, and all that are as
-    accurate; where the error is a thirtieth of the distance or less. Then tracks are taken best
-    first, the weight of an observation being its inverse expected variance. One is used where at
-    least half of its observations lie in images that are not full, and there in cells, `spacing`
-    wide, that no better track lies in; it loses the observations in full images.
+    First, observations are removed whose error, relative to the first observation of their track,
+    exceeds `max_sigma`. Observations with a wide baseline may have a larger error, up to a
+    thirtieth of the distance from the first observation. In each image, a baseline is wide that is
+    nearly as long as the longest ones. Of these observations, the `wide_tracks` with the smallest
+    error relative to the distance are kept, and all others of the image that are as accurate.
+
+    Then tracks are selected, the best first. The weight of a track is the sum of the inverse
+    expected variances of its observations. A track is selected if at least half of its observations
+    lie in images that are not full, and there in cells of width `spacing` without a better track.
+    It loses its observations in full images.
 
     Args:
         tracks: tracks of the whole video.
-        options: how many to use; the defaults of DensityOptions if None.
+        options: how many to select; the defaults of DensityOptions if None.
 
     Returns:
-        The chosen tracks in their former order, each with `min_images` observations or more.
-        The same object where nothing is left out.
+        The selected tracks in the same order, each with at least `min_images` observations. The
+        same object if nothing is removed.
     """
     options = options if options is not None else DensityOptions()
     limits = _limits_of(options)
@@ -73,35 +76,35 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
         max_variance = limits.max_sigma**2
         if options.max_sigma is None:
             max_variance *= _frames_between_images(tracks)
-        way = _way_since_first(tracks)
-        share = _error_shares(tracks, np.sqrt(variance), way, limits.wide_tracks)
-        # In place, here and below: these arrays are the largest of a whole run.
-        way *= share[tracks.frame]
-        way *= way
-        sure = variance <= np.maximum(np.float32(max_variance), way, out=way)
-        del way
+        distance = _distance_since_first(tracks)
+        share = _error_shares(tracks, np.sqrt(variance), distance, limits.wide_tracks)
+        # Computed in place, here and below, because these arrays are the largest of a run.
+        distance *= share[tracks.frame]
+        distance *= distance
+        sure = variance <= np.maximum(np.float32(max_variance), distance, out=distance)
+        del distance
         tracks, variance = tracks.keep_observations(sure), variance[sure]
     return tracks.keep_observations(_spread(tracks, variance, limits))
 
 
 def spread_observations(tracks: Tracks, options: DensityOptions) -> NDArray[np.bool_]:
-    """Which observations `select_tracks` keeps where errors are not limited: bool [n]."""
+    """Which observations `select_tracks` would keep without limits on errors: bool [n]."""
     return _spread(tracks, _variance_since_first(tracks), _limits_of(options))
 
 
 def _limits_of(options: DensityOptions) -> _Limits:
-    """The limits of the preset, with those of the options in place of its own."""
+    """The limits of the preset, replaced by those that the options give."""
     names = [field.name for field in fields(_Limits)]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     return replace(PRESETS[options.preset], **given)
 
 
 def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: _Limits) -> NDArray[np.bool_]:
-    """Which observations are kept so that tracks are long, accurate and spread; bool [n].
+    """Which observations to keep so that tracks are long, accurate and spread: bool [n].
 
     Args:
         tracks: any tracks.
-        variance: float32 [n] variance of each observation in px^2, overwritten.
+        variance: float32 [n] variance of each observation in px^2; overwritten.
         limits: how many tracks to keep, and how far apart.
     """
     variance += _SIGMA_FLOOR**2
@@ -128,7 +131,7 @@ def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
     return variance
 
 
-def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
+def _distance_since_first(tracks: Tracks) -> NDArray[np.float32]:
     """Distance of each observation to the first kept one of its track, in px."""
     squared = np.zeros(len(tracks.xy), dtype=np.float32)
     for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
@@ -140,23 +143,23 @@ def _way_since_first(tracks: Tracks) -> NDArray[np.float32]:
 
 
 def _error_shares(
-    tracks: Tracks, error: NDArray[np.float32], way: NDArray[np.float32], wide_tracks: int
+    tracks: Tracks, error: NDArray[np.float32], distance: NDArray[np.float32], wide_tracks: int
 ) -> NDArray[np.float32]:
-    """Error allowed in each frame for wide baselines, as a share of the motion, [num_frames]."""
+    """Largest error of wide baselines in each frame, as a share of the distance: [num_frames]."""
     if wide_tracks == 0:
         return np.zeros(tracks.num_frames, dtype=np.float32)
     shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)
-    usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * way)
+    usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * distance)
     usable = usable[order_by_frame(tracks.frame[usable], tracks.num_frames)]
     bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))
     for frame, (start, stop) in enumerate(pairwise(bounds)):
         own = usable[start:stop]
         if len(own) <= wide_tracks:
             continue
-        farthest = np.partition(way[own], -wide_tracks)[-wide_tracks]
-        wide = own[(way[own] >= _WIDE * farthest) & (way[own] > 0)]
+        farthest = np.partition(distance[own], -wide_tracks)[-wide_tracks]
+        wide = own[(distance[own] >= _WIDE * farthest) & (distance[own] > 0)]
         if len(wide) > wide_tracks:
-            share = error[wide] / way[wide]
+            share = error[wide] / distance[wide]
             shares[frame] = np.partition(share, wide_tracks - 1)[wide_tracks - 1]
     return shares
 

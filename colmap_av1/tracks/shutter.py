@@ -1,4 +1,4 @@
-"""Tracks of a rolling shutter, which reads the rows of a picture one after another."""
+"""Correct tracks for a rolling shutter, which reads the rows of a picture one after another."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
 
-# Width in pixels of the cells of a picture over which velocities are averaged: those of single
-# tracks are too noisy beside what a shutter changes, and what is near moves much alike.
+# Width in pixels of the cells of a picture over which velocities are averaged. The velocity of a
+# single track is too noisy for the small corrections here, and neighbouring points move alike.
 _CELL = 32
-# Weights of steps to the frames one and two away in the derivative of a cubic through all five.
+# Weights of the motion over one and two frames in the derivative of a cubic fitted to five frames.
 _NEAR, _FAR = 2 / 3, -1 / 12
 
 
 def velocities(tracks: Tracks) -> NDArray[np.float64]:
-    """Float64 [num_observations, 2] pixels per frame at each observation; 0 of lone ones.
+    """Velocity at each observation in pixels per frame: float64 [num_observations, 2].
 
-    The derivative of a cubic through the frames up to two away, where the track has all of them: a
-    line through so many would flatten what a hand shakes. Else that of a parabola through its
-    neighbours, or the step to the one it has. These are averaged over cells of each picture.
+    It is the derivative of a cubic fitted to the frames up to two away, if the track has all of
+    them; a line would smooth out the shake of a hand. Otherwise it is the derivative of a parabola
+    through both neighbours, or the step to the only neighbour; 0 without neighbours. Velocities
+    are averaged over cells of each picture.
     """
     one, two = (_steps(tracks, shift) for shift in (1, 2))
     ahead, behind = one, _back(one, 1)
@@ -35,7 +36,7 @@ def velocities(tracks: Tracks) -> NDArray[np.float64]:
 
 
 def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of values [num_observations, 2] over all tracks in a cell of a frame."""
+    """The mean of values [num_observations, 2] over all observations in the same cell."""
     columns = -(-tracks.width // _CELL) + 2
     rows = -(-tracks.height // _CELL) + 2
     cell = np.clip(tracks.xy // _CELL, -1, [columns - 2, rows - 2]).astype(np.int64) + 1
@@ -47,7 +48,7 @@ def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
-    """Float64 [num_observations, 2] motion to so many frames later; NaN where that is unknown."""
+    """Motion to `shift` frames later: float64 [num_observations, 2]; NaN where it is unknown."""
     found = np.full(tracks.xy.shape, np.nan)
     if tracks.num_observations > shift:
         number = tracks.track
@@ -60,7 +61,7 @@ def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
 
 
 def _back(steps: NDArray[np.float64], shift: int) -> NDArray[np.float64]:
-    """The motion from so many frames earlier, of those to so many later."""
+    """The motion from `shift` frames earlier, given the motion to `shift` frames later."""
     found = np.full_like(steps, np.nan)
     found[shift:] = steps[: len(steps) - shift]
     return found
@@ -72,12 +73,13 @@ def at_middle_of_read_out(
     place: NDArray[np.floating],
     read_out: float,
 ) -> NDArray[np.float64]:
-    """Where points are in the middle of the read-out, that are seen when their row is read.
+    """Positions of points in the middle of the read-out, given those when their row is read.
 
     Args:
         xy: [n, 2] pixels.
         velocity: [n, 2] pixels per frame.
-        place: [n] of their rows in the order of read-out, -0.5 for the first, 0.5 for the last.
+        place: [n] position of their rows in the order of read-out, from -0.5 for the first row to
+            0.5 for the last.
         read_out: time from the first row to the last, in frames.
     """
     return np.asarray(xy - read_out * place[:, None] * velocity, dtype=np.float64)
@@ -86,12 +88,12 @@ def at_middle_of_read_out(
 def row_places(
     xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Places [n] of points in the order of read-out, see `at_middle_of_read_out`.
+    """Positions [n] of points in the order of read-out, see `at_middle_of_read_out`.
 
     Args:
         xy: [n, 2] pixels of shown pictures.
-        size: (width, height) of these.
-        down: how the direction in which rows are read is shown: (0, 1) is down.
+        size: (width, height) of these pictures.
+        down: direction in shown pictures in which rows are read; (0, 1) is down.
     """
     length = size[0] if down[0] else size[1]
     from_centre = np.asarray(xy, dtype=np.float64) - np.array(size) / 2
@@ -99,12 +101,13 @@ def row_places(
 
 
 def correct_tracks(tracks: Tracks, read_out: float, down: tuple[int, int]) -> Tracks:
-    """Tracks as a shutter sees them that takes each picture at once, in the middle of its read-out.
+    """The tracks that a global shutter would see in the middle of the read-out.
 
     Args:
         tracks: tracks through all frames.
-        read_out: time from the first row to the last, in frames; negative: read from the bottom.
-        down: as `row_places` takes it.
+        read_out: time from the first row to the last, in frames; negative if rows are read from
+            the bottom.
+        down: as in `row_places`.
     """
     place = row_places(tracks.xy, (tracks.width, tracks.height), down)
     moved = at_middle_of_read_out(tracks.xy, velocities(tracks), place, read_out)

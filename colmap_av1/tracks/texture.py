@@ -1,4 +1,4 @@
-"""How well the windows of a picture can be found again, by their texture."""
+"""How accurately the windows of a picture can be matched, judged by their texture."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 def texture_at(
     image: NDArray[np.uint8], at: NDArray[np.int64], window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The texture, see `texture_of`, around some pixels (x, y) [n, 2] of a picture."""
-    width = 2 * (window + 1) + 1  # two windows, one around every pixel of the other, and a gradient
+    """The texture around some pixels (x, y) [n, 2] of a picture, see `texture_of`."""
+    width = 2 * (window + 1) + 1  # a window around every pixel of a window, and the gradients
     if len(at) * width**2 >= image.size:
         softness, contrast = texture_of(image, window)
         return softness[at[:, 1], at[:, 0]], contrast[at[:, 1], at[:, 0]]
-    # Patches below each other, as one picture.
+    # The patches are stacked vertically to one picture.
     framed = np.pad(image, width // 2, mode="reflect")
     patches = np.lib.stride_tricks.sliding_window_view(framed, (width, width))
     softness, contrast = texture_of(patches[at[:, 1], at[:, 0]].reshape(-1, width), window)
@@ -28,14 +28,15 @@ def texture_of(
     """The texture of the window around every pixel.
 
     Returns:
-        float32 [height, width] standard deviation in pixels of a match in the worst direction
-        where every pixel has a noise of one grey level, and mean deviation in grey levels.
+        (softness, contrast), both float32 [height, width]. Softness is the standard deviation in
+        pixels of a match in the worst direction if every pixel has noise of one grey level.
+        Contrast is the mean absolute deviation in grey levels.
     """
     grey = image.astype(np.float32)
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     size = (window, window)
-    # In place: new memory for arrays of large pictures takes longer than what is done in it.
+    # Computed in place: allocating arrays for large pictures takes longer than the computation.
     product = np.multiply(dx, dy)
     xy = cv2.boxFilter(product, cv2.CV_32F, size, normalize=False)
     xx = cv2.boxFilter(np.multiply(dx, dx, out=product), cv2.CV_32F, size, dx, normalize=False)

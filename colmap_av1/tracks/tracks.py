@@ -17,7 +17,7 @@ from colmap_av1.options import TrackOptions
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.video.display import Display, shown_points, shown_size
 
-# Width in pixels of the squares that motion is coded for.
+# Width in pixels of the units that have motion.
 _UNIT = 4
 _MIN_LENGTH = 4
 
@@ -37,9 +37,9 @@ class Tracks:
         xy: float32 [num_observations, 2] position in pixels, (x right, y down), origin at
             the top-left corner of the image: the first pixel's centre is (0.5, 0.5).
         sigma: float32 [num_observations] expected standard deviation of the position along
-            either axis, in pixels, against the track's first observation.
+            either axis, in pixels, relative to the track's first observation.
         confirmed: bool [num_observations] whether decoded pixels confirmed the position;
-            without refinement none is.
+            False without refinement.
     """
 
     num_frames: int
@@ -63,17 +63,17 @@ class Tracks:
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """Int64 [num_tracks] the number of observations of each track."""
+        """Number of observations of each track: int64 [num_tracks]."""
         return np.diff(self.offsets)
 
     @property
     def track(self) -> NDArray[np.int64]:
-        """Int64 [num_observations] the track of each observation."""
+        """Index of the track of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(self.num_tracks), self.lengths)
 
     @staticmethod
     def empty(num_frames: int, size: tuple[int, int]) -> Tracks:
-        """No tracks, of a video of `num_frames` frames of `size` (width, height)."""
+        """An empty set of tracks for a video of `num_frames` frames of `size` (width, height)."""
         return Tracks(
             num_frames=num_frames,
             width=size[0],
@@ -87,10 +87,10 @@ class Tracks:
 
     @staticmethod
     def concatenate(first: Tracks, *others: Tracks) -> Tracks:
-        """All tracks of several sets through the same frames, in the order of the sets.
+        """The tracks of several sets through the same frames, one set after the other.
 
-        The number of frames and the size are those of the first set, which is returned itself
-        where the others are empty.
+        The number of frames and the size are those of the first set. If the others are empty, the
+        first set is returned.
         """
         sets = [first, *(other for other in others if other.num_tracks)]
         if len(sets) == 1:
@@ -106,16 +106,16 @@ class Tracks:
 
     @staticmethod
     def in_sequence(videos: Sequence[Tracks], num_frames: int) -> Tracks:
-        """The tracks of several videos as of one video that shows them one after the other.
+        """The tracks of several videos as if they were one video, one after the other.
 
         Args:
             videos: the tracks of each video.
-            num_frames: frames of all videos, and of what has no tracks after them.
+            num_frames: number of frames of all videos, plus those without tracks that follow, such
+                as photos.
 
         Returns:
             All tracks in the order of the videos. Positions stay in pixels of their own video;
-            width and height are the largest. The tracks of the video itself where there is only
-            one and nothing after it.
+            width and height are the largest. The same object for one video without frames after it.
         """
         first = videos[0]
         if len(videos) == 1 and num_frames == first.num_frames:
@@ -138,13 +138,14 @@ class Tracks:
         return order_by_frame(self.frame, self.num_frames)
 
     def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:
-        """The tracks with some of their observations only.
+        """Keep some of the observations.
 
         Args:
             kept: bool [num_observations].
 
         Returns:
-            Tracks in the same order, without those that keep nothing; itself where all are kept.
+            Tracks in the same order, without those that keep no observation. The same object if
+            all observations are kept.
         """
         if kept.all():
             return self
@@ -155,13 +156,13 @@ class Tracks:
         return self._take(kept, offsets)
 
     def keep_frames(self, frames: NDArray[np.int32]) -> Tracks:
-        """The tracks with the observations in these frames only, as `keep_observations`."""
+        """Keep the observations in these frames, as `keep_observations`."""
         wanted = np.zeros(self.num_frames, dtype=np.bool_)
         wanted[frames] = True
         return self.keep_observations(wanted[self.frame])
 
     def subsample_frames(self, frames: NDArray[np.int32]) -> Tracks:
-        """The tracks as of a video that has these frames only, numbered anew from 0.
+        """The tracks of a video that consists of these frames only, numbered from 0.
 
         Args:
             frames: int32 [n] display indices, ascending.
@@ -172,7 +173,7 @@ class Tracks:
         return replace(seen, num_frames=len(frames), frame=number[seen.frame])
 
     def keep_tracks(self, kept: NDArray[np.bool_]) -> Tracks:
-        """Some of the tracks, in the same order.
+        """Keep some of the tracks, in the same order.
 
         Args:
             kept: bool [num_tracks].
@@ -180,22 +181,22 @@ class Tracks:
         return self.keep_observations(np.repeat(kept, self.lengths))
 
     def keep_long(self, min_length: int) -> Tracks:
-        """The tracks of at least `min_length` observations."""
+        """Keep the tracks with at least `min_length` observations."""
         return self.keep_tracks(self.lengths >= min_length)
 
     def keep_observed_in(self, frames: NDArray[np.int32], min_frames: int) -> Tracks:
-        """The whole tracks that are observed in at least `min_frames` of these frames."""
+        """Keep the whole tracks that are observed in at least `min_frames` of these frames."""
         counted = np.zeros(self.num_frames, dtype=np.bool_)
         counted[frames] = True
         so_far = np.concatenate([[0], np.cumsum(counted[self.frame])])
         return self.keep_tracks(np.diff(so_far[self.offsets]) >= min_frames)
 
     def every_nth(self, n: int) -> Tracks:
-        """One in `n` of the tracks, from the first."""
+        """Keep every n-th track, beginning with the first."""
         return self.keep_tracks(np.arange(self.num_tracks) % n == 0)
 
     def split_to_length(self, max_length: int) -> Tracks:
-        """All observations, each track split into equal parts of `max_length` at most."""
+        """Split each track into equal parts of at most `max_length` observations."""
         lengths = self.lengths
         part = -(-lengths // -(-lengths // max_length))
         place = np.arange(self.num_observations) - np.repeat(self.offsets[:-1], lengths)
@@ -204,10 +205,10 @@ class Tracks:
         return replace(self, offsets=offsets)
 
     def split_after_frames(self, frames: Sequence[int]) -> Tracks:
-        """All observations, the tracks split between each of these frames and the next.
+        """Split the tracks between each of these frames and the next.
 
         Args:
-            frames: display indices; where there are none, the tracks themselves are returned.
+            frames: display indices; if empty, the same object is returned.
         """
         if len(frames) == 0:
             return self
@@ -218,7 +219,7 @@ class Tracks:
         return replace(self, offsets=np.flatnonzero(starts).astype(np.int64))
 
     def split_at_removed(self, kept: NDArray[np.bool_], starts: NDArray[np.bool_]) -> Tracks:
-        """The tracks with some of their observations only, split where one between is removed.
+        """Keep some of the observations, and split tracks where one in between is removed.
 
         Args:
             kept: bool [num_observations].
@@ -233,7 +234,7 @@ class Tracks:
         """The tracks in pictures that are scaled to another (width, height) in pixels."""
         if size == (self.width, self.height):
             return self
-        # All in numbers of four bytes: the arrays are the largest of a whole run.
+        # Computed in float32 because the arrays are the largest of a run.
         factor = np.array([size[0] / self.width, size[1] / self.height], np.float32)
         return replace(
             self,
@@ -244,19 +245,20 @@ class Tracks:
         )
 
     def as_displayed(self, display: Display, presented: NDArray[np.int32] | None = None) -> Tracks:
-        """The tracks in the pictures that players show, from those in the stored pictures.
+        """Convert tracks in stored pictures to tracks in the pictures that players show.
 
         Args:
             display: how the pictures are cropped and rotated.
             presented: indices of the frames that players show, ascending; None: all.
 
         Returns:
-            The observations within what is shown; frames are numbered anew where some are not.
+            The observations inside the shown pictures. Frames are renumbered if some of them are
+            not shown.
         """
         size = shown_size((self.width, self.height), display)
         xy = shown_points(self.xy, (self.width, self.height), display)
         shown = replace(self, width=size[0], height=size[1], xy=xy)
-        # By columns: NumPy's loops over rows of two take several times as long.
+        # Columns are compared because NumPy takes several times as long for rows of two numbers.
         x, y = xy[:, 0], xy[:, 1]
         kept = (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
         if presented is not None:
@@ -269,7 +271,8 @@ class Tracks:
 
     def _take(self, kept: NDArray[np.bool_], offsets: NDArray[np.int64]) -> Tracks:
         """Some of the observations, in tracks with these offsets."""
-        # A position is taken as one number of eight bytes: rows of two take several times as long.
+        # A position is indexed as one number of eight bytes: rows of two numbers take several times
+        # as long.
         xy = np.ascontiguousarray(self.xy).view(np.uint64)[:, 0][kept]
         return replace(
             self,
@@ -290,30 +293,31 @@ def build_tracks(
 ) -> Tracks:
     """Chain the motion of a video into point tracks.
 
-    The motion of a block holds for each of its 4x4 units. A unit carries on the track
-    found where its displacement lands in the referenced frame, to the sub-pixel place
-    that moves exactly onto it, and a track moves with its unit into a reference shown
-    later. Where two tracks want one cell, a unit unless `options.cell` cuts it into parts, the
-    longer is continued. Frames are chained in display order
-    and links to the nearest frame come first, so a frame that was coded far ahead is reached by
-    the short steps between; frames that are never shown are chained through last. A unit without
-    coded motion moves as those on either side of it do, where these agree. A unit without a
-    track starts one at its centre. No cell holds two tracks, no frame sees a track twice. Frames
-    are consumed one by one; beyond a few frames of motion, memory grows with the observations
-    only.
+    The motion of a block applies to each of its 4x4 units. A unit continues the track that it finds
+    where its displacement leads in the referenced frame. The new observation is the sub-pixel
+    position that the displacement moves exactly onto the track. A track also moves with its unit
+    into a reference that is shown later. If several tracks lead to one cell, the longest is
+    continued; a cell is a unit, or a part of a unit with `options.cell`. A unit without a track
+    starts one at its centre. No cell holds two tracks, and no track is observed twice in a frame.
+
+    Frames are chained in display order, and links to the nearest frame come first, so that a frame
+    that was coded far ahead is reached in short steps. Frames that are never shown are chained
+    through last. A unit without coded motion moves like the units on both sides of it if these
+    agree. Frames are consumed one by one. In addition to a few frames of motion, memory grows only
+    with the observations.
 
     Args:
         motion: the coded frames of one video, in bitstream order.
         options: how to chain; the defaults of TrackOptions if None.
         progress: called after each coded frame with the number of frames so far.
-        frames: int32 [n] display indices of the frames whose observations are kept, which bounds
-            memory; None: those of all.
+        frames: int32 [n] display indices of the frames whose observations are kept, which limits
+            memory; None: all frames.
 
     Returns:
-        Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their seeds
-        (display order of the frame, then raster order). Where frames differ in size,
-        positions are in pixels of the first shown frame's size. With `frames` they are the same
-        tracks, without those that fewer than two of these see.
+        Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their
+        seeds (display order of the frame, then raster order). If frames differ in size, positions
+        are in pixels of the first shown frame. With `frames`, the same tracks without those that
+        are observed in fewer than two of these frames.
 
     Raises:
         VideoError: no frame is shown.
@@ -334,7 +338,7 @@ def build_tracks(
         if progress is not None:
             progress(count)
     num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
-    give_back_free_memory()  # what was needed to build the tracks, as much as they are
+    give_back_free_memory()  # building needs as much memory again as the tracks
     if num_frames == 0:
         raise VideoError("the video shows no frame: give a video with at least one picture")
     confirmed = np.zeros(len(frame_index), dtype=np.bool_)
@@ -343,12 +347,12 @@ def build_tracks(
 
 def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
     """Indices of observations sorted by frame; within a frame they keep their order."""
-    # A type of two bytes is sorted by radix, in a quarter of the time.
+    # NumPy sorts two-byte integers by radix sort, in a quarter of the time.
     return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")
 
 
 def least_length(options: TrackOptions) -> int:
-    """Shown frames that a track is seen in at least."""
+    """Smallest number of shown frames in which a track is observed."""
     return _MIN_LENGTH if options.min_length is None else options.min_length
 
 
@@ -358,8 +362,8 @@ def _joined_offsets(sets: Sequence[Tracks]) -> NDArray[np.int64]:
 
 
 def _core_options(options: TrackOptions) -> _core.TrackBuilderOptions:
-    """The options as the C++ core takes them: cells instead of their widths."""
-    # Squares that tracks start in are not smaller than those that hold one.
+    """The options of the C++ core, which counts in cells instead of pixels."""
+    # The squares in which tracks start are not smaller than the cells that hold one track.
     cell = options.cell or min(_UNIT, options.seeding)
     core = _core.TrackBuilderOptions()
     core.min_length = least_length(options)

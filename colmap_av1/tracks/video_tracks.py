@@ -1,4 +1,4 @@
-"""From a video to its tracks: the AV1 stream found or made, its motion chained and refined."""
+"""From a video to its tracks: open or make its AV1 stream, chain its motion, refine the tracks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from colmap_av1.video.unchanged import FileState
 
 _Image = NDArray[np.uint8]
 
-# Of the tracks; fewer over the picture are left out without a word.
+# Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
 
 
@@ -52,12 +52,13 @@ class VideoSource:
     """Where the motion and the pictures of a video come from.
 
     Attributes:
-        stream: the AV1 video whose motion is read. One that was made of another holds the frames
-            that the other's edit list hides, too, and may be smaller than it.
-        pictures: the video whose pictures become images: the same, or what it was made of.
-        is_kept: the stream stays when the work is done.
-        conversion: what the stream was made of and how, in words; None where it is the video.
-        kept: keeps the pictures that were decoded; None: they are decoded each time.
+        stream: the AV1 video whose motion is read. A converted stream also has the frames that an
+            edit list of the original video hides, and may be smaller.
+        pictures: the video whose pictures become images: the same video, or the original video of
+            a converted stream.
+        is_kept: whether the stream is kept after the run.
+        conversion: description of the conversion; None if there was none.
+        kept: store of decoded pictures; None: pictures are decoded each time.
     """
 
     stream: Video
@@ -73,22 +74,22 @@ class VideoSource:
 
     @property
     def files(self) -> tuple[FileState, ...]:
-        """Its files as they were at the start, each once."""
+        """The states of its files at the start, each file once."""
         return tuple(dict.fromkeys([self.stream.state, self.pictures.state]))
 
 
 @dataclass(frozen=True)
 class TrackedVideo:
-    """The tracks of a video, and the findings made on the way.
+    """The tracks of a video, and facts found while building them.
 
     Attributes:
         tracks: tracks through all shown frames.
-        num_coded_frames: frames with block data, hidden ones included.
-        inter_share: float32 [num_frames] share of inter units in each frame that players show; of
-            frames hidden before it the least.
-        warnings: what the user should know, such as damage of the stream.
-        read_out: milliseconds in which the shutter reads the rows of a picture, where the tracks
-            are corrected for it; None: they are not.
+        num_coded_frames: number of frames with block data, including hidden ones.
+        inter_share: float32 [num_frames] share of inter units in each frame that players show; the
+            smallest share among the frame and the hidden frames before it.
+        warnings: messages for the user, for example about damage of the stream.
+        read_out: time in milliseconds in which the shutter reads the rows of a picture, if the
+            tracks are corrected for it; None if they are not.
     """
 
     tracks: Tracks
@@ -102,22 +103,22 @@ class TrackedVideo:
 def open_source(
     video: Video, options: SourceOptions, *, beside: Path, context: RunContext
 ) -> Iterator[VideoSource]:
-    """Find the AV1 stream of a video, or make it by converting; motion is read from it.
+    """Open the AV1 stream of a video, from which motion is read; convert the video if necessary.
 
-    A stream that is made lasts as long as the body, unless the options say where it is kept.
+    A converted stream exists while the body runs, unless the options name a file to keep it.
 
     Args:
         video: a video of any codec.
-        options: whether and how a stream is made.
-        beside: the file or folder that is being made, which gets the stream beside it meanwhile.
-        context: gets the stage "encoding" where a stream is made.
+        options: whether and how the video is converted.
+        beside: the output file or folder, in whose parent folder a temporary stream is written.
+        context: measures the stage "encoding" if the video is converted.
 
     Raises:
         VideoError: the video cannot be converted.
         EncodeError: no AV1 encoder works, or the stream cannot be written.
-        OptionError: `keep_stream` names a file that is none of this video's.
+        OptionError: `keep_stream` names a file that is not a stream of this video.
     """
-    # Of a run that was killed while it converted another video.
+    # A killed run may have left its stream here, even if this video needs no conversion.
     remove_leftovers(beside.resolve().parent, beside.resolve().name)
     if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
         yield VideoSource(video, video)
@@ -141,7 +142,7 @@ def open_source(
                 video,
                 folder / "stream.mp4",
                 strict=strict,
-                telemetry=False,  # the video itself is asked
+                telemetry=False,  # positions are read from the original video
                 options=how,
                 progress=context.progress,
             )
@@ -151,7 +152,11 @@ def open_source(
 def _made_source(
     video: Video, made: EncodeReport, options: EncodeOptions, *, is_kept: bool
 ) -> VideoSource:
-    """A video and its stream; refused where the stream's pictures have not the size asked for."""
+    """The source of a converted video.
+
+    Raises:
+        VideoError: the pictures of the stream do not have the expected size.
+    """
     stream = read_video(made.output)
     size, wanted = (
         "{}x{}".format(*pixels)
@@ -159,8 +164,8 @@ def _made_source(
     )
     if size != wanted:
         raise VideoError(
-            f"{stream}: its pictures are {size}, not {wanted} as asked for of {video}: convert it "
-            "by another --encoder"
+            f"{stream}: its pictures are {size} instead of {wanted}: convert {video} with another "
+            "--encoder"
         )
     shown = "{}x{}".format(*video.picture_size)
     conversion = f"{video.codec} at {shown} to AV1 at {size} by {made.encoder}"
@@ -170,12 +175,12 @@ def _made_source(
 
 
 def with_stream_kept(options: MatchOptions, folder: Path, name: str = "") -> MatchOptions:
-    """The same options; a stream that is made is kept in a folder unless they say where.
+    """The same options with `keep_stream` set to a file in a folder, unless it is set already.
 
     Args:
-        options: any.
+        options: any options.
         folder: the folder.
-        name: of the video, where there are several.
+        name: name of the video, if there are several.
     """
     if options.keep_stream is not None:
         return options
@@ -185,7 +190,7 @@ def with_stream_kept(options: MatchOptions, folder: Path, name: str = "") -> Mat
 
 @contextmanager
 def _scratch(beside: Path) -> Iterator[Path]:
-    """A folder for a stream that is not kept."""
+    """A temporary folder for a stream that is not kept."""
     with ExitStack() as made:
         try:
             folder = made.enter_context(scratch_folder(beside))
@@ -208,15 +213,16 @@ def track_video(
     Args:
         source: the video.
         options: how motion is read and chained, and tracks are refined.
-        one_size: refuse shown frames of several sizes, as refinement does.
-        frames: int32 [n] the frames, as players show them, whose observations are kept; None: all.
-        context: gets the stages "motion" and "tracks", with refinement "decoding" and
+        one_size: raise an error if shown frames differ in size, as refinement does.
+        frames: int32 [n] frames, as numbered by players, whose observations are kept; None: all.
+        context: measures the stages "motion" and "tracks", and with refinement "decoding" and
             "refinement".
 
     Raises:
         VideoError: the video shows no frame.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: the frames change their size and must not.
+        BitstreamError: the stream is damaged before its second frame, or anywhere if
+            `options.read.strict` is set.
+        ImageError: shown frames differ in size but must not.
     """
     clock, progress = context.clock, context.progress
     motion: Iterable[FrameMotion] = read_motion(source.stream, options.read)
@@ -236,12 +242,12 @@ def track_video(
             tracks = build_tracks(motion, options.tracks, count, frames=stored)
             num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
             tracks = remove_overlays(tracks)
-            share_over_picture = 1 - len(tracks.offsets) / num_tracks
+            overlay_share = 1 - len(tracks.offsets) / num_tracks
             tracks = tracks.as_displayed(source.stream.display, presented)
             num_pixels = num_frames * tracks.width * tracks.height
             if source.stream is not source.pictures:
                 tracks = tracks.scale_to(source.pictures.picture_size)
-        # Reading happened inside the chaining.
+        # Motion was read while it was chained, so that time is subtracted.
         clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
             with clock.measure("refinement"):
@@ -257,27 +263,27 @@ def track_video(
                 )
             clock.seconds["refinement"] -= clock.seconds["decoding"]
     notes = [str(w.message) for w in caught]
-    # Of the whole file, so a rate that is found low is even lower.
+    # The size of the whole file is an upper bound of the rate, so a low rate is truly low.
     bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels
-    notes += _notes(source, share_over_picture, structure.reasons(bits_per_pixel))
+    notes += _notes(source, overlay_share, structure.reasons(bits_per_pixel))
     inter_share = _inter_share(structure, num_frames, presented)
     return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
 
 
-def _notes(source: VideoSource, share_over_picture: float, reasons: Sequence[str]) -> list[str]:
-    """What the user should know of a video whose tracks are found."""
+def _notes(source: VideoSource, overlay_share: float, reasons: Sequence[str]) -> list[str]:
+    """Messages for the user about a video and its tracks."""
     notes = []
-    if share_over_picture >= _NOTABLE_SHARE:
+    if overlay_share >= _NOTABLE_SHARE:
         notes.append(
-            f"{share_over_picture:.0%} of the tracks stand still while the picture moves, as "
-            "logos and dashboards do: they are left out"
+            f"removed {overlay_share:.0%} of the tracks as overlays, which stand still while the "
+            "picture moves, such as logos and dashboards"
         )
     if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or use --reencode 1 to convert the video first")
     dynamic_range = source.pictures.dynamic_range
     if dynamic_range is not None:
         notes.append(
-            f"the video is of high dynamic range ({dynamic_range}): images keep its values, which "
+            f"the video has high dynamic range ({dynamic_range}): images keep its values, which "
             "look pale; give a video of standard range for the colours that players show"
         )
     return notes
@@ -293,21 +299,21 @@ def _inter_share(
     presented = presented[presented < num_frames]
     if len(presented) == 0:
         return share[:0]
-    # From the frame after the last one shown up to each.
+    # Each range begins after the previous shown frame and ends with the shown frame.
     starts = np.concatenate([presented[:1], presented[:-1] + 1])
     ends = presented + 1
     return np.array([share[a:b].min() for a, b in zip(starts, ends, strict=True)], np.float32)
 
 
 def count_frames(source: VideoSource) -> int:
-    """Frames that players show of a video, as its containers say."""
+    """Number of frames of a video that players show, according to its container."""
     if source.pictures.presented is not None:
         return len(source.pictures.presented)
     return with_counted_packets(source.stream).num_packets or 0
 
 
 def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
-    """Times of the frames that players show; None where they are unknown."""
+    """Times in seconds of the frames that players show: float64 [num_frames]; None if unknown."""
     times = frame_times(source.stream)
     presented = source.pictures.presented
     if times is not None and presented is not None:
@@ -324,10 +330,10 @@ def refine_in_images(
     display: Display | None = None,
     context: RunContext,
 ) -> TrackedVideo:
-    """Correct the tracks that poses come from where motion was searched in smaller pictures.
+    """Correct the tracks that poses are estimated from if motion was coded in smaller pictures.
 
-    Poses then are as exact as those of motion at full size. The tracks of a video whose motion is
-    of full size stay as they are.
+    Poses are then as accurate as with motion at full size. If the stream has full size, the tracks
+    are not changed.
 
     Args:
         tracked: tracks of the video.
@@ -335,10 +341,10 @@ def refine_in_images(
         frames: int32 [n] frames that become images, ascending.
         options: how the video is decoded.
         display: how images show the pictures; None: as players do.
-        context: gets the stage "refinement".
+        context: measures the stage "refinement".
 
     Raises:
-        BitstreamError: the video is damaged, and strict.
+        BitstreamError: the video is damaged and `options.strict` is set.
     """
     if not source.is_downscaled:
         return tracked
@@ -374,9 +380,19 @@ def decodable_frames(
     use: str = "tracks are refined",
     kept: KeptPictures | None = None,
 ) -> Iterator[tuple[int, _Image]]:
-    """The pictures of the frames that have tracks; those before a damage, with a warning.
+    """Decode the pictures of the frames that have tracks, up to a damage, with a warning.
 
-    `use` says in it what they are for. What `kept` holds is not decoded.
+    Args:
+        video: the video.
+        num_frames: number of frames that have tracks.
+        options: how the video is decoded.
+        display: how pictures are cropped and rotated; None: as players do.
+        wanted: indices of the frames to yield; None: all.
+        use: what the pictures are used for; the warning contains it.
+        kept: store of decoded pictures; what it holds is not decoded again.
+
+    Raises:
+        BitstreamError: the video is damaged and `options.strict` is set.
     """
     decoded = decode_frames(
         video,
@@ -392,7 +408,7 @@ def decodable_frames(
             if index < num_frames:
                 yield index, image
                 count += 1
-            if index + 1 >= num_frames:  # what is damaged beyond does no harm
+            if index + 1 >= num_frames:  # damage of later frames does not matter
                 return
     except BitstreamError as error:
         if options.strict:
@@ -403,14 +419,14 @@ def decodable_frames(
 
 
 def _counted(motion: Iterable[FrameMotion], structure: Structure) -> Iterator[FrameMotion]:
-    """The same frames; counts them."""
+    """Yield the same frames and count them."""
     for frame in motion:
         structure.add(frame)
         yield frame
 
 
 def _of_one_size(motion: Iterable[FrameMotion]) -> Iterator[FrameMotion]:
-    """The same frames; refuses shown frames of several sizes, which share no camera."""
+    """Yield the same frames; shown frames must have one size to share a camera."""
     size: tuple[int, int] | None = None
     for frame in motion:
         if frame.display_index >= 0:

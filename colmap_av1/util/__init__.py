@@ -1,1 +1,1 @@
-"""Files, processes, progress and signals: nothing of the subject."""
+"""Helpers for files, processes, progress and signals, independent of video and geometry."""

@@ -15,20 +15,21 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# Fields of options that change how long a result takes, not the result: not the threads of the
-# mappers, which change its last digits.
+# Option fields that change only the run time, not the result. The threads of a mapper are not among
+# them, because they change the last digits of the result.
 WITHOUT_EFFECT = frozenset({"ReadOptions.num_threads", "RunOptions.num_threads"})
 _CODE = {".py", ".so", ".pyd"}
-# A file that is written again so soon may keep its times: those of FAT come in steps of 2 s.
+# A file that is written again within this time may keep its time stamps: FAT stores them in steps
+# of 2 s.
 _UNSURE_NS = 2_000_000_000
 _BLOCK = 1 << 20
 
 
 def file_digest(path: Path) -> str:
-    """Digest of a file's content; a file is read once by a process as long as it stays.
+    """Digest of a file's content. A process reads an unchanged file only once.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     status = path.stat()
     times = _sure_times(status)
@@ -38,10 +39,10 @@ def file_digest(path: Path) -> str:
 
 
 def digest_if_there(path: str | os.PathLike[str] | None) -> str | None:
-    """The same of a file that may be missing; None where it is, or none is given.
+    """Digest of a file that may be missing; None if it is missing or the path is None.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     return file_digest(Path(path)) if path is not None and Path(path).is_file() else None
 
@@ -60,10 +61,10 @@ def _read_digest(path: Path) -> str:
 
 
 def file_record(path: Path) -> dict[str, Any]:
-    """The record by which `is_as_recorded` detects changes of a file, as JSON holds it.
+    """A record for JSON, with which `is_as_recorded` detects changes of a file.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     status = path.stat()
     return {
@@ -74,12 +75,12 @@ def file_record(path: Path) -> dict[str, Any]:
 
 
 def is_as_recorded(path: Path, record: dict[str, Any]) -> bool:
-    """Whether a file is there and holds what it held when it was recorded.
+    """Whether a file exists with the content that was recorded.
 
-    It is read only where its times differ, as those of copies do, or were too recent to be
-    distinguished from later ones: all images of a long video take a while to read, most of all from
-    a network disk. One of the times is that of the last change of the file's attributes, which
-    programs cannot set, so that other content under an old date is noticed, too.
+    Its content is read only if its time stamps differ, as those of a copy do, or were too recent
+    when it was recorded, because reading all images of a long video takes long, above all from a
+    network disk. One of the time stamps is that of the last status change, which programs cannot
+    set, so that new content with an old modification time is detected, too.
     """
     try:
         status = path.stat()
@@ -96,7 +97,7 @@ def _times(status: os.stat_result) -> list[int]:
 
 
 def _sure_times(status: os.stat_result) -> list[int] | None:
-    """The times of a file's changes; None where another change could leave them as they are."""
+    """The time stamps of a file; None if they are so recent that a change may not alter them."""
     times = _times(status)
     return times if time.time_ns() - max(times) > _UNSURE_NS else None
 
@@ -106,7 +107,7 @@ def code_digest(*folders: str) -> str:
     """Digest of the code in some folders of this package, compiled code included.
 
     Args:
-        folders: paths within the package, below which all counts; ".": the whole package.
+        folders: paths in the package, whose content counts recursively; ".": the whole package.
 
     Raises:
         ValueError: the package has no such folder.
@@ -122,7 +123,7 @@ def code_digest(*folders: str) -> str:
 
 
 def package_version() -> str:
-    """Version of this package as it is installed."""
+    """Version of the installed package."""
     try:
         return version("colmap-av1")
     except PackageNotFoundError:
@@ -130,22 +131,22 @@ def package_version() -> str:
 
 
 def digest_of(values: Iterable[Any], *, timed: bool = False) -> str:
-    """Digest of values that a result depends on: options, paths, numbers, words and such in rows.
+    """Digest of the values that a result depends on, such as options, paths and numbers.
 
     Args:
-        values: dataclasses, dictionaries, sequences and plain values; of dataclasses those fields
-            do not count that have no effect on a result.
-        timed: the time that the result takes is of interest, too: all fields count.
+        values: dataclasses, dictionaries, sequences and plain values. Option fields that have no
+            effect on the result are ignored.
+        timed: the result includes the run time, so all fields count.
 
     Raises:
-        TypeError: something is of another type, whose values cannot be distinguished.
+        TypeError: a value has another type, whose values cannot be distinguished.
     """
     text = _spell(list(values), frozenset() if timed else WITHOUT_EFFECT)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _spell(value: Any, left_out: frozenset[str]) -> str:
-    """The value as text, different for different values."""
+    """The value as text that differs for different values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         names = (field.name for field in dataclasses.fields(value))
@@ -164,5 +165,5 @@ def _spell(value: Any, left_out: frozenset[str]) -> str:
 
 
 def seed_of(*words: int) -> int:
-    """A seed of random numbers for one of many searches, that others have no part in."""
+    """A random seed for one of many searches, independent of the other searches."""
     return zlib.crc32(repr(words).encode())

@@ -1,4 +1,4 @@
-"""What kind of failure an exception is, for tables of many videos."""
+"""Classify exceptions as kinds of failure, for tables of many videos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from colmap_av1.errors import (
     VideoError,
 )
 
-# Failures of the system that will be there at the next attempt, too.
+# System errors that the next attempt will meet again.
 _PERMANENT = (
     FileExistsError,
     FileNotFoundError,
@@ -25,7 +25,7 @@ _PERMANENT = (
     NotADirectoryError,
     PermissionError,
 )
-# Failures that the video or the options cause; the first that fits.
+# Failures that the video or the options cause. The first matching class is used.
 _REASONS: tuple[tuple[type[Exception], str], ...] = (
     (NotAv1Error, "not AV1"),
     (BitstreamError, "damaged"),
@@ -44,7 +44,7 @@ class Failure:
     Attributes:
         reason: the kind of failure.
         message: one line.
-        transient: another attempt may succeed.
+        transient: whether another attempt may succeed.
     """
 
     reason: str
@@ -53,7 +53,7 @@ class Failure:
 
 
 def failure_of(error: BaseException) -> Failure:
-    """The failure that an exception stands for."""
+    """The failure that an exception represents."""
     chain = list(_chain(error))
     if any(isinstance(e, MemoryError) for e in chain):
         return Failure("memory", _line_of(error), transient=True)

@@ -1,7 +1,7 @@
-"""Outputs: refused where something exists, written beside their place, one run in each.
+"""Write output files and folders safely: no overwriting by accident, no partial output.
 
-What is being written lies in a hidden file or folder beside its place, which the process holds a
-lock on. One that nobody holds was left by a killed process.
+An output is written to a hidden file or folder next to its final place, which the process locks.
+A hidden file or folder that no process has locked was left by a killed process.
 """
 
 from __future__ import annotations
@@ -23,32 +23,33 @@ from colmap_av1.errors import OptionError
 
 try:
     import fcntl
-except ImportError:  # there is none on Windows
+except ImportError:  # Windows has no fcntl
     fcntl = None  # type: ignore[assignment]
 
 _Path = str | os.PathLike[str]
 
-# Some file systems of clusters have locks that only one machine knows: each cleans up after itself.
+# Locks of some cluster file systems are visible on one machine only, so each machine removes only
+# its own leftovers.
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
 
 
 def check_new_file(
     path: Path, inputs: Iterable[_Path | None] = (), *, overwrite: bool = False
 ) -> None:
-    """Refuse a file that a command must not write, before its work.
+    """Check, before a command begins its work, that it may write a file.
 
     Args:
         path: the file.
-        inputs: files that are read, which are never written over; None: not given.
-        overwrite: replace another file that exists.
+        inputs: input files, which are never overwritten; None: not given.
+        overwrite: allow replacing an existing file that is not an input.
 
     Raises:
-        OptionError: it is an input, or it exists and must not be replaced.
+        OptionError: the file is an input, or it exists and must not be replaced.
     """
     if not os.path.lexists(path):
         return
     if path.is_dir() or (path.exists() and not path.is_file()):
-        raise OptionError(f"{path}: exists and is no file: give another output")
+        raise OptionError(f"{path}: exists and is not a file: give another output")
     if any(_is_same(path, given) for given in inputs if given is not None):
         raise OptionError(f"{path}: is the input itself: give another output")
     if not overwrite:
@@ -62,54 +63,60 @@ def check_new_folder(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Refuse a folder that `whole_folder` could not make; remove what a killed run left of it.
+    """Check that `whole_folder` can write a folder, and remove what a killed run left of it.
 
     Args:
         path: the folder.
-        own: paths of files in folders that may be replaced.
-        inputs: files and folders that are read, see `check_apart`.
-        overwrite: replace a folder that holds nothing else.
+        own: pattern of paths in the folder that may be replaced.
+        inputs: input files and folders, see `check_apart`.
+        overwrite: allow replacing a folder that contains only such paths.
 
     Raises:
-        OptionError: it is there and not empty, or nothing can be made where it is to be.
+        OptionError: the folder exists and must not be replaced, contains an input, or cannot be
+            created.
     """
     if path.exists() and not path.is_dir():
         raise OptionError(f"{path}: is a file: give a new folder")
     remove_leftovers(path.resolve().parent, path.resolve().name)
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            raise OptionError(f"{path}: is there and not empty: give a new folder, or --overwrite")
+            raise OptionError(f"{path}: is not empty: give a new folder, or --overwrite")
         held = (p.relative_to(path).as_posix() for p in path.rglob("*") if not _is_folder(p))
         other = next((name for name in held if not own.fullmatch(name)), None)
         if other is not None:
-            raise OptionError(f"{path}: holds {other}, which stays: give a new folder")
+            raise OptionError(
+                f"{path}: contains {other}, which is never replaced: give a new folder"
+            )
     check_apart(path, inputs)
     path = path.resolve()
     above = next(folder for folder in path.parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{path}: cannot be made in {above}: give another folder")
+        raise OptionError(f"{path}: cannot be created in {above}: give another folder")
 
 
 def check_apart(output: Path, inputs: Iterable[_Path | None]) -> None:
-    """Refuse an output folder that is an input or holds one.
+    """Check that an output folder neither is nor contains an input.
 
     Raises:
-        OptionError: so it is.
+        OptionError: it is or contains an input.
     """
     for given in inputs:
         if given is not None and Path(given).resolve().is_relative_to(output.resolve()):
-            raise OptionError(f"{output}: is or holds the input {given}: give another folder")
+            raise OptionError(f"{output}: is or contains the input {given}: give another folder")
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A hidden name in the file's folder to write it under; it gets its own name at the end.
+    """Write a file under a hidden name in its folder; it is renamed at the end of the body.
 
-    Whatever ends the body early, an interrupt too, leaves the file as it was, and nothing
-    beside it.
+    If the body ends early, even by an interrupt, an existing file is unchanged and the hidden file
+    is removed.
+
+    Yields:
+        The hidden path to write to.
 
     Raises:
-        OSError: the file cannot be given its name.
+        OSError: the file cannot be created or renamed.
     """
     with _held(path, lambda partial: partial.touch(exist_ok=False), os.O_RDWR) as partial:
         try:
@@ -121,16 +128,19 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """The same for a folder, made with those above it, that does not exist yet or is empty.
+    """Like `whole_file` for a folder that is missing or empty; its parents are created.
 
     Args:
         path: the folder.
-        overwrite: replace the content of one that is not empty, see `check_new_folder`. A process
-            that is killed meanwhile loses neither the old nor the new content: `remove_leftovers`
-            puts one of them in place.
+        overwrite: replace the content of a folder that is not empty, see `check_new_folder`. If
+            the process is killed while it does so, `remove_leftovers` restores the old or the new
+            content.
+
+    Yields:
+        The hidden folder to write to.
 
     Raises:
-        OSError: the folder cannot be made or given its name.
+        OSError: the folder cannot be created or renamed.
     """
     path = path.resolve()
     with _hidden_folder(path) as partial:
@@ -139,18 +149,21 @@ def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             partial.replace(path)
         elif any(path.iterdir()) and not overwrite:
             raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY), str(path))
-        else:  # the folder stays: it may be where the user is
+        else:  # the folder itself stays, because it may be the user's current folder
             _exchange(path, partial)
 
 
 @contextmanager
 def scratch_folder(beside: Path) -> Iterator[Path]:
-    """A hidden folder beside a file or folder, which need not exist, as long as the body runs.
+    """A hidden folder next to a file or folder; it exists while the body runs.
 
-    What a killed run left of its own there is removed first.
+    The leftovers of killed runs are removed first.
+
+    Args:
+        beside: the file or folder, which need not exist.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be created.
     """
     beside = beside.resolve()
     remove_leftovers(beside.parent, beside.name)
@@ -159,13 +172,13 @@ def scratch_folder(beside: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path, name: str | None = None) -> None:
-    """Remove what killed processes of this machine left of what they wrote by the functions above.
+    """Remove the hidden files and folders that killed processes of this machine left behind.
 
-    A folder whose replacement was stopped gets its old or its new content, whichever is complete.
+    A folder that was being replaced gets its old or its new content, whichever is complete.
 
     Args:
-        folder: where that is.
-        name: of the file or folder; None: any.
+        folder: the folder with the leftovers.
+        name: name of the output file or folder; None: any.
     """
     pattern = f".{'*' if name is None else glob.escape(name)}.{_OURS}{'[0-9a-f]' * 8}"
     for old in glob.glob(f"{pattern}.old", root_dir=folder):
@@ -174,15 +187,17 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
         _undo_exchange(folder / before)
     for leftover in glob.glob(f"{pattern}.partial", root_dir=folder):
         path = folder / leftover
-        with _left(path) as is_left, contextlib.suppress(OSError):  # what stays does no harm
+        # Leftovers that cannot be removed are harmless.
+        with _left(path) as is_left, contextlib.suppress(OSError):
             if is_left:
                 shutil.rmtree(path) if _is_folder(path) else path.unlink()
 
 
 def _exchange(path: Path, partial: Path) -> None:
-    """Replace a folder's content. Its old content lies in `.before` until it is all there.
+    """Replace the content of a folder.
 
-    From then on it lies in `.old`, and the new content goes into the folder.
+    The old content is moved to the folder `.before`. When it is complete there, the folder is
+    renamed to `.old`, and the new content is moved into place.
     """
     before, old = partial.with_suffix(".before"), partial.with_suffix(".old")
     before.mkdir()
@@ -202,7 +217,7 @@ def _exchange(path: Path, partial: Path) -> None:
 
 
 def _undo_exchange(before: Path) -> None:
-    """Put the old content of a folder back."""
+    """Move the old content of a folder back."""
     with _left(before.with_suffix(".partial")) as is_left, contextlib.suppress(OSError):
         if is_left:
             _move_entries(before, _place_of(before))
@@ -210,7 +225,7 @@ def _undo_exchange(before: Path) -> None:
 
 
 def _finish_exchange(old: Path) -> None:
-    """Put the rest of the new content of a folder in place, and remove the old one."""
+    """Move the rest of the new content of a folder into place, and remove the old content."""
     partial = old.with_suffix(".partial")
     with _left(partial) as is_left, contextlib.suppress(OSError):
         if is_left and partial.exists():
@@ -221,13 +236,13 @@ def _finish_exchange(old: Path) -> None:
 
 
 def _place_of(hidden: Path) -> Path:
-    """The place that a hidden file or folder lies beside."""
+    """The final place of a hidden file or folder."""
     return hidden.with_name(hidden.name[1:].rpartition(f".{_OURS}")[0])
 
 
 def _move_entries(source: Path, target: Path) -> None:
     for entry in source.iterdir():
-        if os.path.lexists(target / entry.name):  # of a user, meanwhile
+        if os.path.lexists(target / entry.name):  # the user created it in the meantime
             raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(target / entry.name))
         entry.replace(target / entry.name)
 
@@ -247,13 +262,13 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _held(path: Path, make: Callable[[Path], None], how: int) -> Iterator[Path]:
-    """Make a hidden file or folder beside a path, and hold a lock on it, where there are locks.
+    """Create a hidden file or folder next to a path and lock it, if the system has locks.
 
-    Until it is locked another process may take it for a leftover. Then it is made again.
+    Before it is locked, another process may remove it as a leftover. It is then created again.
 
     Args:
         path: the path.
-        make: makes the file or folder.
+        make: creates the file or folder.
         how: flags to open it with.
     """
     while True:
@@ -275,7 +290,7 @@ def _held(path: Path, make: Callable[[Path], None], how: int) -> Iterator[Path]:
 
 
 def _lock(descriptor: int) -> bool:
-    """Lock an open file or folder; False where another process holds it."""
+    """Lock an open file or folder; False if another process has locked it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -287,14 +302,14 @@ def _lock(descriptor: int) -> bool:
 
 @contextmanager
 def _left(path: Path) -> Iterator[bool]:
-    """Whether nobody holds a hidden file or folder any more; the body then holds it.
+    """Whether a hidden file or folder is a leftover, which the body then keeps locked.
 
-    False where that cannot be known.
+    False if this cannot be determined.
     """
     if fcntl is None:
         yield False
         return
-    how = os.O_RDONLY if _is_folder(path) else os.O_RDWR  # as some file systems want it
+    how = os.O_RDONLY if _is_folder(path) else os.O_RDWR  # some file systems need it to lock
     try:
         descriptor = os.open(path, how | os.O_NOFOLLOW)
     except OSError:
@@ -313,20 +328,20 @@ def _left(path: Path) -> Iterator[bool]:
 
 @contextmanager
 def only_run(lock: Path) -> Iterator[bool]:
-    """Hold a file as long as the body runs; False where another process holds it.
+    """Lock a file while the body runs; yields False if another process has locked it.
 
-    It is given back however this process ends.
+    The system releases the lock even if this process is killed.
 
     Raises:
-        OSError: the file cannot be made.
+        OSError: the file cannot be created.
     """
     with lock.open("ab") as file:
         yield fcntl is None or _lock(file.fileno())
 
 
 def may_read(path: Path) -> bool:
-    """Whether the system lets this process read a file; True where it is not there, too."""
-    if path.exists() and not path.is_file():  # opening a pipe waits for another process
+    """Whether this process has permission to read a file; also True if the file is missing."""
+    if path.exists() and not path.is_file():  # opening a pipe would wait for another process
         return True
     try:
         path.open("rb").close()
@@ -344,5 +359,5 @@ def _is_folder(path: Path) -> bool:
 def _is_same(one: Path, two: _Path) -> bool:
     try:
         return one.samefile(two)
-    except OSError:  # one is not there
+    except OSError:  # one of them does not exist
         return False

@@ -1,4 +1,4 @@
-"""New HDF5 files, which survive a full disk."""
+"""Write HDF5 files; a full disk raises an error instead of a crash."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import h5py
 
 
 class _Storage(io.FileIO):
-    """A file that hides its first failure from the HDF5 library, which would crash."""
+    """A file that keeps its first write error and hides it from HDF5, which would crash."""
 
     failure: OSError | None = None
 
@@ -36,16 +36,17 @@ class _Storage(io.FileIO):
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[Callable[..., h5py.Dataset]]:
-    """Make an HDF5 file; the same data in the same order gives the same bytes.
+    """Create an HDF5 file; the same data in the same order gives the same bytes.
 
     Args:
         path: the file.
 
     Yields:
-        Writes a dataset, made of its path in the file, its data and h5py's further options.
+        A function that writes a dataset, given its path in the file, its data, and further options
+        of h5py.
 
     Raises:
-        OSError: the file cannot be made or written.
+        OSError: the file cannot be created or written.
     """
     with _Storage(path, "w+") as storage:
         file = h5py.File(storage, "w", libver="latest")

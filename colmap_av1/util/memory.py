@@ -12,9 +12,9 @@ _UNKNOWN = 8 << 30
 
 
 def usable_memory() -> int:
-    """Bytes of memory that this process and those it starts may use together.
+    """Bytes of memory that this process and its child processes may use together.
 
-    Containers and queues of clusters give less than the machine has.
+    Containers and cluster queues may allow less than the machine has.
     """
     limits = [_machine_memory()]
     with suppress(OSError):
@@ -34,16 +34,15 @@ def usable_memory() -> int:
 def _machine_memory() -> int:
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not on Windows
+    except (AttributeError, ValueError, OSError):  # Windows
         return _UNKNOWN
 
 
 def give_back_free_memory() -> None:
-    """Give memory that is free again back to the system, where that does not happen by itself.
+    """Return freed memory to the system, which the GNU C library does not do on its own.
 
-    GNU's C library keeps what it has had from the system for arrays of up to 32 MiB: after much
-    work that is more than what is in use.
+    It keeps the memory of freed arrays of up to 32 MiB, which can be more than the memory in use.
     """
-    # Other C libraries have no such function.
+    # Other C libraries have no malloc_trim.
     with suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

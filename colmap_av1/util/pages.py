@@ -1,14 +1,14 @@
-"""HTML pages that need no other file and no network, from the templates of this package."""
+"""HTML pages from the templates of this package, which need no other files and no network."""
 
 from __future__ import annotations
 
 
 def render_page(template: str, **values: object) -> str:
-    """Fill in a template; texts are escaped.
+    """Fill in a template; all text is escaped.
 
     Args:
         template: name of a file in `templates/`.
-        values: what it shows.
+        values: variables of the template.
     """
     import jinja2  # noqa: PLC0415 - few commands write pages
 

@@ -1,4 +1,4 @@
-"""Values as JSON holds them."""
+"""Convert values to those that JSON can hold."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Callable, Mapping
 
 
 def plain(value: object, spell: Callable[[str], str] = str) -> object:
-    """A value as JSON holds it: NaN and infinity become None, keys and paths become texts.
+    """Convert a value for JSON: NaN and infinity become None, keys and paths become strings.
 
     Args:
-        value: dictionaries, sequences, NumPy's arrays, numbers, texts, paths.
-        spell: what becomes of a text that is a value.
+        value: dictionaries, sequences, NumPy arrays, numbers, strings, paths.
+        spell: applied to strings that are values, not keys.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item, spell) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item, spell) for item in value]
-    if hasattr(value, "tolist"):  # NumPy's arrays and numbers
+    if hasattr(value, "tolist"):  # NumPy arrays and numbers
         return plain(value.tolist(), spell)
     if isinstance(value, float):
         return value if math.isfinite(value) else None

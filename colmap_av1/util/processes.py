@@ -1,4 +1,4 @@
-"""Processes that end with the one that started them."""
+"""Child processes that end when their parent process ends."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
-# A program that becomes another. Linux then ends that one with the process that started it, even
-# where that is killed and cannot.
+# A program that asks Linux to end it with its parent, even if the parent is killed, and then
+# becomes the command.
 _BOUND = """
 import ctypes, os, signal, sys
 starter, *command = sys.argv[1:]
@@ -18,8 +18,8 @@ ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 if os.getppid() == int(starter):
     os.execvp(command[0], command)
 """
-# A program that runs a command and ends with the process that started it, as does all that the
-# command started: the system would only end the command.
+# A program that runs a command in a process group and ends the whole group with its parent. The
+# system alone would only end the command, not what the command started.
 _GROUP = """
 import ctypes, os, signal, subprocess, sys
 starter, *command = sys.argv[1:]
@@ -41,10 +41,10 @@ sys.exit(status if status >= 0 else 128 - status)
 
 
 def bound(command: Sequence[str]) -> list[str]:
-    """The words of a process that ends with this one, even where this one is killed.
+    """A command line that ends with this process, even if this process is killed.
 
-    The thread that starts it must not end before it. Only Linux can do that; elsewhere these are
-    the words given.
+    The thread that starts it must not end before it. Only Linux can do that; on other systems the
+    command is returned unchanged.
     """
     if not _can_bind():
         return list(command)
@@ -52,17 +52,20 @@ def bound(command: Sequence[str]) -> list[str]:
 
 
 def bound_group(command: Sequence[str]) -> list[str]:
-    """The same, for a command and all that it starts, which ends with the command, too."""
+    """Like `bound`, for a command and all processes that it starts.
+
+    What the command left running ends when the command ends.
+    """
     if not _can_bind():
         return list(command)
     return [sys.executable, "-I", "-S", "-c", _GROUP, str(os.getpid()), *command]
 
 
 def bind(starter: int) -> None:
-    """End this process with the one that started it, even where that one is killed.
+    """End this process when the process that started it ends, even if that is killed.
 
     Args:
-        starter: its process id. The thread of it that started this one must not end before.
+        starter: ID of that process. The thread that started this process must not end before it.
     """
     if sys.platform != "linux":
         return

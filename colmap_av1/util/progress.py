@@ -1,4 +1,4 @@
-"""Progress of the stages of a long run, and the time they took."""
+"""Progress of the stages of a long run, and the time they take."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from colmap_av1.util.cpus import cpu_seconds
 
-# Called with a stage's name, what is done of it and, where known, of how much.
+# Called with the name of a stage, the amount done, and the total if it is known.
 Progress = Callable[[str, int, "int | None"], None]
 
 _Item = TypeVar("_Item")
@@ -21,7 +21,7 @@ def no_progress(stage: str, done: int, total: int | None) -> None:
 
 
 def progress_in(progress: Progress, stage: str, total: int) -> Callable[[int], None]:
-    """What reports how much of a stage is done, by the number alone."""
+    """A function that reports the progress of a stage, given only the amount done."""
     return lambda done: progress(stage, done, total)
 
 
@@ -29,8 +29,8 @@ class Clock:
     """Time of named stages, in the order in which they first ran.
 
     Attributes:
-        seconds: the wall time of each stage so far.
-        cpu_seconds: the processor time, of all threads and of processes that were waited for.
+        seconds: wall time of each stage so far.
+        cpu_seconds: CPU time, of all threads and of finished child processes.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Clock:
             self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu
 
     def iterate(self, stage: str, items: Iterable[_Item]) -> Iterator[_Item]:
-        """Yield from `items`, adding the time they take to come to a stage."""
+        """Yield from `items`, and add the time to produce them to a stage."""
         iterator = iter(items)
         self.seconds.setdefault(stage, 0.0)
         self.cpu_seconds.setdefault(stage, 0.0)

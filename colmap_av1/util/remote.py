@@ -20,18 +20,18 @@ _SECRET = re.compile(
     r"""([A-Za-z][A-Za-z0-9+.-]+:/{1,2})(?:[^\s/?@]*@)?([^\s?'"]*)(?:\?[^\s'"]*)?"""
 )
 _BLOCK = 1 << 22
-# What stores call the tag of a version of an object: S3 and Azure, HTTP, Google.
+# Keys of the tag or time of a version of an object: S3 and Azure, HTTP, Google.
 _TAGS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "updated")
 EXTRA = "colmap-av1[remote]"
 
 
 def without_secrets(text: str) -> str:
-    """The text with its URLs cut at the query and without passwords: signed URLs hold secrets."""
+    """The text with queries and passwords removed from its URLs: signed URLs contain secrets."""
     return _SECRET.sub(r"\1\2", text)
 
 
 def is_url(address: str) -> bool:
-    """Whether an address is a URL, not a path of this machine."""
+    """Whether an address is a URL, not a local path."""
     return _URL.match(address) is not None
 
 
@@ -43,32 +43,38 @@ def absolute(address: str) -> str:
 
 
 def filesystem(url: str) -> tuple[Any, str]:
-    """The file system that fsspec has for a URL, and the path in it.
+    """The file system of fsspec for a URL, and the path in it.
 
     Raises:
-        OptionError: a package is missing, or fsspec does not know this kind of URL.
+        OptionError: a package is missing, or fsspec does not support this kind of URL.
     """
     shown = without_secrets(url)
     try:
-        import fsspec  # noqa: PLC0415 - few need it
+        import fsspec  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
         raise OptionError(f"{shown}: needs the package fsspec: pip install '{EXTRA}'") from error
     try:
         system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         reason = without_secrets(str(error))
-        raise OptionError(f"{shown}: {reason}: pip install '{EXTRA}' has those of S3") from error
+        raise OptionError(f"{shown}: {reason}: for S3, pip install '{EXTRA}'") from error
     except ValueError as error:
         reason = without_secrets(str(error))
-        raise OptionError(f"{shown}: {reason}: give a path, or a URL that fsspec knows") from error
+        raise OptionError(
+            f"{shown}: {reason}: give a path, or a URL that fsspec supports"
+        ) from error
     return system, str(path)
 
 
 def version_of(address: str, stall: float) -> dict[str, object]:
-    """What changes with the content of a file: its size and time, or the tag of its store.
+    """Facts that change with the content of a file: its size and time, or the tag of its store.
+
+    Args:
+        address: path or URL.
+        stall: seconds without data after which reading a URL is given up.
 
     Raises:
-        VideoError: there is no such file.
+        VideoError: the file does not exist.
         OSError: the file system does not answer.
     """
     if not is_url(address):
@@ -89,16 +95,16 @@ def version_of(address: str, stall: float) -> dict[str, object]:
 
 
 def fetch(address: str, folder: Path, stall: float) -> Path:
-    """The path of a file; a file at a URL is copied.
+    """The path of a file; a file at a URL is downloaded.
 
     Args:
         address: path or URL.
-        folder: gets the copy.
+        folder: folder for the download.
         stall: seconds without data after which reading a URL is given up.
 
     Raises:
-        VideoError: there is no such file.
-        OSError: it cannot be read, or the copy not be written.
+        VideoError: the file does not exist.
+        OSError: the file cannot be read, or the download cannot be written.
     """
     if not is_url(address):
         return Path(address)
@@ -115,11 +121,11 @@ def fetch(address: str, folder: Path, stall: float) -> Path:
 
 
 def open_to_read(address: str) -> Any:
-    """An open binary file.
+    """Open a path or URL to read bytes.
 
     Raises:
         OptionError: as `filesystem`.
-        OSError: it cannot be opened.
+        OSError: the file cannot be opened.
     """
     if not is_url(address):
         return open(address, "rb")
@@ -133,14 +139,14 @@ def unless_stalled(
     """Run a step that reads a URL; give it up if it makes no progress.
 
     Args:
-        step: gets a function to call after each piece of progress.
-        address: what it reads, for messages.
-        seconds: without progress after which it is given up.
+        step: called with a function that it calls after each piece of progress.
+        address: the URL, for messages.
+        seconds: time without progress after which the step is given up.
 
     Raises:
-        VideoError: there is no such file.
-        OSError: it failed or stalled; a stalled step may run on in its thread.
-        ColmapAv1Error: what the step raised.
+        VideoError: the file does not exist.
+        OSError: the step failed or stalled; a stalled step may continue in its thread.
+        ColmapAv1Error: raised by the step.
     """
     result: list[_Result] = []
     failure: list[BaseException] = []
@@ -162,14 +168,14 @@ def unless_stalled(
     while not done.wait(max(0.01, last[0] + seconds - time.monotonic())):
         if time.monotonic() - last[0] >= seconds:
             shown = without_secrets(address)
-            raise OSError(errno.ETIMEDOUT, f"nothing comes for {seconds:g} seconds", shown)
+            raise OSError(errno.ETIMEDOUT, f"no data for {seconds:g} seconds", shown)
     if failure:
         raise _as_os_error(failure[0], address) from failure[0]
     return result[0]
 
 
 def _as_os_error(error: BaseException, address: str) -> BaseException:
-    """An error of a store's client, which may be of any type, as an OSError."""
+    """Convert an error of a store's client, which may have any type, to an OSError."""
     if isinstance(error, ColmapAv1Error) or not isinstance(error, Exception):
         return error
     if isinstance(error, FileNotFoundError):

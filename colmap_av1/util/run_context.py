@@ -1,4 +1,4 @@
-"""What travels with every call of a long run: its clock, progress, threads and seed."""
+"""The state that all steps of a long run share: clock, progress, threads and seed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from colmap_av1.util.progress import Clock, Progress, no_progress
 
 @dataclass(frozen=True)
 class RunContext:
-    """What every step of a run shares.
+    """The state that all steps of a run share.
 
     Attributes:
         clock: measures the time of the stages.
-        progress: called as the stages go on.
-        num_threads: threads a step may use. The result does not depend on it.
-        seed: seed of the random numbers.
+        progress: called as the stages progress.
+        num_threads: number of threads that a step may use; the result does not depend on it.
+        seed: random seed.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -29,6 +29,6 @@ class RunContext:
     def of(
         cls, run: RunOptions, clock: Clock | None = None, progress: Progress = no_progress
     ) -> RunContext:
-        """The context of a run with these options; None: a clock of its own."""
+        """The context of a run with these options; without a clock it gets a new one."""
         clock = clock if clock is not None else Clock()
         return cls(clock, progress, threads_or_cpus(run.num_threads), run.seed)

@@ -1,4 +1,4 @@
-"""Signals that end a process: held back, kept from libraries, and turned into exceptions."""
+"""Signals that end a process: delay them, keep libraries from handling them, raise exceptions."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
-# Some systems have no SIGHUP.
+# Windows has no SIGHUP.
 ENDING = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
-# Handlers that may be replaced. A signal that is ignored, as nohup asks for, stays ignored.
+# Handlers that may be replaced. A signal that is ignored, as by nohup, stays ignored.
 HEEDED = (signal.SIG_DFL, signal.default_int_handler)
 _INTERRUPT = int(signal.SIGINT)
 
 
 def end_at_once(number: int, _: object) -> None:
-    """A handler that ends the process."""
+    """A signal handler that ends the process immediately."""
     os._exit(128 + number)
 
 
 @contextmanager
 def ending_in_order() -> Iterator[None]:
-    """Let the signals that end a process unwind the body, so that nothing half-written is left.
+    """Let signals that end the process raise exceptions, so that the body can clean up.
 
     Raises:
-        KeyboardInterrupt: the process is interrupted.
-        SystemExit: a signal ends it.
+        KeyboardInterrupt: the process was interrupted.
+        SystemExit: another signal ends the process.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -50,9 +50,9 @@ def _unwind(number: int, _: types.FrameType | None) -> NoReturn:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Let signals that end the process wait until the body is done.
+    """Delay signals that end the process until the body is done.
 
-    Processes that are started meanwhile hold them back, too, until they call `let_through`.
+    Processes that the body starts delay them, too, until they call `let_through`.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -65,14 +65,14 @@ def held_back() -> Iterator[None]:
 
 
 def let_through() -> None:
-    """Take the signals that the process which started this one held back."""
+    """Receive signals again after the parent process started this one in `held_back`."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
 
 
 @contextmanager
 def handlers_kept() -> Iterator[None]:
-    """Undo what the body does to the handlers of signals that end a process."""
+    """Restore the handlers of signals that end the process after the body has changed them."""
     before = {number: signal.getsignal(number) for number in ENDING}
     try:
         yield

@@ -1,4 +1,4 @@
-"""Indices that are evenly spread over a sequence."""
+"""Indices that are evenly spaced over a sequence."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 
 def evenly_spread(count: int, most: int, *, rounded: bool = False) -> list[int]:
-    """At most `most` indices below `count`, evenly spread, from the first to the last.
+    """At most `most` indices below `count`, evenly spaced from the first to the last.
 
     Args:
         count: length of the sequence.
-        most: number of indices, at most.
-        rounded: round positions to the nearest index; otherwise down.
+        most: largest number of indices.
+        rounded: round positions to the nearest index instead of down.
     """
     place = np.linspace(0, count - 1, max(min(most, count), 0))
     return sorted(set((place.round() if rounded else place).astype(int).tolist()))

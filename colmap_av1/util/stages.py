@@ -1,10 +1,11 @@
-"""Stages of a long run that are kept in a folder, so that a later run resumes after them.
+"""Keep the finished stages of a long run in a folder, so that a later run resumes after them.
 
-A stage's record is written when all it makes is there: a key of what the result depends on, the
-result, and the digests of the products. A later run takes over the stage where the key is the
-same and the products are as recorded. All else is made again, damaged records and products too.
-Files of a user among the products stay.
-The key holds options and inputs by their content, and this package's code and version.
+When the products of a stage are complete, a record is written: a key of everything the result
+depends on, the result, and the digests of the products. A later run uses a stage with the same key
+and unchanged products. All other stages run again, including those with damaged records or
+products. A user's files among the products are not touched.
+
+The key is made from the options, the content of the inputs, and this package's code and version.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ class Kept(Generic[_Found_co]):
     """A finished stage.
 
     Attributes:
-        result: what the stage found.
-        digest: identifies the result and the products: what later stages depend on.
-        resumed: an earlier run finished the stage.
+        result: the result of the stage.
+        digest: digest of the result and the products, on which later stages depend.
+        resumed: whether an earlier run finished the stage.
     """
 
     result: _Found_co
@@ -56,15 +57,15 @@ class Kept(Generic[_Found_co]):
 
 @contextmanager
 def open_stages(output: Path, command: str) -> Iterator[Path]:
-    """The folder of the stages in an output folder, both made where they are missing.
+    """The folder of the stages in an output folder; both are created if missing.
 
     Args:
         output: the output folder.
-        command: the command whose output it is.
+        command: the command that writes the output.
 
     Raises:
-        OptionError: the output folder holds something else, cannot be made, or another run
-            works in it.
+        OptionError: the output folder contains something else, cannot be created, or another run
+            is writing to it.
     """
     stages = output / _FOLDER
     with ExitStack() as running:
@@ -88,7 +89,7 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
             raise OptionError(cannot_write(output, error)) from error
         if not alone:
             raise OptionError(
-                f"{output}: another run is at work in it: wait for its end, or give another folder"
+                f"{output}: another run is writing to it: wait for its end, or give another folder"
             )
         for folder in (output, stages):
             remove_leftovers(folder)
@@ -107,22 +108,22 @@ def run_stage(
 ) -> Kept[_Result]:
     """Run a stage, unless an earlier run finished it with the same input.
 
-    What it makes appears under its name when it is complete, never in part; what was there until
-    then stays. Only files of an earlier run are replaced.
+    The products appear under their names only when they are complete. Until then earlier products
+    stay. Only files of an earlier run are replaced.
 
     Args:
         stages: the folder of the stages.
         name: name of the stage.
-        depends_on: everything the result depends on but the code, see `digest_of`.
-        kind: the dataclass of the result; its fields are of types that JSON can hold, or such
+        depends_on: everything except the code that the result depends on, see `digest_of`.
+        kind: dataclass of the result; its fields have types that JSON can hold, or are such
             dataclasses.
-        into: folder that gets the products.
-        products: files and folders that the stage makes.
-        make: makes the products in the given folder and returns the result.
+        into: folder for the products.
+        products: files and folders that the stage writes.
+        make: writes the products to the given folder and returns the result.
 
     Raises:
-        ModelError: something cannot be written.
-        OptionError: a file of a user is in the way.
+        ModelError: a file cannot be written.
+        OptionError: a user's file is in the way.
     """
     key = _stage_key(depends_on)
     record = stages / f"{name}.json"
@@ -133,16 +134,16 @@ def run_stage(
     try:
         _remove(partial)
         partial.mkdir()
-        give_back_free_memory()  # what earlier stages had
+        give_back_free_memory()  # memory that earlier stages have freed
         result = make(partial)
         made = _put_in_place(record, partial, into, products)
         return _record(record, key, result, kind, into=into, products=made)
     except OSError as error:
         if error.filename is not None and stages.parent not in Path(error.filename).parents:
-            raise  # of what is read
+            raise  # an input could not be read
         raise ModelError(
-            f"{into}: cannot be written: {error.strerror or error}: the stages before are kept, "
-            "run the same command again once that is fixed"
+            f"{into}: cannot be written: {error.strerror or error}: fix that and run the same "
+            "command again, finished stages are kept"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -157,21 +158,22 @@ def run_stage_in(
     made_by: Sequence[str] = WHOLE_PACKAGE,
     timed: bool = False,
 ) -> Kept[dict[str, Any]]:
-    """Run a stage that has a folder to itself, unless an earlier run finished it.
+    """Run a stage that has its own folder, unless an earlier run finished it.
 
-    What it makes is made in its place, for programs that write down where their output lies.
+    The products are written in their final place, for programs that record the path of their
+    output.
 
     Args:
-        folder: emptied before the stage is run; gets `result.json` beside what the stage leaves.
-        depends_on: everything the result depends on but the code, see `digest_of`.
-        make: makes the products and returns a result that JSON can hold.
+        folder: emptied before the stage runs; contains `result.json` and the output of the stage.
+        depends_on: everything except the code that the result depends on, see `digest_of`.
+        make: writes the products and returns a result that JSON can hold.
         products: files and folders that later stages read, in the folder or elsewhere.
-        made_by: folders of this package whose code changes the result, see `code_digest`: where
-            other programs make it, not those that only make what it depends on.
-        timed: the result says how long it took, so that the number of threads counts.
+        made_by: folders of this package whose code changes the result, see `code_digest`. If other
+            programs make the result, folders whose code only makes their input are not listed.
+        timed: the result contains run times, so the number of threads counts.
 
     Raises:
-        OSError: something cannot be written.
+        OSError: a file cannot be written.
     """
     key = _stage_key(depends_on, made_by=made_by, timed=timed)
     record = folder / "result.json"
@@ -193,7 +195,7 @@ def _stage_key(
 
 
 def _finished(record: Path, key: str, into: Path, kind: type[_Result]) -> Kept[_Result] | None:
-    """The stage as recorded; None where it is another, or the record or a product is damaged."""
+    """The recorded stage; None if its key differs, or the record or a product is damaged."""
     body = _read_record(record)
     if body is None or body["key"] != key:
         return None
@@ -203,7 +205,7 @@ def _finished(record: Path, key: str, into: Path, kind: type[_Result]) -> Kept[_
 
 
 def _read_record(record: Path) -> dict[str, Any] | None:
-    """The record of a stage; None where there is none, or it is damaged."""
+    """The record of a stage; None if it is missing or damaged."""
     try:
         body = json.loads(record.read_text())
     except (OSError, ValueError, RecursionError):
@@ -221,10 +223,10 @@ def _write_record(record: Path, body: dict[str, Any]) -> None:
 
 
 def _put_in_place(record: Path, made: Path, into: Path, products: Sequence[str]) -> list[Path]:
-    """Put products in their places, where those of an earlier run make room; their files there.
+    """Move products into place, replacing those of an earlier run, and return their files there.
 
-    The record lists the files of both until a new one is written, so that a run that is killed
-    meanwhile leaves none that the next one takes for a user's.
+    Until the new record is written, the old record lists the files of both runs. If this run is
+    killed, the next run therefore knows that none of the files is a user's.
     """
     body = _read_record(record)
     listed = [] if body is None else body["files"]
@@ -235,11 +237,11 @@ def _put_in_place(record: Path, made: Path, into: Path, products: Sequence[str])
     }
     files = [path.relative_to(made) for product in products for path in _files_of(made / product)]
     new = {path.as_posix() for path in files}
-    if body is not None:  # else nothing says whose the files are that have the new ones' names
+    if body is not None:  # without a record it is unknown whose the existing files are
         theirs = [n for n in new - earlier if _is_inside(into, n) and (into / n).is_file()]
         if theirs:
             raise OptionError(
-                f"{into / min(theirs)}: is in the way and not of an earlier run: move it away"
+                f"{into / min(theirs)}: is in the way and not from an earlier run: move it away"
             )
     _write_record(record, {"key": "", "result": None, "files": dict.fromkeys({*listed, *new})})
     for name in sorted(earlier):
@@ -252,19 +254,19 @@ def _put_in_place(record: Path, made: Path, into: Path, products: Sequence[str])
         if not place.exists():
             (made / product).replace(place)
     for path in files:
-        if (made / path).exists():  # not moved with its folder
+        if (made / path).exists():  # it was not moved with its folder
             (into / path).parent.mkdir(parents=True, exist_ok=True)
             (made / path).replace(into / path)
     return [into / path for path in files]
 
 
 def _is_inside(folder: Path, name: str) -> bool:
-    """Whether a recorded name leads nowhere else: a record may be of another origin."""
+    """Whether a recorded name lies inside the folder; a manipulated record may lead elsewhere."""
     return (folder / name).parent.resolve().is_relative_to(folder.resolve())
 
 
 def _remove_one(path: Path) -> None:
-    """Remove a file, a link or an empty folder, if it is there."""
+    """Remove a file, a link or an empty folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         path.rmdir()
     else:
@@ -272,7 +274,7 @@ def _remove_one(path: Path) -> None:
 
 
 def _remove_empty(folder: Path, root: Path) -> None:
-    """Remove a folder and those above it, below a root, that hold nothing."""
+    """Remove a folder and its parents below a root, as far as they are empty."""
     while folder != root and root in folder.parents:
         try:
             folder.rmdir()
@@ -282,10 +284,10 @@ def _remove_empty(folder: Path, root: Path) -> None:
 
 
 def remove_products(output: Path, stages: Path) -> None:
-    """Remove what the stages of an earlier run made in a folder, and their records.
+    """Remove the products of the stages of an earlier run from a folder, and their records.
 
     Raises:
-        OSError: something cannot be removed.
+        OSError: a file cannot be removed.
     """
     for record in stages.glob("*.json"):
         files = (_read_record(record) or {"files": {}})["files"]
@@ -314,7 +316,7 @@ def _record(
         for product in products
         for path in _files_of(product)
     }
-    # Read back, so that this run goes on from what a later run will read.
+    # The record is parsed again, so that this run continues with the values a later run will read.
     plain = {"key": key, "result": cattrs.unstructure(result), "files": files}
     body = json.loads(json.dumps(plain))
     _write_record(record, body)

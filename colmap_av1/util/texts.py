@@ -1,4 +1,4 @@
-"""Text files that users write, one entry a line, and texts of files in messages."""
+"""Read text files that users write, with one entry per line, and show their text in messages."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from pathlib import Path, PurePosixPath
 
 from colmap_av1.errors import ImageError
 
-# No list of frames, images or poses comes near it.
+# In bytes; lists of frames, images or poses are much smaller.
 _LARGEST = 1 << 28
-# Characters of a text that a message shows.
+# Number of characters that a message shows of a text.
 _MOST_SHOWN = 40
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def shown(text: str) -> str:
-    """The start of a text of a file, for messages: without what would steer a terminal."""
+    """The start of a text for a message, without characters that control a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:_MOST_SHOWN])
 
 
 def read_lines(path: str | os.PathLike[str]) -> list[str]:
-    """The lines of a text in UTF-8, or in UTF-16 with its mark of the order of bytes.
+    """Read the lines of a text file in UTF-8, or in UTF-16 with a byte order mark.
 
     Raises:
-        OSError: it cannot be read, is larger than any list, or no regular file: a pipe gives what
-            it holds once only, and a device may have no end.
-        UnicodeDecodeError: it is no such text.
+        OSError: the file cannot be read, is larger than any list, or is not a regular file: a pipe
+            can be read only once, and a device may have no end.
+        UnicodeDecodeError: the file has another encoding.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        what = "is a folder" if path.is_dir() else "is no regular file: copy it to one first"
+        what = "is a folder" if path.is_dir() else "is not a regular file: copy it to one first"
         raise OSError(None, what)
     if path.stat().st_size > _LARGEST:
         raise OSError(None, "is too large")
@@ -39,10 +39,10 @@ def read_lines(path: str | os.PathLike[str]) -> list[str]:
 
 
 def check_name(name: str) -> None:
-    """Check that an image's name, its path within the image folder, is that of a file in it.
+    """Check that an image's name is a valid path of a file within the image folder.
 
     Raises:
-        ImageError: it leads out of the folder, or is none that a file can have.
+        ImageError: the name leads out of the folder, or no file can have it.
     """
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
@@ -50,8 +50,8 @@ def check_name(name: str) -> None:
             f"image {name!r} lies outside the image folder: give names within the folder"
         )
     if not parts.parts or "\0" in name:
-        raise ImageError(f"image {name!r} has a name that no file can have: name it otherwise")
-    if name.encode(errors="replace").decode() != name:  # Python holds other bytes as surrogates
+        raise ImageError(f"image {name!r} has a name that no file can have: rename it")
+    if name.encode(errors="replace").decode() != name:  # Python keeps other bytes as surrogates
         raise ImageError(
             f"image {name!r} has a name that is not UTF-8, which no database can hold: rename it"
         )

@@ -1,1 +1,1 @@
-"""The video file: container, pictures, how players show it, conversion to AV1."""
+"""The video file: container, decoding, display geometry, conversion to AV1, metadata."""

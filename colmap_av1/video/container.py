@@ -1,4 +1,4 @@
-"""Facts of a video in its container, and the packets of AV1; FFmpeg (through PyAV) demuxes."""
+"""Facts from the container of a video, and its AV1 packets. FFmpeg demuxes, through PyAV."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 from colmap_av1.video.cut_off import is_fragmented_mp4_cut, is_matroska_cut
 from colmap_av1.video.unchanged import FileState, file_state
 
-# Edit lists drop or hide samples, but a later frame may reference them: read them all.
+# Edit lists drop or hide samples that a later frame may reference, so all samples are read.
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
 _IVF_FRAME_HEADER_SIZE = 12
-_IVF_RATE_OFFSET = 16  # rate and scale, 32 bits each
+_IVF_RATE_OFFSET = 16  # frame rate and time scale, 32 bits each
 _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
 _AV1C_HEADER_SIZE = 4
-# As a path spells it, with one slash.
+# A URL as `Path` spells it, with one slash instead of two.
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]+):/(?P<rest>.*)", re.DOTALL)
-ENCRYPTED = "is encrypted: give a copy that is not"
-# FFmpeg's tag for the key of an encrypted Matroska stream.
+ENCRYPTED = "is encrypted: give a decrypted copy"
+# FFmpeg gives this tag to an encrypted Matroska stream: the ID of its key.
 _KEY_TAG = "enc_key_id"
-# Transfer characteristics of high dynamic range (ITU-T H.273, table 3).
-_HIGH_RANGES = {16: "PQ", 18: "HLG"}
+# Transfer characteristics of HDR video (ITU-T H.273, table 3).
+_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Packet:
     """One unit of the container, usually a temporal unit.
 
     Attributes:
-        data: OBUs in low-overhead format (AV1 specification, section 5), whatever the
+        data: OBUs in low-overhead format (AV1 specification, section 5) for every
             container; the last one may lack its obu_size. A view of the demuxer's memory.
-        pts: presentation time in seconds; None where the container gives none.
-        index: number of the packet in the stream, from 0.
+        pts: presentation time in seconds; None if the container gives none.
+        index: index of the packet in the stream, from 0.
     """
 
     data: memoryview
@@ -56,26 +56,25 @@ class Packet:
 
 @dataclass(frozen=True)
 class VideoFile:
-    """Facts of a video file of any codec, without decoding.
+    """Facts about a video file of any codec, read without decoding.
 
-    It stands for the file's path where one is asked for.
+    It can be passed wherever the path of a video is expected.
 
     Attributes:
         path: the file.
-        state: the file before it was opened, for `unchanged`.
+        state: state of the file before it was opened, for `unchanged`.
         container: FFmpeg's name of the container format.
         codec: FFmpeg's name of the codec.
-        index: number of the video among the streams of the file.
-        stored_size: (width, height) in pixels of the pictures as they are stored.
-        frame_rate: average frames per second; None where unknown.
-        duration: length in seconds; None where unknown.
-        is_timed: the container says when its frames are shown.
-        num_packets: packets of the video, usually one a frame; None where the container does
-            not say.
-        dynamic_range: name of the transfer function of high dynamic range that its pictures
-            have, "HLG" or "PQ"; None where they have none.
-        tags: names, in lower case, and values of what the container says of the whole file.
-        has_telemetry: it has streams of data or subtitles, which may say where it was taken.
+        index: index of the video stream in the file.
+        stored_size: (width, height) in pixels of the stored pictures.
+        frame_rate: average frames per second; None if unknown.
+        duration: length in seconds; None if unknown.
+        is_timed: whether the container gives presentation times.
+        num_packets: packets of the video stream, usually one per frame; None if the container
+            does not give the number.
+        dynamic_range: transfer function of HDR video, "HLG" or "PQ"; None for other video.
+        tags: metadata of the whole file: (name in lower case, value) pairs.
+        has_telemetry: whether the file has data or subtitle streams, which may hold positions.
     """
 
     path: Path
@@ -100,14 +99,14 @@ class VideoFile:
 
     @property
     def likely_num_packets(self) -> int | None:
-        """The number of packets, or what it comes to by duration and frame rate."""
+        """The number of packets, or an estimate from duration and frame rate."""
         if self.num_packets is not None or self.duration is None or self.frame_rate is None:
             return self.num_packets
         return round(self.duration * self.frame_rate) or None
 
 
 def read_file(video: str | os.PathLike[str]) -> VideoFile:
-    """Read the facts of a file of any codec; the same object where that has been done.
+    """Read the facts about a file of any codec; a `VideoFile` is returned unchanged.
 
     Raises:
         VideoError: as `decode_frames`.
@@ -120,19 +119,20 @@ def read_file(video: str | os.PathLike[str]) -> VideoFile:
 
 
 def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
-    """What an open container says of a stream.
+    """Collect the facts that an open container gives about a stream.
 
     Args:
-        container: of PyAV.
-        stream: its stream, of PyAV.
-        state: the file before it was opened.
+        container: PyAV's container.
+        stream: PyAV's stream.
+        state: state of the file before it was opened.
     """
     rate = stream.average_rate or stream.guessed_rate
     is_timed = not (_is_ivf_without_rate(state.path) or _is_mp4_without_scale(container, stream))
     num_packets, duration = stream.frames or None, _stream_duration(container, stream)
     if container.format.name == "ivf" and is_timed and rate and stream.time_base != 1 / rate:
-        # Some programs write the number of frames to the header, some the length in units of time.
-        num_packets, duration = _measured(state.path, stream.index, 1 / rate)
+        # The header holds the number of frames or the duration in time units, depending on the
+        # program that wrote it, so both are measured.
+        num_packets, duration = _measured_length(state.path, stream.index, 1 / rate)
     return VideoFile(
         path=state.path,
         state=state,
@@ -144,7 +144,7 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
         duration=duration if is_timed else None,
         is_timed=is_timed,
         num_packets=num_packets,
-        dynamic_range=_HIGH_RANGES.get(stream.codec_context.color_trc),
+        dynamic_range=_HDR_TRANSFERS.get(stream.codec_context.color_trc),
         tags=tuple((str(k).lower(), str(v)) for k, v in container.metadata.items()),
         has_telemetry=bool(container.streams.data or container.streams.subtitles),
     )
@@ -154,9 +154,9 @@ class VideoStream:
     """The AV1 stream of an open video file; a context manager that closes it.
 
     Attributes:
-        file: what the container says of it.
+        file: facts from the container.
         configuration: OBUs that precede the first packet: the configOBUs of the container's
-            av1C box, empty where the stream carries its sequence header itself.
+            av1C box; empty if the stream contains its own sequence header.
     """
 
     def __init__(self, video: str | os.PathLike[str]) -> None:
@@ -188,13 +188,13 @@ class VideoStream:
         self._opened.close()
 
     def packets(self) -> Iterator[Packet]:
-        """Read the packets in bitstream order. Works once per opened stream.
+        """Read the packets in bitstream order. Can be called once per opened stream.
 
         Raises:
             BitstreamError: the file is damaged or cut off; every packet before the damage
-                has been given.
-            VideoError: there is no packet at all, it is encrypted, or this process was forked
-                meanwhile.
+                has been yielded.
+            VideoError: the stream has no packets, is encrypted, or was opened before this
+                process was forked.
         """
         index = 0
         last: Any = None
@@ -226,15 +226,20 @@ class VideoStream:
         if damage:
             raise BitstreamError(f"{self.file}: {damage}")
         if index == 0:
-            raise VideoError(f"{self.file}: holds no frame: give a video with pictures")
+            raise VideoError(f"{self.file}: has no frames: give another video")
 
     def _missing_end(self, count: int, last: Any) -> str | None:
-        """Evidence that the file is cut off, where demuxers end as if it were complete."""
+        """Describe how a file is cut off that the demuxer treats as complete; None if it is whole.
+
+        Args:
+            count: number of packets read.
+            last: the last packet, of PyAV.
+        """
         file = self.file
         if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
-            return f"cut off: {count} of {file.num_packets} packets are there"
+            return f"cut off after {count} of {file.num_packets} packets"
         if count == 0:
-            # Tables that point nowhere, or a cut inside the first packet.
+            # The sample tables point outside the file, or it ends inside the first packet.
             if file.num_packets or (file.duration and "matroska" in file.container):
                 return "damaged or cut off before the end of the first packet"
             return None
@@ -254,45 +259,49 @@ class VideoStream:
             length = float((last.duration or 0) * last.time_base)
             end_time = float(last.pts * last.time_base) + max(length, step)
             if end_time + 1.5 * step < file.duration:
-                return f"cut off: {end_time:.2f} of {file.duration:.2f} seconds are there"
+                return f"cut off after {end_time:.2f} of {file.duration:.2f} seconds"
         return None
 
 
 def check_process(video: str | os.PathLike[str], process: int) -> None:
-    """Refuse to go on with a file in a process forked from the one that opened it.
+    """Check that a file is read by the process that opened it, not by a fork of it.
 
-    The two would take packets from each other, and threads that read stay with the first.
+    Both processes would take packets from the same open file, and the fork has no reader threads.
+
+    Args:
+        video: the file, for the message.
+        process: ID of the process that opened it.
 
     Raises:
-        VideoError: this is not that process.
+        VideoError: the current process is another one.
     """
     if os.getpid() != process:
         raise VideoError(
-            f"{os.fspath(video)}: was being read when this process was forked: read it anew here"
+            f"{os.fspath(video)}: was opened before this process was forked: open it again here"
         )
 
 
 def open_stream(video: str | os.PathLike[str]) -> VideoStream:
     """Open the AV1 stream of a video file.
 
-    Reads every container FFmpeg demuxes, among them MP4, Matroska, WebM, IVF and bare OBU
-    files (Section 5 and Annex B).
+    Every container that FFmpeg demuxes is accepted, including MP4, Matroska, WebM, IVF and bare
+    OBU files (Section 5 and Annex B).
 
     Raises:
-        NotAv1Error: the video is coded otherwise; the message says how to convert it.
-        VideoError: the file is missing, empty, not a video, or holds no video stream.
+        NotAv1Error: the video has another codec; the message says how to convert it.
+        VideoError: the file is missing, empty, not a video, or has no video stream.
     """
     return VideoStream(video)
 
 
 def packets(video: str | os.PathLike[str]) -> Iterator[Packet]:
-    """Read the packets of a video file: `VideoStream.packets` of a file opened for it."""
+    """Open a video file and read its packets, as `VideoStream.packets`."""
     with open_stream(video) as stream:
         yield from stream.packets()
 
 
 class _IvfWithRate(io.FileIO):
-    """An IVF file read as if its header gave a frame rate; FFmpeg refuses one that is 0."""
+    """An IVF file read as if its header had a frame rate, because FFmpeg rejects a rate of 0."""
 
     def readinto(self, buffer: Any) -> int:
         start = self.tell()
@@ -320,9 +329,9 @@ def _is_ivf_without_rate(path: Path) -> bool:
 
 
 def _is_mp4_without_scale(container: Any, stream: Any) -> bool:
-    """Whether units of time have no length, which FFmpeg takes for a second.
+    """Whether an MP4 file has an invalid time scale, for which FFmpeg assumes units of a second.
 
-    A frame lasts several units: no video has one that long for a unit.
+    With this unit the file has less than one frame per second, which no real video has.
     """
     rate = stream.average_rate
     is_second = "mov" in container.format.name.split(",") and stream.time_base == 1
@@ -331,14 +340,22 @@ def _is_mp4_without_scale(container: Any, stream: Any) -> bool:
 
 @contextmanager
 def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
-    """Open a file of any container, with clear messages for what can go wrong."""
+    """Open a file of any container.
+
+    Args:
+        path: the file.
+        apply_edits: hide the samples that an edit list hides.
+
+    Raises:
+        VideoError: the file is missing, unreadable, empty, or not a video.
+    """
     file: _IvfWithRate | None = None
     try:
         address = _ADDRESS.match(str(path))
         if address and not path.exists():
             raise VideoError(
-                f"{address['scheme']}://{address['rest']}: is no file: fetch it first, and give "
-                "its path"
+                f"{address['scheme']}://{address['rest']}: is a URL, not a file: download it first "
+                "and give its path"
             )
         if not path.exists():
             raise VideoError(f"{path}: no such file: give the path of a video")
@@ -346,14 +363,14 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
             raise VideoError(f"{path}: is a folder: give a video file")
         if not path.is_file():
             raise VideoError(
-                f"{path}: is a pipe or device, but a video is read several times: copy it to a "
+                f"{path}: is a pipe or device, and a video is read several times: copy it to a "
                 "file first"
             )
         if path.stat().st_size == 0:
             raise VideoError(f"{path}: is an empty file: give the path of a video")
         if _is_ivf_without_rate(path):
             file = _IvfWithRate(path)
-        # An absolute path: FFmpeg would take 'name:...' for a protocol.
+        # The path is absolute because FFmpeg would read 'name:...' as a protocol.
         container = av.open(
             file or os.path.abspath(path),
             container_options={} if apply_edits else _CONTAINER_OPTIONS,
@@ -363,11 +380,11 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
             file.close()
         if isinstance(error, PermissionError):
             raise VideoError(
-                f"{path}: no permission to read it: change that, or give another"
+                f"{path}: no permission to read it: change its permissions or give another file"
             ) from error
         raise VideoError(
             f"{path}: not a video, or damaged before its first frame ({reason_of(error)}): give "
-            "another"
+            "another file"
         ) from error
     try:
         yield container
@@ -389,25 +406,32 @@ def _find_av1_stream(container: Any, path: Path) -> Any:
 
 
 def find_video_stream(container: Any, path: Path) -> Any:
-    """The AV1 stream, in a file without one the first that is no cover picture.
+    """The AV1 stream of a file; if there is none, the first video stream with moving pictures.
 
-    A picture beside a track, as animated AVIF and HEIF files have one, is no video.
+    Cover pictures, and the still pictures of animated AVIF and HEIF files, are skipped.
+
+    Raises:
+        VideoError: there is no video stream.
     """
     streams = container.streams.video
     if not streams:
         kinds = sorted({stream.type for stream in container.streams})
-        found = f"only {', '.join(kinds)}" if kinds else "nothing"
-        raise VideoError(f"{path}: holds no video stream, {found}: give a video")
+        found = f", only {', '.join(kinds)}" if kinds else ""
+        raise VideoError(f"{path}: has no video stream{found}: give a video")
     moving = [s for s in streams if not s.disposition & Disposition.attached_pic]
     if not moving and container.streams.audio:
-        raise VideoError(f"{path}: holds audio and a cover picture, no video: give a video")
+        raise VideoError(f"{path}: has audio and a cover picture, no video: give a video")
     moving = moving or streams
     coded = [s for s in moving if _codec_name(s) == "av1"] or moving
     return next((s for s in coded if s.frames != 1), coded[0])
 
 
 def find_decodable_stream(container: Any, path: Path) -> Any:
-    """As `find_video_stream`; refuses a codec that FFmpeg does not decode."""
+    """Like `find_video_stream`, but the codec must be one that FFmpeg decodes.
+
+    Raises:
+        VideoError: there is no video stream, or FFmpeg cannot decode it.
+    """
     stream = find_video_stream(container, path)
     if stream.codec_context is None:
         raise VideoError(f"{path}: FFmpeg has no decoder for its codec: convert it first")
@@ -415,8 +439,8 @@ def find_decodable_stream(container: Any, path: Path) -> Any:
 
 
 def is_encrypted(packet: Any) -> bool:
-    """Whether a packet is encrypted, as by Common Encryption (ISO/IEC 23001-7)."""
-    # Earlier PyAV does not show what the container says of a packet.
+    """Whether a packet is encrypted, for example by Common Encryption (ISO/IEC 23001-7)."""
+    # Old versions of PyAV do not give the side data of packets.
     has = getattr(packet, "has_sidedata", None)
     return _KEY_TAG in packet.stream.metadata or (has is not None and has("encryption_info"))
 
@@ -428,10 +452,10 @@ def _codec_name(stream: Any) -> str:
 
 
 def _configuration_obus(extradata: bytes | None) -> bytes:
-    """The configOBUs of an av1C box (AV1 in ISOBMFF, section 2.3), or bare OBUs as they are."""
+    """The configOBUs of an av1C box (AV1 in ISOBMFF, section 2.3); bare OBUs stay unchanged."""
     if not extradata:
         return b""
-    if extradata[0] == 0x81:  # marker and version; no OBU header starts so
+    if extradata[0] == 0x81:  # marker and version; no OBU header begins with this byte
         return bytes(extradata[_AV1C_HEADER_SIZE:])
     return bytes(extradata)
 
@@ -439,7 +463,7 @@ def _configuration_obus(extradata: bytes | None) -> bytes:
 def _stream_duration(container: Any, stream: Any) -> float | None:
     if stream.duration is not None and stream.time_base:
         return float(stream.duration * stream.time_base)
-    tag = stream.metadata.get("DURATION")  # Matroska, as muxers write it: 00:00:01.234
+    tag = stream.metadata.get("DURATION")  # Matroska muxers write 00:00:01.234
     if tag:
         try:
             hours, minutes, seconds = tag.split(":")
@@ -451,13 +475,13 @@ def _stream_duration(container: Any, stream: Any) -> float | None:
     return None
 
 
-def _measured(path: Path, index: int, step: Fraction) -> tuple[int, float]:
-    """Number of packets of a stream up to the first damage, and its length in seconds.
+def _measured_length(path: Path, index: int, step: Fraction) -> tuple[int, float]:
+    """Number of packets of a stream up to the first damage, and its duration in seconds.
 
     Args:
         path: the file.
-        index: number of the stream.
-        step: seconds from a picture to the next.
+        index: index of the stream.
+        step: seconds from one picture to the next.
     """
     times: list[Fraction] = []
     with open_container(path) as container, suppress(av.error.FFmpegError, OSError):
@@ -468,6 +492,6 @@ def _measured(path: Path, index: int, step: Fraction) -> tuple[int, float]:
 
 
 def reason_of(error: BaseException) -> str:
-    """FFmpeg's words for an error, without its number and the file's name."""
+    """FFmpeg's description of an error, without its number and the name of the file."""
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return " ".join(str(reason).split())

@@ -1,4 +1,4 @@
-"""Elements of a container that end after the file does: demuxers leave them out silently."""
+"""Detect files that end inside an element of their container, which demuxers skip silently."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 _SIMPLE_BLOCK, _BLOCK = b"\xa3", b"\xa1"
-# Elements whose content is read as elements of the same level: Segment, Cluster, BlockGroup.
-_ENTERED = (b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0")
+# Elements that contain elements: Segment, Cluster, BlockGroup.
+_PARENTS = (b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0")
 _LONGEST_ID, _LONGEST_SIZE = 4, 8
 
 
 def is_matroska_cut(path: Path, payload: int) -> bool:
-    """Whether a Matroska file ends inside an element after a block.
+    """Whether a Matroska file ends inside a block or an element after it.
 
     Args:
         path: the file.
-        payload: position of the payload of the block, as FFmpeg gives it with a packet.
+        payload: position in the file of the block's payload, which FFmpeg gives with a packet.
     """
     with path.open("rb") as file:
         size = file.seek(0, 2)
@@ -27,7 +27,7 @@ def is_matroska_cut(path: Path, payload: int) -> bool:
             length = _vint_length(head, _LONGEST_ID)
             name, rest = head[:length], head[length:]
             if length == 0:
-                return False  # no element: nothing is known
+                return False  # not a Matroska element, so the end cannot be judged
             width = _vint_length(rest, _LONGEST_SIZE)
             if len(rest) < max(width, 1):
                 return True
@@ -35,7 +35,7 @@ def is_matroska_cut(path: Path, payload: int) -> bool:
                 return False
             at += length + width
             content = _vint(rest[:width])
-            if name in _ENTERED:
+            if name in _PARENTS:
                 continue
             if content is None:
                 return False
@@ -44,7 +44,7 @@ def is_matroska_cut(path: Path, payload: int) -> bool:
 
 
 def _end_of_block(file: BinaryIO, payload: int) -> int | None:
-    """Where the block with this payload ends; None where there is none."""
+    """The position where the block with this payload ends; None if no block is found."""
     start = max(payload - _LONGEST_SIZE - 1, 0)
     file.seek(start)
     before = file.read(payload - start)
@@ -60,20 +60,23 @@ def _end_of_block(file: BinaryIO, payload: int) -> int | None:
 
 
 def _vint_length(data: bytes, longest: int) -> int:
-    """Bytes of the number of variable length that data begins with; 0: it is none."""
+    """Length in bytes of the variable-length integer at the start of `data`; 0 if it is invalid."""
     length = 9 - data[0].bit_length() if data else 0
     return length if length <= longest else 0
 
 
 def _vint(data: bytes) -> int | None:
-    """The number of variable length in its bytes; None: unknown."""
+    """The value of a variable-length integer; None for the reserved value "unknown"."""
     bits = 7 * len(data)
     value = int.from_bytes(data, "big") & ((1 << bits) - 1)
     return None if value == (1 << bits) - 1 else value
 
 
 def is_fragmented_mp4_cut(path: Path) -> bool:
-    """Whether an MP4 file in fragments ends inside a box; a single box `moov` lists its samples."""
+    """Whether a fragmented MP4 file ends inside a box.
+
+    Other MP4 files list their samples in the box `moov`, so missing packets can be counted.
+    """
     with path.open("rb") as file:
         size = file.seek(0, 2)
         at = 0
@@ -87,7 +90,7 @@ def is_fragmented_mp4_cut(path: Path) -> bool:
                 length = int.from_bytes(head[8:16], "big")
             if len(head) < 8 or at + length > size:
                 return is_fragmented
-            if length < 8:  # up to the end of the file, or damaged
+            if length < 8:  # the box extends to the end of the file, or is damaged
                 return False
             at += length
         return False

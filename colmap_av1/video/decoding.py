@@ -1,4 +1,4 @@
-"""Decoded pictures of a video, as players show them."""
+"""Decode the pictures of a video as players show them."""
 
 from __future__ import annotations
 
@@ -29,24 +29,25 @@ def decode_frames(
     wanted: Collection[int] | None = None,
     kept: KeptPictures | None = None,
 ) -> Generator[tuple[int, NDArray[np.uint8]], None, None]:
-    """Decode the frames that players show, as they show them but for film grain.
+    """Decode the frames that players show, as they show them but without film grain.
 
     Args:
         video: a file of any codec that FFmpeg decodes.
         operating_point: operating point of a scalable stream.
-        num_threads: threads of the decoder; None: as many as it likes.
-        display: how pictures are cut and turned; None: as players do. Pixels stay as wide as
-            they are stored.
-        wanted: indices of the frames that are given, all others are decoded only; None: all.
-        kept: keeps those that are wanted, and what it holds is not decoded; None: each is decoded.
+        num_threads: number of decoder threads; None: chosen by the decoder.
+        display: how pictures are cropped and rotated; None: as players do. Pictures with
+            non-square pixels are not resampled.
+        wanted: indices of the frames to yield, all others being decoded only; None: all frames.
+        kept: store of decoded pictures. It keeps the wanted frames, and frames that it already
+            holds are not decoded again; None: every frame is decoded.
 
     Yields:
-        (index, image) in output order: the index counts the frames that players show, see
-        `Video.presented`; the image is uint8 [height, width, 3] in BGR order.
+        (index, image) in output order: the index among the frames that players show, see
+        `Video.presented`, and the image, uint8 [height, width, 3] in BGR order.
 
     Raises:
-        BitstreamError: the stream is damaged; the frames before have been given.
-        VideoError: as `read_video`, or the stream names colours that there are none of.
+        BitstreamError: the stream is damaged; the frames before the damage have been yielded.
+        VideoError: as `read_video`, or the stream has an invalid colour matrix.
     """
     video = read_video(video, operating_point)
     how = display if display is not None else video.display
@@ -55,13 +56,13 @@ def decode_frames(
         decoded = kept.of(wanted, decoded)
     with closing(decoded):
         for index, stored in decoded:
-            yield index, shown_picture(_in_colours(stored, video.path), how)
+            yield index, shown_picture(_to_bgr(stored, video.path), how)
 
 
 def _decoded(
     video: Video, operating_point: int, num_threads: int | None, wanted: Collection[int] | None
 ) -> Generator[Stored, None, None]:
-    """The frames that players show, or the wanted ones of them, by their index, as stored."""
+    """The frames that players show, or the wanted ones of them, with their indices, as stored."""
     index_of = None
     if video.presented is not None:
         index_of = {int(f): i for i, f in enumerate(video.presented)}
@@ -83,20 +84,21 @@ def _decoded(
     except BitstreamError:
         if num_threads == 1:
             raise
-        # Threads lose the frames in flight at the damage; one thread has none in flight.
+        # At the damage a decoder with several threads loses the frames in flight. Decode again
+        # with one thread, which has none in flight.
         for number, frame in enumerate(frames(1)):
             if number >= count:
                 yield from given(number, frame)
 
 
-def _in_colours(frame: Any, path: Path) -> NDArray[np.uint8]:
+def _to_bgr(frame: Any, path: Path) -> NDArray[np.uint8]:
     try:
         picture = np.asarray(frame.to_ndarray(format="bgr24"))
     except OSError as error:
         raise VideoError(
             f"{path}: pictures of format {frame.format.name} with colour matrix "
-            f"{int(frame.colorspace)} cannot be converted: {reason_of(error)}: name the right "
-            "colours with 'ffmpeg -i VIDEO -c copy -bsf:v av1_metadata=matrix_coefficients=1 NEW'"
+            f"{int(frame.colorspace)} cannot be converted: {reason_of(error)}: set the right "
+            "matrix with 'ffmpeg -i VIDEO -c copy -bsf:v av1_metadata=matrix_coefficients=1 NEW'"
         ) from error
-    # Where nothing is converted the samples are the frame's own, which others may overwrite.
+    # Without a conversion the array shares the memory of the frame, which may be overwritten.
     return picture.copy() if frame.format.name == "bgr24" else picture

@@ -1,7 +1,7 @@
-"""Pictures of two fields, one taken after the other, as camcorders made them: the first field's.
+"""Deinterlace pictures, whose two fields camcorders took one after the other.
 
-Lines of the other are interpolated by FFmpeg's bwdif, in conversions and for images alike, so that
-motion and pictures are of the same moment.
+The first field is kept, and FFmpeg's filter bwdif interpolates the lines of the second. The same
+filter is used in conversions and for images, so that motion and images show the same moment.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import av.filter
 from colmap_av1.errors import BitstreamError
 
 _NAME, _OPTIONS = "bwdif", "mode=send_frame:deint=interlaced"
-# ffmpeg's words for it; a picture of a single moment in between stays as it is.
+# The filter as ffmpeg spells it. Progressive pictures in between are not changed.
 DEINTERLACING = f"{_NAME}={_OPTIONS}"
 
 
 def deinterlaced(frames: Generator[Any, None, None]) -> Generator[Any, None, None]:
-    """Frames as they are stored (av.VideoFrame), each with the lines of its first field alone.
+    """Deinterlace stored frames (av.VideoFrame), keeping the first field of each.
 
     Raises:
-        BitstreamError: as `frames`; those before the damage have been given.
+        BitstreamError: as `frames`; the frames before the damage have been yielded.
     """
     graph = damage = None
     with closing(frames):
@@ -36,7 +36,7 @@ def deinterlaced(frames: Generator[Any, None, None]) -> Generator[Any, None, Non
         except BitstreamError as error:
             damage = error
     if graph is not None:
-        # It holds frames back, as their lines are taken from the next one, too.
+        # The filter delays frames because it also interpolates from the next one: flush it.
         graph.push(None)
         yield from _pulled(graph)
     if damage is not None:

@@ -1,4 +1,4 @@
-"""How players show the pictures of a video: cropped, turned, with pixels of any aspect."""
+"""How players show the pictures of a video: cropped, rotated, with non-square pixels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# How far a display matrix may be from a turn by quarters, in units of its longer column.
+# Largest difference of an entry of a display matrix, its columns scaled to length 1, from a
+# rotation by a multiple of 90 degrees.
 _QUARTER_TURN_TOLERANCE = 0.02
 
 Turn = tuple[tuple[int, int], tuple[int, int]]
@@ -18,13 +19,14 @@ _UPRIGHT: Turn = ((1, 0), (0, 1))
 
 @dataclass(frozen=True)
 class Display:
-    """How the pictures of a stream are shown. The bitstream holds them as they were stored.
+    """How players show the pictures of a stream, compared with how they are stored.
 
     Attributes:
-        crop: pixels that are cut off at the left, top, right and bottom of stored pictures.
-        turn: ((a, b), (c, d)), a quarter turn, a reflection, or both: what is stored x right
-            and y down of the middle is shown a x + b y right and c x + d y down of it.
-        pixel_aspect: width of a shown pixel over its height.
+        crop: pixels to crop at the left, top, right and bottom of stored pictures.
+        turn: ((a, b), (c, d)), a rotation by a multiple of 90 degrees, a reflection, or both: a
+            point stored at (x, y) from the centre, x right and y down, is shown at
+            (a x + b y, c x + d y).
+        pixel_aspect: width of a shown pixel divided by its height.
     """
 
     crop: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -33,29 +35,29 @@ class Display:
 
     @property
     def rotation(self) -> int:
-        """Degrees counter-clockwise of the turn, without its reflection."""
+        """The rotation in degrees counter-clockwise, without the reflection."""
         (a, b), _ = self.turn
         turned = (1, 0) if a else (0, 1)
         return {(1, 0): 0 if a > 0 else 180, (0, 1): 90 if b > 0 else 270}[turned]
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the turn has a reflection: along y, after the rotation."""
+        """Whether the pictures are also reflected, along y after the rotation."""
         (a, b), (c, d) = self.turn
         return a * d - b * c < 0
 
 
 def turn_of_matrix(matrix: Sequence[int]) -> Turn | None:
-    """The quarter turn or reflection that a container's display matrix asks for.
+    """The rotation and reflection that a container's display matrix describes.
 
     Args:
         matrix: the 9 values of ISO/IEC 14496-12, 8.3.2: a, b, u, c, d, v, x, y, w.
 
     Returns:
-        The turn as `Display` has it; None where it turns by anything but quarters.
+        The turn as in `Display`; None if the angle is not a multiple of 90 degrees.
     """
     a, b, c, d = matrix[0], matrix[1], matrix[3], matrix[4]
-    # The matrix holds what (1, 0) and (0, 1) become, and may scale as well.
+    # The matrix maps (1, 0) and (0, 1) to these columns, and may also scale.
     columns = np.array([[a, c], [b, d]], dtype=np.float64)
     lengths = np.hypot(columns[0], columns[1])
     if not lengths.all():
@@ -69,21 +71,21 @@ def turn_of_matrix(matrix: Sequence[int]) -> Turn | None:
 
 
 def turned_back(display: Display) -> Display:
-    """The turn from shown pictures back to stored ones; what was cropped stays cropped."""
+    """The inverse, from shown pictures back to stored ones; cropped pixels are not restored."""
     (a, b), (c, d) = display.turn
     aspect = display.pixel_aspect if a else 1 / display.pixel_aspect
     return Display(turn=((a, c), (b, d)), pixel_aspect=aspect)
 
 
 def shown_size(size: tuple[int, int], display: Display) -> tuple[int, int]:
-    """(width, height) in pixels of a stored picture of a size, as it is shown."""
+    """(width, height) in pixels at which stored pictures of a given size are shown."""
     left, top, right, bottom = display.crop
     width, height = size[0] - left - right, size[1] - top - bottom
     return (width, height) if display.turn[0][0] else (height, width)
 
 
 def shown_picture(stored: NDArray[np.uint8], display: Display) -> NDArray[np.uint8]:
-    """A stored picture, uint8 [height, width, 3], as it is shown."""
+    """Crop and rotate a stored picture, uint8 [height, width, 3], as players show it."""
     left, top, right, bottom = display.crop
     height, width = stored.shape[:2]
     picture = stored[top : height - bottom, left : width - right]
@@ -100,7 +102,7 @@ def shown_picture(stored: NDArray[np.uint8], display: Display) -> NDArray[np.uin
 def shown_points(
     stored: NDArray[np.float32], size: tuple[int, int], display: Display
 ) -> NDArray[np.float32]:
-    """Where points of stored pictures are shown.
+    """Map points of stored pictures to the pictures as shown.
 
     Args:
         stored: float32 [n, 2] (x, y) in pixels, origin at the stored picture's top-left corner.
@@ -108,14 +110,14 @@ def shown_points(
         display: how they are shown.
 
     Returns:
-        float32 [n, 2], origin at the shown picture's top-left corner; what was cut off lies
-        beyond the picture. The same object where pictures are shown as they are stored.
+        float32 [n, 2], origin at the shown picture's top-left corner; points that are cropped
+        lie outside the picture. The same array if pictures are shown as they are stored.
     """
     if display.turn == _UPRIGHT and not any(display.crop):
         return stored
     turn = np.array(display.turn, dtype=np.float32)
     left, top, _, _ = display.crop
     points = (stored - np.array([left, top], dtype=np.float32)) @ turn.T
-    # What turned towards negative coordinates is counted from the other edge.
+    # Coordinates along a reversed axis are measured from the opposite edge.
     points += np.where(turn.sum(axis=1) < 0, shown_size(size, display), 0)
     return np.asarray(points, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Conversion of any video to an AV1 stream with good motion, by ffmpeg."""
+"""Convert any video to an AV1 stream with good motion vectors, with ffmpeg."""
 
 from __future__ import annotations
 
@@ -45,22 +45,23 @@ from colmap_av1.video.stored_frames import count_frames
 from colmap_av1.video.unchanged import unchanged
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
-# Marks a stream with what it was made of and with, so that it is not taken for another.
+# Begins the comment tag that records the source and settings of a stream, by which a kept stream
+# is recognized.
 _MARK = "colmap-av1"
-# These hold the mark.
+# Containers that store the tag.
 _KEPT_FORMATS = (".mp4", ".mkv", ".webm")
 _NEW_SIZE = re.compile(r"Reconfiguring filter graph.* changed to .*, (\d+)x(\d+)")
 
 
 @dataclass(frozen=True)
 class EncodeReport:
-    """A conversion.
+    """Result of a conversion.
 
     Attributes:
         output: the AV1 stream.
         encoder: ffmpeg's name of the encoder.
-        num_frames: frames of the stream, as many as the video has.
-        reused: the stream was there already.
+        num_frames: number of frames of the stream; the video has as many.
+        reused: whether an existing stream was used.
     """
 
     output: Path
@@ -79,29 +80,30 @@ def encode(
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
-    """Convert a video to AV1 with backward references only, and one intra frame.
+    """Convert a video to AV1 with backward references only and a single intra frame.
 
-    Every frame of the video becomes one of the stream, none is dropped or doubled, and time
-    stamps are kept. Of pictures of two fields the first is taken. Pictures are turned as players
-    turn them, and downscaled where the options say so; sound is left out. Where the video was
-    taken, and how it was held, goes over to streams that can hold it, else a warning says so. The
-    stream appears under its name only when whole. Of a damaged video the frames before the damage
-    are converted, with a warning.
+    Every frame of the video becomes one frame of the stream, none is dropped or duplicated, and
+    time stamps are kept. Interlaced pictures are deinterlaced, which keeps their first field.
+    Pictures are rotated as players rotate them, and downscaled if the options ask for it. Sound is
+    dropped. GPS positions and the direction of gravity are copied if the output format can hold
+    them; otherwise a warning is given. The output appears under its name only when it is complete.
+    A damaged video is converted up to the damage, with a warning.
 
     Args:
         video: a video that ffmpeg decodes.
-        output: the stream; its extension .mp4, .mkv, .webm or .ivf says the container.
-        overwrite: replace an output that exists.
-        strict: refuse a damaged video.
-        telemetry: take over where the video was taken.
-        options: which encoder and how.
-        progress: called with the stage "encoding", the frames done, and of how many where known.
+        output: the stream; its extension .mp4, .mkv, .webm or .ivf selects the container.
+        overwrite: replace an existing output.
+        strict: raise an error for a damaged video.
+        telemetry: copy GPS positions and the direction of gravity.
+        options: the encoder and its settings.
+        progress: called with the stage "encoding", the number of frames done, and the total if
+            it is known.
 
     Raises:
         VideoError: the video is missing or cannot be decoded.
-        BitstreamError: the video is damaged, and must not be.
+        BitstreamError: the video is damaged and `strict` is set.
         EncodeError: no encoder works, or the output cannot be written.
-        OptionError: an option has a value that cannot work, or the output exists.
+        OptionError: an option has an invalid value, or the output exists.
     """
     options = options if options is not None else EncodeOptions()
     progress = progress if progress is not None else no_progress
@@ -110,25 +112,25 @@ def encode(
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
     check_new_file(output, [path], overwrite=overwrite)
     if not output.parent.is_dir():
-        raise EncodeError(f"{output}: the folder does not exist: make it first")
+        raise EncodeError(f"{output}: the folder does not exist: create it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
     remove_leftovers(output.parent, output.name)
     file = with_counted_packets(read_video(video))
-    place = read_positions(file) if telemetry else None
+    positions = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
-    beside, carried = carrying(file, place, output_format) if telemetry else ([], [])
+    second_input, copied = carrying(file, positions, output_format) if telemetry else ([], [])
     name, ffmpeg = find_encoder(options)
     encoder = ENCODERS[name]
     quality, speed = settings(encoder, options)
     before = [ffmpeg, *TALK, "-nostdin", "-y", *encoder.before_input]
     if "mov" in file.container:
-        # Frames that an edit list hides are frames all the same, and good ones.
+        # Frames that an edit list hides are converted too, because motion runs through them.
         before += ["-ignore_editlist", "1"]
     # fmt: off
-    how = [
+    arguments = [
         "-i", f"file:{path}",
-        *beside,
+        *second_input,
         "-map", f"0:{file.index}",
         "-vf", ",".join([*_filters(file, options), encoder.upload]),
         "-fps_mode", "passthrough",
@@ -138,7 +140,7 @@ def encode(
         *encoder.words(quality, speed),
         "-progress", "pipe:1",
         "-f", output_format,
-        *carried,
+        *copied,
     ]
     # fmt: on
     mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
@@ -148,15 +150,15 @@ def encode(
     def convert(partial: Path, num_frames: int | None = None) -> int:
         total = num_frames or file.num_packets
         progress("encoding", 0, total)
-        command = [*before, *how]
+        command = [*before, *arguments]
         if num_frames is not None:
             command += ["-frames:v", str(num_frames)]
-        words = _mark(mark if num_frames is None else {**mark, "readable": num_frames})
-        command += ["-metadata", f"comment={words}", f"file:{partial}"]
+        comment = _mark(mark if num_frames is None else {**mark, "readable": num_frames})
+        command += ["-metadata", f"comment={comment}", f"file:{partial}"]
         count = _run(command, file, lambda done: progress("encoding", done, total))
         if count == 0:
             raise VideoError(
-                f"{path}: no frame can be decoded, it is damaged: give another copy of it"
+                f"{path}: no frame can be decoded, the file is damaged: give another copy"
             )
         _check_stream(partial, count)
         return count
@@ -169,7 +171,7 @@ def encode(
                 count = convert(partial, readable)
     except OSError as error:
         raise EncodeError(cannot_write(output, error)) from error
-    _warn(loss_of(file, place, output))
+    _warn(loss_of(file, positions, output))
     return EncodeReport(output, encoder.ffmpeg_name, count)
 
 
@@ -181,38 +183,38 @@ def stream_of(
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
-    """The AV1 stream of a video that is not AV1: the one kept from before, or a new one.
+    """The AV1 stream of a video in another codec: the stream kept by an earlier run, or a new one.
 
-    It is used again while it is newer than the video, whole, and made of a file of the video's
-    size with the settings that `options` ask for.
+    A kept stream is reused if it is complete, newer than the video, and made from a file of the
+    same size with the settings that `options` ask for.
 
     Args:
         video: a video that ffmpeg decodes.
-        keep_stream: where the stream is kept; its extension says the container.
-        strict: refuse a damaged video.
-        options: which encoder and how.
+        keep_stream: file in which the stream is kept; its extension selects the container.
+        strict: raise an error for a damaged video.
+        options: the encoder and its settings.
         progress: as in `encode`.
 
     Raises:
         VideoError: the video is missing or cannot be decoded.
-        BitstreamError: the video is damaged, and must not be.
+        BitstreamError: the video is damaged and `strict` is set.
         EncodeError: no encoder works, or the stream cannot be written.
-        OptionError: an option has a value that cannot work, or `keep_stream` names a file
-            that is no kept stream.
+        OptionError: an option has an invalid value, or `keep_stream` names an existing file
+            that is not a kept stream.
     """
     options = options if options is not None else EncodeOptions()
     path = Path(video)
     output = Path(keep_stream)
     if output.suffix.lower() not in _KEPT_FORMATS:
-        raise OptionError(f"{output}: give a stream that ends in {', '.join(_KEPT_FORMATS)}")
+        raise OptionError(f"{output}: give a file that ends in {', '.join(_KEPT_FORMATS)}")
     file = with_counted_packets(read_file(video))
     if output.exists():
         if not may_read(output):
-            raise OptionError(f"{output}: no permission to read it: change that")
+            raise OptionError(f"{output}: no permission to read it: change its permissions")
         mark = _mark_of(output)
         if mark is None:
             raise OptionError(
-                f"{output}: exists and is no stream that was kept of {path.name}: give another "
+                f"{output}: exists and is not a stream kept for {path.name}: give another "
                 "--keep_stream, or remove it"
             )
         if _fits(mark, path, options) and output.stat().st_mtime_ns >= path.stat().st_mtime_ns:
@@ -220,19 +222,19 @@ def stream_of(
             readable = int(mark.get("readable", 0))
             if kept and not (strict and readable):
                 if readable:
-                    _warn_of_damage(file, readable, f"{output} was made of what is before")
+                    _warn_of_damage(file, readable, f"{output} ends there")
                 return EncodeReport(output, ENCODERS[mark["encoder"]].ffmpeg_name, kept, True)
     if not os.access(output.resolve().parent, os.W_OK | os.X_OK):
         raise EncodeError(
             f"{output.resolve().parent}: the AV1 stream of {path.name} cannot be written there: "
-            "say where with --keep_stream"
+            "give another place with --keep_stream"
         )
     how = {"overwrite": True, "strict": strict, "telemetry": False}
     return encode(file, output, **how, options=options, progress=progress)
 
 
 def _filters(video: Video, options: EncodeOptions) -> list[str]:
-    # Scaling would mix the fields, so it comes last.
+    # Scaling comes last because it would mix the fields of an interlaced picture.
     return [*([DEINTERLACING] if video.is_interlaced else []), *scaling(options)]
 
 
@@ -240,7 +242,7 @@ def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]
     """Run ffmpeg on a video and return the number of frames it wrote."""
     size = video.stored_size
     count = dropped = doubled = 0
-    with tempfile.TemporaryFile() as words, _process(command, words) as process:
+    with tempfile.TemporaryFile() as log_file, _process(command, log_file) as process:
         for line in process.stdout or ():
             key, _, value = line.strip().partition("=")
             if key == "frame":
@@ -251,41 +253,41 @@ def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]
             elif key == "dup_frames":
                 doubled = int(value)
         status = process.wait()
-        words.seek(0)
-        said = words.read().decode(errors="replace")
+        log_file.seek(0)
+        log = log_file.read().decode(errors="replace")
     if status != 0:
-        reason = reason_of(said)
-        if "No space left" in said:
+        reason = reason_of(log)
+        if "No space left" in log:
             raise EncodeError(
-                f"{video}: the disk is full: free some space, or say where the stream goes"
+                f"{video}: the disk is full: free some space, or write the stream elsewhere"
             )
-        if count == 0 and ("Invalid data" in said or "does not contain any stream" in said):
-            raise VideoError(f"{video}: cannot be decoded: {reason}: give another copy of it")
+        if count == 0 and ("Invalid data" in log or "does not contain any stream" in log):
+            raise VideoError(f"{video}: cannot be decoded: {reason}: give another copy")
         raise EncodeError(
             f"{video}: the encoder failed after {count} frames ({reason}): try another --encoder"
         )
-    sizes = {(int(width), int(height)) for width, height in _NEW_SIZE.findall(said)} - {size}
+    sizes = {(int(width), int(height)) for width, height in _NEW_SIZE.findall(log)} - {size}
     if sizes:
         raise VideoError(
-            f"{video}: its pictures change their size from {size[0]}x{size[1]} to "
+            f"{video}: the picture size changes from {size[0]}x{size[1]} to "
             f"{' and '.join(f'{w}x{h}' for w, h in sorted(sizes))}: convert it to one size first"
         )
     if dropped or doubled:
         raise EncodeError(
-            f"{video}: ffmpeg dropped {dropped} and doubled {doubled} frames, so frames of the "
-            "stream would not be those of the video: convert it with another program first"
+            f"{video}: ffmpeg dropped {dropped} and duplicated {doubled} frames, so the frames of "
+            "the stream would not match the video: convert it with another program first"
         )
     return count
 
 
 @contextmanager
-def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen[str]]:
-    """A running ffmpeg that does not outlive what waits for it."""
+def _process(command: Sequence[str], log_file: object) -> Iterator[subprocess.Popen[str]]:
+    """Run ffmpeg; it is killed if the body ends before it does."""
     process = subprocess.Popen(
         bound(command),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
-        stderr=words,  # type: ignore[call-overload]
+        stderr=log_file,  # type: ignore[call-overload]
         text=True,
     )
     try:
@@ -299,9 +301,9 @@ def _process(command: Sequence[str], words: object) -> Iterator[subprocess.Popen
 
 
 def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
-    """How many of the `count` frames that ffmpeg wrote readers of pictures see as well.
+    """Number of the `count` frames written by ffmpeg that PyAV decodes, too.
 
-    ffmpeg goes on after damage, and the frames it leaves out shift those that follow.
+    ffmpeg continues after damage, and the frames that it skips shift all later ones.
     """
     if count == video.num_packets:
         return count
@@ -310,11 +312,11 @@ def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
         return count
     if damage is None or readable > count:
         raise EncodeError(
-            f"{video}: ffmpeg decodes {count} frames of it, PyAV {readable}: frames of the stream "
-            "would not be those of the video: convert it with another program first"
+            f"{video}: ffmpeg decodes {count} frames and PyAV {readable}, so the frames of the "
+            "stream would not match the video: convert it with another program first"
         )
     if readable == 0:
-        raise VideoError(f"{video}: no frame can be decoded: {damage}: give another copy of it")
+        raise VideoError(f"{video}: no frame can be decoded: {damage}: give another copy")
     if strict:
         raise BitstreamError(f"{video}: damaged after {readable} frames: {damage}")
     _warn_of_damage(video, readable, damage)
@@ -328,21 +330,21 @@ def _warn(text: str | None) -> None:
 
 def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:
     warnings.warn(
-        f"{video}: damaged after {readable} of {video.num_packets} frames, which are used: "
+        f"{video}: damaged after {readable} of {video.num_packets} frames, only these are used: "
         f"{reason}",
         stacklevel=3,
     )
 
 
 def _check_stream(stream: Path, count: int) -> None:
-    """Refuse a stream that has not as many frames as ffmpeg says it wrote."""
+    """Raise an error if a stream does not have the number of frames that ffmpeg reported."""
     found = _count_packets(stream)
     if found != count:
-        raise EncodeError(f"the encoder wrote {found} of {count} frames: give another --encoder")
+        raise EncodeError(f"the encoder wrote {found} of {count} frames: try another --encoder")
 
 
 def _count_packets(stream: Path) -> int:
-    """Frames of a stream that was made here; 0 where it is damaged or no AV1."""
+    """Number of frames of a stream that `encode` wrote; 0 if it is damaged or not AV1."""
     try:
         with open_stream(stream) as opened:
             return sum(1 for _ in opened.packets())
@@ -359,7 +361,7 @@ def _mark(facts: Mapping[str, object]) -> str:
 
 
 def _mark_of(stream: Path) -> dict[str, str] | None:
-    """The record of how a kept stream was made; None where there is none."""
+    """The source and settings recorded in a kept stream; None if it has no record."""
     try:
         with av.open(os.path.abspath(stream)) as opened:
             tags = {key.lower(): value for key, value in opened.metadata.items()}
@@ -372,7 +374,7 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
 
 
 def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
-    """Whether a kept stream was made from the video with the present options."""
+    """Whether a kept stream was made from the video with these options."""
     if mark.get("encoder") not in ENCODERS or mark.get("source") != str(_size(video)):
         return False
     encoder = None if options.encoder == "auto" else options.encoder

@@ -1,4 +1,4 @@
-"""AV1 encoders of ffmpeg, their options, and which of them works here."""
+"""ffmpeg's AV1 encoders, their options, and which of them work on this machine."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from colmap_av1.errors import EncodeError
 from colmap_av1.options import EncodeOptions
 from colmap_av1.options.video import NUM_QUALITIES
 
-# Whether an encoder works is found out by encoding so many frames.
+# An encoder works if it can encode this many frames.
 _PROBE_FRAMES = 8
 _PROBE_TIMEOUT = 30.0
+# libaom's realtime mode starts at this speed.
 _LIBAOM_REALTIME = 5
-# ffmpeg's own option goes no further, libaom does.
+# ffmpeg's -cpu-used does not accept higher speeds, libaom does.
 _FFMPEG_FASTEST = 8
-# Beyond, a fifth of the time would go into bringing the costs of symbols up to date; streams are of
-# the same size without.
+# At higher speeds a fifth of the time would be spent on updating the costs of symbols. Without the
+# updates streams have the same size.
 _LIBAOM_FASTER = "mode-cost-upd-freq=3:coeff-cost-upd-freq=3:mv-cost-upd-freq=3"
-# A frame further than any video is long: the first is the only intra frame.
+# In frames; longer than most videos, so that the first frame is the only intra frame.
 KEY_FRAME_DISTANCE = "9999"
-# So that every message says how grave it is.
+# Log options; `level` starts every message with its severity.
 TALK = ("-hide_banner", "-nostats", "-v", "level+info")
 _MESSAGE_SOURCE = re.compile(r"^(\[[^\]]+\] )+")
-_GRAVE = re.compile(r"\[(error|fatal|panic)\]")
+_SEVERE = re.compile(r"\[(error|fatal|panic)\]")
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,13 @@ class _Encoder:
     """An encoder of ffmpeg.
 
     Attributes:
-        ffmpeg_name: ffmpeg's name of it.
-        quality: default on the scale of EncodeOptions.
-        speed: default on the encoder's own scale.
-        quick_speed: that of quick conversions.
-        words: ffmpeg's words for a quality and a speed.
-        before_input: words before the input.
-        upload: filter that hands the pictures to the device, and the pixel format.
+        ffmpeg_name: its name in ffmpeg.
+        quality: default quality on the scale of EncodeOptions.
+        speed: default speed on the encoder's own scale.
+        quick_speed: default speed of quick conversions.
+        words: ffmpeg's arguments for a quality and a speed.
+        before_input: arguments that precede the input.
+        upload: filters that set the pixel format and send pictures to the device.
     """
 
     ffmpeg_name: str
@@ -57,7 +58,7 @@ class _Encoder:
 
 
 def _nvenc(quality: int, speed: int) -> list[str]:
-    # The published method's flags.
+    # These are the flags of the published method.
     rate = ["-rc", "constqp", "-qp", str(_q_index(quality))]
     return ["-tune", "hq", "-preset", f"p{speed}", *rate, "-b_ref_mode", "0", "-bf", "0"]
 
@@ -87,7 +88,6 @@ def _vaapi(quality: int, speed: int) -> list[str]:
 
 
 def _libaom(quality: int, speed: int) -> list[str]:
-    # Its realtime mode starts at speed 5.
     usage = "realtime" if speed >= _LIBAOM_REALTIME else "good"
     how = ["-usage", usage, "-cpu-used", str(min(speed, _FFMPEG_FASTEST)), "-lag-in-frames", "0"]
     how += ["-row-mt", "1", "-crf", str(quality), "-b:v", "0"]
@@ -97,12 +97,12 @@ def _libaom(quality: int, speed: int) -> list[str]:
 
 
 def _svt(quality: int, speed: int) -> list[str]:
-    # Low delay, and without layers: frames refer to those just before them.
+    # Low delay without hierarchical layers: frames refer to the frames just before them.
     how = "pred-struct=1:hierarchical-levels=0"
     return ["-preset", str(speed), "-crf", str(quality), "-svtav1-params", how]
 
 
-# In the order in which they are tried. ffmpeg has no AV1 encoder of Apple's VideoToolbox.
+# In the order in which they are tried. ffmpeg has no AV1 encoder for Apple's VideoToolbox.
 ENCODERS = {
     "nvenc": _Encoder("av1_nvenc", 20, 1, 1, _nvenc),
     "qsv": _Encoder("av1_qsv", 20, 7, 7, _qsv, upload="format=nv12"),
@@ -116,25 +116,25 @@ ENCODERS = {
         before_input=("-vaapi_device", "/dev/dri/renderD128"),
         upload="format=nv12,hwupload",
     ),
-    # Speed 7 takes a third to a half of the time of 6 for models that are nearly as good; 8 saves
-    # little more and gives up to 8 % fewer points. What else was tried: "Encoders" in
-    # examples/benchmarks/README.md.
+    # Speed 7 takes a third to a half of the time of speed 6 for models that are nearly as good.
+    # Speed 8 saves little more and gives up to 8 % fewer points. Other settings are compared in
+    # examples/benchmarks/README.md, "Encoders".
     "libaom": _Encoder("libaom-av1", 20, 7, 10, _libaom),
     "svt": _Encoder("libsvtav1", 20, 8, 8, _svt),
 }
 
 
 def find_encoder(options: EncodeOptions) -> tuple[str, str]:
-    """Find an encoder that works, by letting it encode a few frames.
+    """Find an encoder that works by encoding a few frames.
 
-    Hardware encoders are tried first, unless the options name one. The ffmpeg of
-    imageio-ffmpeg ($IMAGEIO_FFMPEG_EXE where that is set) is preferred to the one on the PATH.
+    Hardware encoders are tried first, unless the options name an encoder. The ffmpeg of
+    imageio-ffmpeg ($IMAGEIO_FFMPEG_EXE if set) is preferred to the one on PATH.
 
     Returns:
-        The encoder's name in EncodeOptions, and the ffmpeg program that has it.
+        The encoder's name in EncodeOptions, and the path of the ffmpeg program that has it.
 
     Raises:
-        EncodeError: none works.
+        EncodeError: no encoder works.
     """
     names = list(ENCODERS) if options.encoder == "auto" else [str(options.encoder)]
     programs = _ffmpeg_programs()
@@ -142,7 +142,8 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
     for name in names:
         quality, speed = settings(ENCODERS[name], options)
         for program in programs:
-            # To start one that is not linked as a whole takes several times as long as to probe.
+            # A dynamically linked ffmpeg takes several times as long to start as a probe takes,
+            # so ask it once which encoders it has.
             if program != programs[0] and ENCODERS[name].ffmpeg_name not in _encoders_of(program):
                 reasons.append(f"{name}: {program} does not have it")
                 continue
@@ -163,20 +164,20 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
 
 
 def _q_index(quality: int) -> int:
-    """Quantiser index (0 to 255) of a quality; libaom's own scale is nearly linear, too."""
+    """Quantizer index (0 to 255) of a quality. libaom's own scale is nearly linear, too."""
     return round(quality * 255 / (NUM_QUALITIES - 1))
 
 
 def settings(encoder: _Encoder, options: EncodeOptions) -> tuple[int, int]:
-    """Quality and speed asked for, or the encoder's own."""
+    """Quality and speed from the options, or the encoder's defaults."""
     quality = encoder.quality if options.quality is None else options.quality
-    usual = encoder.quick_speed if options.effort == "quick" else encoder.speed
-    return quality, usual if options.speed is None else options.speed
+    default_speed = encoder.quick_speed if options.effort == "quick" else encoder.speed
+    return quality, default_speed if options.speed is None else options.speed
 
 
 def _ffmpeg_programs() -> list[str]:
     programs = []
-    with contextlib.suppress(RuntimeError):  # it has none for this system
+    with contextlib.suppress(RuntimeError):  # the package has no binary for this system
         programs.append(imageio_ffmpeg.get_ffmpeg_exe())
     on_path = shutil.which("ffmpeg")
     if on_path is not None and on_path not in programs:
@@ -186,7 +187,7 @@ def _ffmpeg_programs() -> list[str]:
 
 @functools.cache
 def _encoders_of(program: str) -> str:
-    """What an ffmpeg says of its encoders."""
+    """The list of encoders that an ffmpeg program prints."""
     command = [program, "-hide_banner", "-encoders"]
     try:
         run = subprocess.run(
@@ -198,7 +199,7 @@ def _encoders_of(program: str) -> str:
 
 
 def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:
-    """Why an encoder does not work; None where it does."""
+    """Try an encoder. Return why it does not work, or None if it works."""
     # fmt: off
     command = [
         program,
@@ -228,9 +229,9 @@ def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | N
 
 
 def reason_of(text: str) -> str:
-    """What ffmpeg gives as the reason of a failure, on a line."""
+    """The reason of a failure in ffmpeg's log, on one line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    # Later lines say that the conversion failed, the first says why. Where ffmpeg itself has
-    # not come to speak, whoever stands in its place has.
-    grave = [line for line in lines if _GRAVE.search(line)] or lines
-    return _MESSAGE_SOURCE.sub("", grave[0]).rstrip(".") if grave else "it ended without a message"
+    # The first error gives the reason; later ones only say that the conversion failed. If ffmpeg
+    # did not start, the lines come from another program, such as the loader, without a severity.
+    errors = [line for line in lines if _SEVERE.search(line)] or lines
+    return _MESSAGE_SOURCE.sub("", errors[0]).rstrip(".") if errors else "it gave no message"

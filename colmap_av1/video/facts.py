@@ -1,4 +1,4 @@
-"""A video: facts of its file and how players show its pictures, read once and passed on."""
+"""A video: facts about its file and how players show its pictures, read once and passed on."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ from colmap_av1.video.metadata.spherical import projection_of
 from colmap_av1.video.stored_frames import decode_stream
 from colmap_av1.video.unchanged import file_state
 
-# FFmpeg names it in its summary of a file; PyAV gives no other access to it.
+# FFmpeg prints this line in its summary of a file; PyAV gives no other access to the cropping.
 _CROPPING = re.compile(r"^ +Frame Cropping: (\d+)/(\d+)/(\d+)/(\d+)$", re.MULTILINE)
 
 _File = TypeVar("_File", bound=VideoFile)
 
-# Of several, that an edit list shows: fewer make no video.
-_FEWEST_SHOWN = 2
+# An edit list that shows fewer frames than this is ignored, unless the video has no more.
+_MIN_SHOWN = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Video(VideoFile):
-    """A video that can be decoded: facts of its file, and how players show its pictures.
+    """A video that can be decoded: facts about its file and how players show its pictures.
 
     Attributes:
-        picture_size: (width, height) in pixels of the pictures that `decode_frames` gives.
+        picture_size: (width, height) in pixels of the pictures that `decode_frames` yields.
         display: how players show the stored pictures.
-        presented: int32 indices, ascending, of the frames that players show among all shown
-            frames of the stream, where an edit list hides some, as of a trimmed clip; None: all
-            of them. The others are frames all the same: motion runs through them. A frame that
-            an edit list shows several times counts once.
-        doubtful_times: what of its container's times cannot be, and is left out, in words; None:
-            nothing.
-        is_interlaced: its pictures are of two fields, one taken after the other.
-        projection: how pictures of all directions lie in the plane, as `projection_of` numbers it;
-            None: these are of a plane.
+        presented: int32 [n] ascending indices, among the frames that the bitstream shows, of those
+            that players show, if an edit list hides some, as in a trimmed clip; None: players
+            show all. Motion also runs through the hidden frames. A frame that an edit list shows
+            several times counts once.
+        doubtful_times: description of invalid times in the container, which are ignored; None if
+            the times are valid.
+        is_interlaced: whether its pictures have two fields, one taken after the other.
+        projection: projection of a spherical video, a number as in `projection_of`; None for
+            other videos.
     """
 
     picture_size: tuple[int, int]
@@ -67,16 +67,16 @@ class Video(VideoFile):
 
 
 def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video:
-    """Open a video of any codec and decode its first picture; the same object where it is one.
+    """Open a video of any codec and decode its first picture; a `Video` is returned unchanged.
 
     Args:
         video: a file that FFmpeg decodes.
-        operating_point: operating point of a scalable stream, which picture sizes depend on.
+        operating_point: operating point of a scalable stream, on which the picture size depends.
 
     Raises:
         BitstreamError: no frame can be decoded.
-        VideoError: the file is missing, empty, not a video, holds no video stream, or its
-            pictures are turned by anything but quarters.
+        VideoError: the file is missing, empty, not a video, has no video stream, or its display
+            rotation is not a multiple of 90 degrees.
     """
     if isinstance(video, Video):
         return video
@@ -93,10 +93,10 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
             frame = next(frames, None)
     if frame is None:
         raise BitstreamError(
-            f"{path}: no frame can be decoded, it is damaged: give another copy of it"
+            f"{path}: no frame can be decoded, the file is damaged: give another copy"
         )
     display = _display(path, frame, crop, aspect)
-    presented, doubt = _believed_edits(file, num_entries)
+    presented, doubt = _checked_edits(file, num_entries)
     return Video(
         **vars(file),
         picture_size=shown_size((frame.width, frame.height), display),
@@ -111,51 +111,49 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
 def _display(
     path: Path, frame: Any, crop: tuple[int, int, int, int], stored_aspect: float
 ) -> Display:
-    """How a decoded frame is shown: crop and pixel aspect come from its container."""
+    """How a decoded frame is shown; `crop` and `stored_aspect` come from its container."""
     matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
     turn = Display().turn if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
     if turn is None:
         raise VideoError(
-            f"{path}: players turn its pictures by an angle that is no multiple of 90 degrees: "
-            "take the turn out with 'ffmpeg -display_rotation 0 -i ... -c copy'"
+            f"{path}: its display rotation is not a multiple of 90 degrees: "
+            "remove it with 'ffmpeg -display_rotation 0 -i ... -c copy'"
         )
     left, top, right, bottom = crop
     if left + right >= frame.width or top + bottom >= frame.height:
-        raise VideoError(
-            f"{path}: its container cuts off the whole picture: give another copy of it"
-        )
+        raise VideoError(f"{path}: its container crops away the whole picture: give another copy")
     return Display(crop, turn, stored_aspect if turn[0][0] else 1 / stored_aspect)
 
 
-def _believed_edits(
+def _checked_edits(
     file: VideoFile, num_entries: int
 ) -> tuple[NDArray[np.int32] | None, str | None]:
-    """`Video.presented` and `Video.doubtful_times` of a file that lists a number of samples."""
+    """`Video.presented` and `Video.doubtful_times` of a file that lists `num_entries` samples."""
     if "mov" not in file.container:
         return None, None
     if not file.is_timed:
         return None, (
-            "the container's time scale is 0, or cannot be: its times and its edit list are left "
-            "out, all frames are taken, and the frame rate is unknown"
+            "the container's time scale is invalid: its times and its edit list are ignored, all "
+            "frames are used, and the frame rate is unknown"
         )
     presented = _presented_frames(file.path, num_entries)
-    if presented is None or len(presented) >= _FEWEST_SHOWN or num_entries < _FEWEST_SHOWN:
+    if presented is None or len(presented) >= _MIN_SHOWN or num_entries < _MIN_SHOWN:
         return presented, None
     return None, (
-        f"the container's edit list shows {len(presented)} of {num_entries} frames, which is no "
-        "video: it is left out, all frames are taken"
+        f"the container's edit list shows only {len(presented)} of {num_entries} frames: it is "
+        "ignored, and all frames are used"
     )
 
 
 def _presented_frames(path: Path, num_entries: int) -> NDArray[np.int32] | None:
-    """`Video.presented` of a file whose container lists a number of samples, edits aside."""
+    """`Video.presented` of a file whose container lists `num_entries` samples without edits."""
     with open_container(path, apply_edits=True) as edited:
         entries = list(find_video_stream(edited, path).index_entries)
-        # Entries lie in the container's memory: they are read while it is open.
+        # The entries lie in the container's memory and must be read while it is open.
         shown = {entry.pos for entry in entries if not entry.is_discard}
     if len(shown) == num_entries or not entries:
         return None
-    # Where pictures are coded out of order, packets come in another order than pictures.
+    # Packets come in coding order, which can differ from the order of the pictures.
     packets: list[tuple[int, bool]] = []
     with open_container(path) as container, contextlib.suppress(av.error.FFmpegError, OSError):
         demuxed = container.demux(find_video_stream(container, path))
@@ -167,13 +165,13 @@ def _presented_frames(path: Path, num_entries: int) -> NDArray[np.int32] | None:
 
 
 def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
-    """Presentation times of the packets of an AV1 video, which show a frame each.
+    """Presentation times of the packets of an AV1 video, each of which shows one frame.
 
-    The whole file is read for them, so they are no part of `Video`: few ask for them.
+    They are not part of `Video` because few callers need them and the whole file must be read.
 
     Returns:
-        float64 [num_packets] seconds, strictly ascending; None where the container gives none,
-        or not in that order.
+        float64 [num_packets] seconds, strictly ascending; None if the container gives no times
+        or times that do not ascend.
 
     Raises:
         VideoError: as `open_stream`.
@@ -189,10 +187,10 @@ def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
 
 
 def picture_times(video: Video) -> NDArray[np.float64] | None:
-    """Presentation times of all pictures of a video of any codec, those hidden by edits, too.
+    """Presentation times of all pictures of a video of any codec, also of those hidden by edits.
 
     Returns:
-        float64 [n] seconds, ascending, up to a damage; None where the container gives none.
+        float64 [n] seconds, ascending, up to the first damage; None if the container gives none.
 
     Raises:
         VideoError: the file cannot be opened.
@@ -207,12 +205,12 @@ def picture_times(video: Video) -> NDArray[np.float64] | None:
                 return None
             if packet.size:
                 times.append(float(packet.pts * packet.time_base))
-    # Where pictures are coded out of order, packets come in another order than pictures.
+    # Packets come in coding order, which can differ from the order of the pictures.
     return np.sort(np.array(times)) if times else None
 
 
 def with_counted_packets(file: _File) -> _File:
-    """The same facts, with the packets counted where the container does not say their number.
+    """The same facts, with the packets counted if the container does not give their number.
 
     Raises:
         VideoError: as `decode_frames`.
@@ -227,7 +225,9 @@ def with_counted_packets(file: _File) -> _File:
 
 
 def count_shown(video: Video) -> int:
-    """Number of frames that players show, by the container: cheap, but not of a damaged stream.
+    """Number of frames that players show, according to the container.
+
+    This is fast, but the number is too large for a damaged stream.
 
     Raises:
         VideoError: as `decode_frames`.
@@ -238,7 +238,7 @@ def count_shown(video: Video) -> int:
 
 
 def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, int]:
-    """Pixels that the container cuts off at the left, top, right and bottom."""
+    """Pixels that the container crops at the left, top, right and bottom."""
     if not {"mov", "matroska"} & set(container.format.name.split(",")):
         return (0, 0, 0, 0)
     level = av.logging.get_level()
@@ -249,7 +249,7 @@ def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, i
         av.logging.set_level(level)
     of_stream = re.split(r"^  Stream #0:(\d+)", summary, flags=re.MULTILINE)
     for number, text in zip(of_stream[1::2], of_stream[2::2], strict=True):
-        # The container's side data comes after its metadata, which may say anything.
+        # The side data follows the metadata, which may contain any text and must be skipped.
         _, _, side_data = text.rpartition("\n    Side data:\n")
         found = _CROPPING.search(side_data)
         if int(number) == stream_index and found:

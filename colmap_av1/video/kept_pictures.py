@@ -1,7 +1,7 @@
-"""Pictures of some frames of a video, decoded once and kept in a file as long as they are needed.
+"""Pictures of some frames of a video, decoded once and kept in a file while they are needed.
 
-They are kept as they are stored, without compression: writing one and reading it again takes less
-time than decoding it, and not much more of the disk than the image that is made of it.
+They are kept uncompressed. Writing and reading a picture takes less time than decoding it, and the
+file is not much larger than the images that are made from it.
 """
 
 from __future__ import annotations
@@ -15,41 +15,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Index of a frame, and the av.VideoFrame as it is stored.
+# Index of a frame, and its av.VideoFrame as stored in the video.
 Stored = tuple[int, Any]
 
 
 class KeptPictures:
-    """Keeps the pictures that were decoded last.
+    """Keeps the pictures of the frames that were decoded last.
 
     Args:
-        file: where; its folder is there, and removed by whoever made it.
+        file: where to keep them; its folder exists and is removed by the caller.
     """
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._frames: list[int] = []
-        # The last of them, which has what a file of samples lacks, such as their colour space.
+        # The last frame has the properties that the file lacks, such as the colour space.
         self._last: Any = None
-        # Of each of its planes, the bytes of all lines and of one.
+        # For each plane, the size in bytes of the plane and of one line.
         self._sizes: list[tuple[int, int]] = []
 
     def of(
         self, wanted: Collection[int], decoded: Generator[Stored, None, None]
     ) -> Generator[Stored, None, None]:
-        """The pictures of some frames, from the file where it holds them.
+        """The pictures of some frames, from the file if it holds them all.
 
         Args:
-            wanted: the frames.
-            decoded: the pictures of these, ascending, from the video: begun only where the file
-                lacks one, and then kept in it.
+            wanted: indices of the frames.
+            decoded: decodes the pictures of these frames, in ascending order. It is used if the
+                file lacks a frame, and its pictures are then kept.
 
         Yields:
-            The same as `decoded`. A picture is overwritten by the next one.
+            The same as `decoded`. Each picture is overwritten by the next one.
 
         Raises:
-            OSError: they cannot be kept.
-            BitstreamError: as `decoded`, of which nothing is kept then.
+            OSError: the file cannot be written.
+            BitstreamError: as `decoded`; nothing is kept in this case.
         """
         if set(wanted) <= set(self._frames):
             return self._read(wanted)
@@ -57,7 +57,7 @@ class KeptPictures:
 
     def _read(self, wanted: Collection[int]) -> Generator[Stored, None, None]:
         stored = self._last
-        stored.make_writable()  # the decoder may hold it, too
+        stored.make_writable()  # the decoder may still hold a reference to it
         planes = [_lines(plane, plane.line_size) for plane in stored.planes]
         with self._file.open("rb") as file:
             for frame in self._frames[: 1 + self._frames.index(max(wanted))]:
@@ -66,7 +66,7 @@ class KeptPictures:
                     continue
                 for own, (size, line_size) in zip(planes, self._sizes, strict=True):
                     kept = _lines(file.read(size), line_size)
-                    # Lines may end in bytes that mean nothing, more or fewer of them.
+                    # Lines may end in padding of different lengths.
                     length = min(line_size, own.shape[1])
                     own[:, :length] = kept[:, :length]
                 yield frame, stored
@@ -74,7 +74,10 @@ class KeptPictures:
     def _kept(
         self, wanted: Collection[int], decoded: Generator[Stored, None, None]
     ) -> Generator[Stored, None, None]:
-        """The decoded pictures; the file is whole before the last is given, where many stop."""
+        """Yield the decoded pictures and keep them.
+
+        The file is complete before the last picture is yielded, because many callers stop there.
+        """
         last = max(wanted)
         frames: list[int] = []
         kind: tuple[Any, ...] = ()
@@ -84,7 +87,8 @@ class KeptPictures:
                 for frame, stored in decoded:
                     kind = kind or _kind_of(stored)
                     if _kind_of(stored) != kind or not _is_in_lines(stored):
-                        # Nobody takes pictures of several kinds: what to say of it is theirs.
+                        # Callers reject a change of size or format with their own messages, so
+                        # such pictures are yielded but not kept.
                         yield frame, stored
                         break
                     for plane in stored.planes:
@@ -100,21 +104,21 @@ class KeptPictures:
 
 
 def _lines(samples: Any, line_size: int) -> NDArray[np.uint8]:
-    """A plane's samples by its lines."""
+    """The samples of a plane as an array with one row per line."""
     return np.frombuffer(samples, np.uint8).reshape(-1, line_size)
 
 
 def _sizes_of(stored: Any) -> list[tuple[int, int]]:
-    """Of each plane, the bytes of all lines and of one."""
+    """For each plane, the size in bytes of the plane and of one line."""
     return [(plane.buffer_size, plane.line_size) for plane in stored.planes]
 
 
 def _kind_of(stored: Any) -> tuple[Any, ...]:
-    """What all pictures in a file have in common."""
+    """The properties that all pictures in a file share."""
     format_ = stored.width, stored.height, stored.format.name
     return *format_, stored.colorspace, stored.color_range, _sizes_of(stored)
 
 
 def _is_in_lines(stored: Any) -> bool:
-    """Whether its samples come line by line from the top, and are no places in a palette."""
+    """Whether its samples are stored line by line from the top, without a palette."""
     return all(plane.line_size > 0 for plane in stored.planes)

@@ -1,4 +1,4 @@
-"""Decoded frames of a video as they are stored; FFmpeg (through PyAV) decodes."""
+"""Decode the frames of a video as they are stored. FFmpeg decodes, through PyAV."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from colmap_av1.video.container import (
 
 
 def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
-    """Decode a file of any codec: its frames before any damage, and what the damage is.
+    """Count the frames of a file of any codec up to the first damage, and describe the damage.
 
     Raises:
         VideoError: as `decode_frames`.
@@ -39,7 +39,12 @@ def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
 def decode(
     video: str | os.PathLike[str], operating_point: int, num_threads: int | None
 ) -> Generator[Any, None, None]:
-    """Decode all frames as they are stored; those before a damage come first."""
+    """Decode all frames as they are stored, up to the first damage.
+
+    Raises:
+        BitstreamError: the stream is damaged; the frames before the damage have been yielded.
+        VideoError: the file cannot be opened, or the stream is encrypted.
+    """
     path = Path(video)
     with open_container(path) as container:
         stream = find_decodable_stream(container, path)
@@ -49,16 +54,18 @@ def decode(
 def decode_stream(
     container: Any, stream: Any, path: Path, operating_point: int, num_threads: int | None
 ) -> Generator[Any, None, None]:
-    """As `decode`, of a file that is open: PyAV's container and a stream of it.
+    """Like `decode`, for a stream of a container that PyAV has opened.
 
     Raises:
+        BitstreamError: the stream is damaged; the frames before the damage have been yielded.
         VideoError: the stream is encrypted.
     """
     context = stream.codec_context
     context.thread_type = "AUTO"
     context.thread_count = num_threads or 0
     options = {"oppoint": str(operating_point)} if operating_point else {}
-    # Grain is noise laid over the picture the motion was coded for.
+    # Exporting film grain keeps the decoder from adding it: it is noise on top of the picture that
+    # motion was coded for.
     context.options = {"export_side_data": "film_grain", **options}
     damage: Exception | None = None
     has_packet = False
@@ -78,7 +85,7 @@ def decode_stream(
             yield from context.decode(packet)
     except (av.error.FFmpegError, OSError) as error:
         damage = error
-    # The decoder holds frames back; those before the damage are still good.
+    # The decoder delays frames; those before the damage are still valid.
     try:
         yield from context.decode(None)
     except (av.error.FFmpegError, OSError) as error:

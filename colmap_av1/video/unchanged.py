@@ -1,4 +1,4 @@
-"""Files that are read several times, and must not change meanwhile."""
+"""Check that files that are read several times do not change in between."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from colmap_av1.errors import ColmapAv1Error, VideoError
 
 @dataclass(frozen=True)
 class FileState:
-    """The state of a file, which differs where it is replaced or written to.
+    """The state of a file; it changes if the file is replaced or written to.
 
     Attributes:
-        path: the file, as it was given.
-        found: path without links, bytes and time of the last change in nanoseconds; None: there
-            was no file.
+        path: the file as given.
+        found: path without symbolic links, size in bytes, and modification time in nanoseconds;
+            None if there was no file.
     """
 
     path: Path
@@ -27,7 +27,7 @@ class FileState:
 
 
 def file_state(file: str | os.PathLike[str]) -> FileState:
-    """The state of a file now."""
+    """The current state of a file."""
     path = Path(file)
     try:
         status = path.stat()
@@ -37,29 +37,29 @@ def file_state(file: str | os.PathLike[str]) -> FileState:
 
 
 def check_unchanged(*before: FileState) -> None:
-    """Check that videos are as they were.
+    """Check that videos have not changed.
 
     Raises:
-        VideoError: one was changed, replaced or removed.
+        VideoError: a video was changed, replaced or removed.
     """
     changed = next((state for state in before if file_state(state.path) != state), None)
     if changed is not None:
         raise VideoError(
             f"{changed.path}: changed or disappeared while it was read: leave it "
-            "unchanged, and run the same command again"
+            "unchanged and run the same command again"
         )
 
 
 @contextmanager
 def unchanged(*before: FileState) -> Iterator[Callable[[], None]]:
-    """Refuse videos that change while the body reads them.
+    """Raise an error if videos change while the body reads them.
 
     Yields:
-        Refuses them at once where they have changed already: for before something is kept.
+        A function that raises the error at once. Call it before keeping a result.
 
     Raises:
-        VideoError: one was changed, replaced or removed; in place of the body's error, too, which
-            may come of that.
+        VideoError: a video was changed, replaced or removed. It replaces an error of the body,
+            which the change may have caused.
     """
     try:
         yield partial(check_unchanged, *before)

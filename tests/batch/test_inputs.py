@@ -135,5 +135,5 @@ def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()
-    assert "hangs.mp4: nothing comes for 2 seconds" in text
+    assert "hangs.mp4: no data for 2 seconds" in text
     assert "none.mp4: no such file" in text

@@ -98,7 +98,7 @@ def test_without_fsspec(
 def test_python_takes_files() -> None:
     for address in ("http://example.org/a b.mp4", "https://x:8/y?z#1"):
         with (
-            pytest.raises(VideoError, match="is no file: fetch it first"),
+            pytest.raises(VideoError, match="is a URL"),
             open_container(Path(address)),
         ):
             pass

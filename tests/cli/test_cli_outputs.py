@@ -79,7 +79,7 @@ def test_inputs_stay_even_with_overwrite(
     for more in (["--overwrite"] * can_overwrite, []):
         assert main([*words.split(), *more]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert any(why in line for why in ("input", "not empty", "which stays"))
+        assert any(why in line for why in ("input", "not empty", "never replaced"))
         assert contents(work) == before
 
 
@@ -137,10 +137,10 @@ def test_models_are_replaced_on_demand_alone(
     words = ["map", "--database", "a.db", "--image_path", "frames", "--output", "model"]
     before = contents(work)
     assert main(words) == 2
-    assert "model: is there and not empty: give a new folder, or --over" in capsys.readouterr().err
+    assert "model: is not empty: give a new folder, or --overwrite" in capsys.readouterr().err
     (work / "model" / "notes.txt").write_text("mine")
     assert main([*words, "--overwrite"]) == 2
-    assert "model: holds notes.txt, which stays" in capsys.readouterr().err
+    assert "model: contains notes.txt" in capsys.readouterr().err
     (work / "model" / "notes.txt").unlink()
     assert contents(work) == before
     # Where the mapper fails, for which no pair has inliers enough to start, what was there stays.

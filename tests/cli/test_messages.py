@@ -43,9 +43,9 @@ def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     os.mkfifo(pipe)
     for command in (["info"], ["match", "--database", database], ["encode", "--output", "x.mp4"]):
         error = told([*command, "--video", pipe], capsys)
-        assert "is a pipe or device, but a video is read several times: copy it to a" in error
+        assert "is a pipe or device" in error
     words = ["match", "--database", database, "--video", str(clip), "--frame_list", pipe]
-    assert "is no regular file: copy it to one first" in told(words, capsys)
+    assert "is not a regular file" in told(words, capsys)
     assert os.listdir(tmp_path) == ["pipe"]
 
 
@@ -89,7 +89,7 @@ def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str])
 def test_operating_points_that_this_stream_has_not(
     clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for video, point, points in ((clip, 1, "point 0 alone"), (LAYERS, 2, "points 0 to 1")):
+    for video, point, points in ((clip, 1, "only point 0"), (LAYERS, 2, "points 0 to 1")):
         error = told(["info", "--video", str(video), "--operating_point", str(point)], capsys)
         assert f"{video}: has no operating_point {point}: the stream has {points}\n" in error
 
@@ -155,5 +155,5 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
 def test_files_that_must_not_be_read(
     name: str, read: Callable[[Path], object], others: Path
 ) -> None:
-    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission to read it: change that"):
+    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission to read it"):
         read(others)

@@ -83,8 +83,8 @@ def test_what_a_container_cannot_hold_is_told(
     assert main([*words, "--quiet"]) == 0
     told = capsys.readouterr().err.strip()
     assert told.endswith(
-        f"{output} does not hold where {source} was taken: give an output that ends in .mp4, or "
-        "give later commands the video itself"
+        f"{output} does not contain the positions of {source}: give an output that ends in .mp4, "
+        "or give later commands the video itself"
     )
     assert "\n" not in told
     assert read_positions(read_file(output)) is None
@@ -100,8 +100,8 @@ def test_subtitles_beside_the_video_are_named(
     assert main(words) == 0
     told = capsys.readouterr().err.strip()
     assert told.endswith(
-        f"{video.with_suffix('.SRT')} says where {video} was taken, and belongs to that: copy it "
-        f"to {output.with_suffix('.srt')}, too"
+        f"{video.with_suffix('.SRT')} holds the positions of {video}, which the stream lacks: copy "
+        f"it to {output.with_suffix('.srt')}, too"
     )
     # As it says.
     shutil.copyfile(video.with_suffix(".SRT"), output.with_suffix(".srt"))

@@ -9,7 +9,7 @@
 
 namespace colmap_av1::av1 {
 
-// X(member, default table): arrays copied as they are
+// X(member, default table): arrays that are copied unchanged
 #define COLMAP_AV1_PLAIN_CDFS(X)                             \
   X(intra_frame_y_mode, kDefaultIntraFrameYModeCdf)          \
   X(y_mode, kDefaultYModeCdf)                                \
@@ -134,7 +134,7 @@ struct CdfContext {
 
   void init_non_coeff_cdfs();
   void init_coeff_cdfs(int base_q_idx);
-  // Sets every adaptation counter to 0, as load_cdfs demands.
+  // Sets every adaptation counter to 0, as load_cdfs requires.
   void clear_counters();
 };
 

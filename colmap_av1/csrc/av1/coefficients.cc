@@ -12,8 +12,8 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// CoefficientReader::levels_ has room for 32x32 levels with a margin of 4 behind each row and
-// below, so that neighbours need no checks. All sizes share the stride: then it is a constant.
+// CoefficientReader::levels_ holds 32x32 levels with a margin of 4 after each row and below, so
+// that neighbours need no bounds checks. All sizes use the same stride, so that it is a constant.
 constexpr int kLevelStride = 36;
 
 constexpr auto kTxClasses = [] {
@@ -24,7 +24,7 @@ constexpr auto kTxClasses = [] {
   return classes;
 }();
 
-// Contexts of neighbours are handled eight at a time, in words.
+// Contexts of neighbours are processed eight at a time, in 64-bit words.
 constexpr std::uint64_t kOnes = 0x0101010101010101;
 
 constexpr std::uint64_t first_bytes(int count) {
@@ -41,7 +41,7 @@ std::uint64_t load_word(const std::uint8_t* p) {
   return word;
 }
 
-// The first `count` entries, 1 to 16, become `value` up to `visible` and 0 behind.
+// Sets the first `count` entries, 1 to 16, to `value` up to `visible` and to 0 after it.
 void set_contexts(std::uint8_t* p, int count, int visible, std::uint8_t value) {
   for (; count > 0; p += 8, count -= 8, visible -= 8) {
     const std::uint64_t word = (load_word(p) & ~first_bytes(count)) |
@@ -50,7 +50,7 @@ void set_contexts(std::uint8_t* p, int count, int visible, std::uint8_t value) {
   }
 }
 
-// What the levels loop needs of one scan position.
+// The values of one scan position that the loop over levels needs.
 struct ScanEntry {
   std::uint16_t index;       // into CoefficientReader::levels_
   std::uint8_t base_offset;  // added to the context of coeff_base
@@ -100,7 +100,7 @@ constexpr const auto& scan_of() {
   }
 }
 
-// A scan with the parts of the contexts that depend on the position alone.
+// A scan with the parts of the contexts that depend only on the position.
 template <int kTxSize, int kTxClass>
 constexpr auto kScan = [] {
   constexpr const auto& kPositions = scan_of<kTxSize, kTxClass>();
@@ -131,11 +131,11 @@ constexpr auto kScans = []<std::size_t... kTxSize>(std::index_sequence<kTxSize..
   return std::array<const ScanEntry*, TX_SIZES_ALL>{kScan<kTxSize, kTxClass>.data()...};
 }(std::make_index_sequence<TX_SIZES_ALL>());
 
-// Levels are stored with their value up to 15 in the low six bits, for coeff_br, and their value
-// up to 3 in the high two, for coeff_base: one sum over the neighbours serves both contexts.
+// Levels are stored clipped to 15 in the low six bits, for coeff_br, and clipped to 3 in the high
+// two bits, for coeff_base. One sum over the neighbours then serves both contexts.
 constexpr int kLevelMask = 63;
 constexpr int kClippedShift = 6;
-constexpr int kMaxLevel = NUM_BASE_LEVELS + 1 + COEFF_BASE_RANGE;  // from it on a Golomb code
+constexpr int kMaxLevel = NUM_BASE_LEVELS + 1 + COEFF_BASE_RANGE;  // a Golomb code follows it
 
 // 5.11.48 Get transform set function
 int tx_set(const FrameHeader& header, const BlockInfo& block, int tx_size) {
@@ -201,7 +201,7 @@ int read_eob(SymbolDecoder& symbols, CdfContext& cdf, int tx_size, int tx_size_c
 void CoefficientReader::start_tile(const SequenceHeader& seq, const FrameHeader& header) {
   seq_ = &seq;
   header_ = &header;
-  // Blocks may reach a superblock's width beyond the frame.
+  // Blocks may extend beyond the frame by the width of a superblock.
   const std::size_t columns = static_cast<std::size_t>(header.mi_cols) + kMaxSb4;
   for (int plane = 0; plane < seq.num_planes; ++plane) above_[plane].assign(columns, 0);
 }
@@ -251,7 +251,7 @@ void CoefficientReader::read(SymbolDecoder& symbols, CdfContext& cdf, const Bloc
   std::uint8_t* above = above_[plane].data() + x4;
   std::uint8_t* left = left_[plane].data() + (y4 & kSbMask);
 
-  // Context of all_zero. Entries behind the frame's edge are kept at 0.
+  // Context of all_zero. Entries beyond the edge of the frame are always 0.
   std::uint64_t any_above = load_word(above) & first_bytes(w4);
   if (w4 > 8) any_above |= load_word(above + 8);
   std::uint64_t any_left = load_word(left) & first_bytes(h4);
@@ -279,10 +279,10 @@ void CoefficientReader::read(SymbolDecoder& symbols, CdfContext& cdf, const Bloc
   if (!all_zero) {
     tx_type = plane == 0 ? read_transform_type(symbols, cdf, *header_, block, tx_size)
                          : chroma_tx_type(block, lossless, tx_size, x4, y4);
-    // TxTypes keeps what was read; a lossless or 64 wide block is DCT_DCT either way.
+    // TxTypes keeps the value that was read; it is DCT_DCT for lossless and for 64 wide blocks.
     const int c = kTxClasses[tx_type];
     const int eob = read_eob(symbols, cdf, tx_size, tx_size_ctx, ptype, c);
-    // Context of dc_sign: positive less negative neighbours
+    // Context of dc_sign: number of positive minus number of negative neighbours
     int dc_sum = 0;
     const auto add_signs = [&](const std::uint8_t* p, int count) {
       for (; count > 0; p += 8, count -= 8) {
@@ -309,7 +309,7 @@ void CoefficientReader::read(SymbolDecoder& symbols, CdfContext& cdf, const Bloc
   set_contexts(left, h4, (header_->mi_rows >> sub_y) - y4, context);
 }
 
-// The levels and signs of coeffs( ). Returns the context that the block leaves behind.
+// The levels and signs of coeffs( ). Returns the context of the block for later blocks.
 template <int kTxClass>
 std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& cdf, int tx_size,
                                             int tx_size_ctx, int ptype, int eob, int dc_sign_ctx) {
@@ -320,12 +320,12 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
   int num_nonzero = 0;
   int num_large = 0;
   int sum = 0;
-  // A copy, so that its state stays in registers: writes to levels_ and to the CDFs could change
-  // the decoder for all the compiler knows.
+  // A copy, so that its state stays in registers: otherwise the compiler must assume that writes to
+  // levels_ and to the CDFs change the decoder.
   SymbolDecoder symbols = decoder;
 
-  // Reads coeff_br where `level` asks for it, and stores the level. `near` sums up the neighbours
-  // that its context looks at.
+  // Reads coeff_br if `level` requires it, and stores the level. `near` is the sum over the
+  // neighbours of its context.
   const auto complete = [&](std::uint8_t* at, int level, int near, int br_offset) {
     int stored = level * ((1 << kClippedShift) + 1);
     if (level > NUM_BASE_LEVELS) {
@@ -343,7 +343,7 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
     sum += level;
   };
 
-  // The last coefficient: it is not 0, and none of its neighbours is read yet.
+  // The last coefficient: it is not 0, and none of its neighbours has been read yet.
   const int last = eob - 1;
   {
     const int adjusted = kAdjustedTxSize[tx_size];
@@ -354,7 +354,7 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
   }
   const auto read_level = [&](ScanEntry entry, bool is_dc) {
     std::uint8_t* at = &levels_[entry.index];
-    // Neighbours that both contexts look at
+    // Neighbours that both contexts use
     int near = at[1] + at[kStride];
     int far;
     if constexpr (kTxClass == TX_CLASS_2D) {
@@ -368,7 +368,7 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
       far = at[3 * kStride] + at[4 * kStride];
     }
     // Min( ( sum of clipped levels + 1 ) >> 1, 4 ). The low bits of five levels carry into the
-    // clipped sum only where that is 15.
+    // clipped sum only if that is 15.
     int ctx = std::min((near + far + (1 << kClippedShift)) >> (kClippedShift + 1), 4);
     ctx = kTxClass == TX_CLASS_2D && is_dc ? 0 : ctx + entry.base_offset;
     complete(at, symbols.symbol<4>(base_cdfs[ctx]), near, entry.br_offset);
@@ -376,8 +376,8 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
   for (int c = last - 1; c > 0; --c) read_level(scan[c], false);
   if (last > 0) read_level(scan[0], true);
 
-  // Signs and Golomb codes, from the first coefficient to the last: nothing is kept of them but
-  // what contexts need.
+  // Signs and Golomb codes, from the first coefficient to the last. Only what contexts need is
+  // kept.
   const int dc = levels_[0] & kLevelMask;
   // levels_ is all 0 between transform blocks.
   const int end = scan[last].index;
@@ -399,7 +399,7 @@ std::uint8_t CoefficientReader::read_levels(SymbolDecoder& decoder, CdfContext& 
   if (dc != 0) {
     const bool sign = symbols.flag(cdf.dc_sign[ptype][dc_sign_ctx]);
     --num_signs;
-    dc_category = sign ? 1 : 2;  // even where nothing is left of the level in 20 bits
+    dc_category = sign ? 1 : 2;  // even if the low 20 bits of the level are 0
     if (dc == kMaxLevel) {
       sum += golomb() - kMaxLevel;
       --num_large;

@@ -11,7 +11,7 @@
 
 namespace colmap_av1::av1 {
 
-// A transform block, its place in units of 4x4 samples of its plane.
+// A transform block; its position is in units of 4x4 samples of its plane.
 struct TransformBlock {
   int plane = 0;
   int x4 = 0;
@@ -19,8 +19,8 @@ struct TransformBlock {
   int tx_size = 0;
 };
 
-// Reads the coefficients of a tile to keep its symbol decoder in step, and drops them. What stays
-// is what contexts ask for. The buffers are kept between tiles.
+// Reads the coefficients of a tile, because the symbol decoder must pass them, and drops them. Only
+// what contexts need is kept. The buffers are reused for the next tile.
 class CoefficientReader {
  public:
   // clear_above_context( ) of 5.11.2
@@ -47,8 +47,8 @@ class CoefficientReader {
   std::array<std::vector<std::uint8_t>, 3> above_;
   std::array<std::array<std::uint8_t, kMaxSb4 + 16>, 3> left_{};
   std::array<std::uint8_t, kMaxSb4 * kMaxSb4> tx_types_{};  // TxTypes, of the superblock
-  // Coefficient levels of a transform block with a margin of 4 behind each row and below, and for
-  // each that a Golomb code follows how many that are not 0 were read before
+  // Coefficient levels of a transform block, with a margin of 4 after each row and below; and for
+  // each level that a Golomb code follows, the number of nonzero levels read before it
   std::array<std::uint8_t, 36 * 36> levels_{};
   std::array<std::uint16_t, 32 * 32> large_{};
 };

@@ -10,7 +10,7 @@ struct BitstreamError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// The stream asks for more than the limits given by the options.
+// The stream exceeds a limit given by the options.
 struct LimitError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };

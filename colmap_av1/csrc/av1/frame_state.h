@@ -1,4 +1,4 @@
-// State of a frame: its blocks while it is parsed, and what later frames may refer to.
+// State of a frame: its blocks while it is parsed, and the parts that later frames refer to.
 #pragma once
 
 #include <array>
@@ -26,8 +26,9 @@ struct Mv {
 
 constexpr std::uint8_t kAbsent = 255;  // a syntax element that a block does not have
 
-// One block (decode_block) under the specification's names. Python reads it as it is, by
-// block_dtype( ) in bindings/frame_motion.cc, and hands the core blocks of its own: any bytes are one.
+// One block (decode_block) under the specification's names. Python reads its memory with the dtype
+// of block_dtype( ) in bindings/frame_motion.cc, and may pass blocks to the core that hold any
+// bytes.
 struct BlockInfo {
   std::array<Mv, 2> mv{};
   std::uint8_t mi_size = 0;
@@ -41,8 +42,8 @@ struct BlockInfo {
   std::uint8_t interintra = 0;
   std::uint8_t use_intrabc = 0;
   std::array<std::int8_t, 2> ref_frame{INTRA_FRAME, NONE};
-  std::int32_t local_warp = -1;  // index of the frame's LocalWarp, -1 without
-  std::int32_t warp_index = -1;  // the same, -1 also where it is not valid
+  std::int32_t local_warp = -1;  // index of the frame's LocalWarp; -1: none
+  std::int32_t warp_index = -1;  // the same; -1 also if it is not valid
   std::uint16_t mi_row = 0;
   std::uint16_t mi_col = 0;
   std::uint8_t uv_mode = kAbsent;
@@ -87,7 +88,7 @@ struct SavedMotion {
   friend bool operator==(const SavedMotion&, const SavedMotion&) = default;
 };
 
-// What stays of a decoded frame (7.20).
+// The parts of a decoded frame that are saved in a reference slot (7.20).
 struct FrameState {
   FrameHeader header;
   int decode_index = -1;
@@ -107,8 +108,8 @@ struct MotionFieldEntry {
   friend bool operator==(const MotionFieldEntry&, const MotionFieldEntry&) = default;
 };
 
-// Room for blocks that touches no memory before a block is written: most frames have far fewer
-// blocks than units, and a header alone must not cost what a frame of its size would.
+// Memory for blocks, which the system provides only where a block is written. Most frames have far
+// fewer blocks than units, and a header must not allocate the memory of a whole frame.
 struct FreeBlocks {
   void operator()(BlockInfo* blocks) const { ::operator delete(blocks); }
 };
@@ -118,7 +119,7 @@ inline BlockBuffer make_block_buffer(std::size_t size) {
   return BlockBuffer(static_cast<BlockInfo*>(::operator new(size * sizeof(BlockInfo))));
 }
 
-// A tile's place in its frame, in units.
+// The position of a tile in its frame, in units.
 struct TileBounds {
   int mi_row_start = 0;
   int mi_row_end = 0;
@@ -131,7 +132,7 @@ struct TileBounds {
   }
 };
 
-// Places in a superblock, in units: contexts to the left are kept by the row of the superblock.
+// Width of a superblock in units. Contexts to the left are stored by the row in the superblock.
 inline constexpr int kMaxSb4 = 32;
 inline constexpr int kSbMask = kMaxSb4 - 1;
 
@@ -140,8 +141,8 @@ struct FrameContext {
   const SequenceHeader* seq = nullptr;
   const FrameHeader* header = nullptr;
   CdfContext cdfs;               // at the start of each tile
-  std::vector<BlockInfo*> grid;  // [mi_rows][mi_cols], null: not decoded yet
-  BlockBuffer blocks;            // room for as many as units
+  std::vector<BlockInfo*> grid;  // [mi_rows][mi_cols]; null: not decoded yet
+  BlockBuffer blocks;            // memory for as many blocks as units
   std::size_t blocks_capacity = 0;
   std::vector<MotionFieldEntry> motion_field;      // [mi_rows / 2][mi_cols / 2]
   const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0

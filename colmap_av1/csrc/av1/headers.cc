@@ -195,8 +195,8 @@ void FrameHeaderReader::uncompressed_header() {
     for (ReferenceInfo& ref : refs_) {
       const int ref_order_hint = r.literal(seq_.order_hint_bits);
       if (ref_order_hint != ref.order_hint || !ref.valid) {
-        // The frame was lost. The slot keeps the hint, so that what depends on hints alone is
-        // parsed alike; using the slot as a reference is an error.
+        // The frame was lost. The slot keeps the order hint, so that everything that depends only
+        // on hints is parsed correctly. Using the slot as a reference is an error.
         ref.valid = false;
         ref.header = nullptr;
         ref.order_hint = ref_order_hint;

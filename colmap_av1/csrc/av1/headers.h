@@ -70,7 +70,7 @@ struct SegmentationParams {
 using WarpParams = std::array<std::int32_t, 6>;
 using GmParams = std::array<WarpParams, TOTAL_REFS_PER_FRAME>;
 
-// gm_params of a frame that has none (setup_past_independence)
+// gm_params of a frame without global motion (setup_past_independence)
 GmParams default_gm_params();
 
 // Values of one frame header under the specification's names. Arrays indexed by reference
@@ -168,7 +168,7 @@ struct FrameHeader {
   }
 };
 
-// What a header may refer to of the frame in one reference slot (section 7.20).
+// The values of the frame in a reference slot that a header may refer to (section 7.20).
 struct ReferenceInfo {
   bool valid = false;                   // RefValid
   int frame_id = 0;                     // RefFrameId

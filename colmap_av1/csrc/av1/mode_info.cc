@@ -221,7 +221,8 @@ void TileParser::intra_block_mode_info() {
   intra_modes_after_y_mode();
 }
 
-// What the two intra tables share: angles, chroma mode, palette, filter intra (5.11.42 to 5.11.46)
+// The common part of both intra tables: angles, chroma mode, palette, filter intra (5.11.42 to
+// 5.11.46)
 void TileParser::intra_modes_after_y_mode() {
   const bool has_angles = b_->mi_size >= BLOCK_8X8;
   if (has_angles && is_directional_mode(b_->y_mode)) {
@@ -418,7 +419,7 @@ void TileParser::read_compound_type() {
     }
     return;
   }
-  // Contexts of comp_group_idx and compound_idx add what the neighbours chose.
+  // The contexts of comp_group_idx and compound_idx are sums over the neighbours.
   const auto neighbour = [&](const BlockInfo* n, bool single, int ref_frame, bool group) {
     if (!n) return 0;
     if (!single) return static_cast<int>(group ? n->comp_group_idx : n->compound_idx);

@@ -6,7 +6,8 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// 7.9.4 Get block position process, one coordinate: by how many 8x8 areas a projected vector moves
+// 7.9.4 Get block position process, for one coordinate: the number of 8x8 areas that a projected
+// vector moves
 int position_offset(int delta, int dst_sign) {
   constexpr int kShift = 3 + 1 + MI_SIZE_LOG2;
   return dst_sign * (delta >= 0 ? delta >> kShift : -((-delta) >> kShift));
@@ -42,7 +43,7 @@ bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameSt
     }
   }
   const SavedMotion* saved = source->saved_motion.data();
-  // Neighbours often have the same motion, which moves them alike.
+  // Neighbours often have the same motion, so the last projection is reused.
   SavedMotion last;
   int offset_y8 = 0;
   int offset_x8 = 0;

@@ -11,8 +11,8 @@
 
 namespace colmap_av1::av1 {
 
-// 7.9.3 Get MV projection process, in two steps: the factor of a pair of distances, and a vector
-// times it.
+// 7.9.3 Get MV projection process, in two steps: the factor for a pair of distances, and its
+// product with a vector.
 inline int projection_factor(int numerator, int denominator) {
   const int clipped = std::clamp(numerator, -MAX_FRAME_DISTANCE, MAX_FRAME_DISTANCE);
   return clipped * kDivMult[std::min(MAX_FRAME_DISTANCE, denominator)];

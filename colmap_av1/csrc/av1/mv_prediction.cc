@@ -23,7 +23,7 @@ bool differs_by_16(Mv a, Mv b) {
   return std::abs(a.row - b.row) >= 16 || std::abs(a.col - b.col) >= 16;
 }
 
-// The find MV stack process of one block.
+// The find MV stack process for one block.
 class MvStackFinder {
  public:
   MvStackFinder(const FrameContext& frame, const TileBounds& tile, const BlockInfo& block)
@@ -45,7 +45,7 @@ class MvStackFinder {
   void temporal_scan();
   void temporal_sample(const MotionFieldEntry& entry, bool first);
   void add_ref_mv_candidate(const BlockInfo& candidate, int weight);
-  // Returns the entry's index, -1 where the stack is full.
+  // Returns the index of the entry, or -1 if the stack is full.
   int add_to_stack(Mv mv0, Mv mv1, int weight);
   Mv lower_mv_precision(Mv mv) const;
   void sort_stack(int start, int end);
@@ -215,11 +215,11 @@ void MvStackFinder::temporal_scan() {
   }
 }
 
-// 7.10.2.6 Temporal sample process, of the sample for a unit in the tile. Tiles end at even units,
-// so the odd one that is asked for is in the tile as well.
+// 7.10.2.6 Temporal sample process, for a unit in the tile. Tiles end at even units, so the odd
+// unit that the process reads is in the tile as well.
 void MvStackFinder::temporal_sample(const MotionFieldEntry& entry, bool first) {
   if (entry.ref_offset == 0) return;
-  // Neighbours often hold the same motion: it projects to the same vectors.
+  // Neighbours often have the same motion, which projects to the same vectors.
   if (temporal_index_ >= 0 && entry == temporal_entry_) {
     stack_.entries[temporal_index_].weight += 2;
     return;
@@ -287,7 +287,7 @@ Mv MvStackFinder::lower_mv_precision(Mv mv) const {
       const int a = ((std::abs(v) + 3) >> 3) << 3;
       return static_cast<std::int16_t>(v > 0 ? a : -a);
     }
-    return static_cast<std::int16_t>((v + (v < 0)) & ~1);  // odd ones towards 0
+    return static_cast<std::int16_t>((v + (v < 0)) & ~1);  // odd values are rounded towards 0
   };
   return {lower(mv.row), lower(mv.col)};
 }

@@ -8,7 +8,7 @@
 
 namespace colmap_av1::av1 {
 
-// What the find MV stack process gives: predicted vectors, and contexts of what is read next.
+// Result of the find MV stack process: predicted vectors, and contexts for the next symbols.
 struct MvStack {
   struct Entry {
     std::array<Mv, 2> mv;  // RefStackMv
@@ -23,11 +23,11 @@ struct MvStack {
   std::array<int, MAX_REF_MV_STACK_SIZE + 2> drl_context{};
 };
 
-// 7.10.2 Find MV stack process, of a block whose place, size and reference frames are known
+// 7.10.2 Find MV stack process, for a block whose position, size and reference frames are known
 MvStack find_mv_stack(const FrameContext& frame, const TileBounds& tile, const BlockInfo& block);
 
-// 7.10.3 Has overlappable candidates process. The blocks above and to the left are null where
-// AvailU and AvailL are 0.
+// 7.10.3 Has overlappable candidates process. The blocks above and to the left are null if AvailU
+// and AvailL are 0.
 bool has_overlappable_candidates(const FrameContext& frame, const BlockInfo& block,
                                  const BlockInfo* above, const BlockInfo* left);
 
@@ -37,7 +37,7 @@ struct WarpSamples {
   int count = 0;
 };
 
-// 7.10.4 Find warp samples process, of a block whose vector is known
+// 7.10.4 Find warp samples process, for a block whose vector is known
 WarpSamples find_warp_samples(const FrameContext& frame, const TileBounds& tile,
                               const BlockInfo& block, const BlockInfo* above,
                               const BlockInfo* left);

@@ -48,7 +48,7 @@ int read_mv_component(SymbolDecoder& symbols, MvComponentCdfs& cdf, const FrameH
   return mv_sign ? -mag : mag;
 }
 
-// is_mv_valid( ) of the semantics of assign_mv (6.10.25)
+// is_mv_valid( ) in the semantics of assign_mv (6.10.25)
 bool is_mv_valid(const SequenceHeader& seq, const TileBounds& tile, const BlockInfo& block) {
   for (int list = 0; list < 1 + block.is_compound(); ++list) {
     if (std::abs(block.mv[list].row) >= kMaxMv || std::abs(block.mv[list].col) >= kMaxMv)

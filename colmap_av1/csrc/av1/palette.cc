@@ -14,8 +14,8 @@ void TileParser::palette_mode_info() {
   const int max_value = (1 << bit_depth) - 1;
   std::array<std::uint16_t, 16> cache;
 
-  // Colours of Y (plane 0) and U (plane 1): taken from the cache, then coded by differences of
-  // at least min_delta.
+  // Colours of Y (plane 0) and U (plane 1): first from the cache, then coded as differences of at
+  // least min_delta.
   const auto read_colors = [&](int plane, int min_delta) {
     auto& colors = palette_colors_[plane];
     const int size = b_->palette_size[plane];
@@ -50,7 +50,7 @@ void TileParser::palette_mode_info() {
     if (read_flag(cdf_.palette_uv_mode[b_->palette_size[0] > 0])) {
       b_->palette_size[1] = static_cast<std::uint8_t>(read(cdf_.palette_uv_size[bsize_ctx]) + 2);
       read_colors(1, 0);
-      // The colours of V are never referred to by other blocks: read and dropped.
+      // Other blocks never refer to the colours of V, so they are read and dropped.
       if (symbols_.bit()) {  // delta_encode_palette_colors_v
         const int bits = bit_depth - 4 + symbols_.literal(2);
         symbols_.literal(bit_depth);
@@ -64,7 +64,7 @@ void TileParser::palette_mode_info() {
   }
 }
 
-// get_palette_cache( ): the sorted union of the colours above and left
+// get_palette_cache( ): the sorted union of the colours of the blocks above and left
 int TileParser::palette_cache(int plane, std::array<std::uint16_t, 16>& cache) const {
   const bool use_above = above_ && (b_->mi_row * MI_SIZE) % 64 != 0;
   const int above_n = use_above ? above_->palette_size[plane] : 0;

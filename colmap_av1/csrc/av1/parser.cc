@@ -17,7 +17,7 @@ namespace {
 
 using Bytes = std::span<const std::uint8_t>;
 
-// 4.10.5 leb128( ), taken off the front of the data
+// 4.10.5 leb128( ), removed from the front of the data
 std::size_t take_leb128(Bytes& data) {
   std::uint64_t value = 0;
   for (int i = 0; i < 8; ++i) {
@@ -33,7 +33,7 @@ std::size_t take_leb128(Bytes& data) {
   throw BitstreamError("OBU size is longer than the specification allows");
 }
 
-// Threads that are waited for where their scope ends, by an exception too.
+// Threads that are joined at the end of their scope, also after an exception.
 class JoinedThreads {
  public:
   JoinedThreads() = default;
@@ -43,7 +43,7 @@ class JoinedThreads {
     for (std::thread& thread : threads_) thread.join();
   }
 
-  // False where the system has no thread to give.
+  // False if the system cannot start a thread.
   template <typename Work>
   bool start(Work work) {
     try {
@@ -64,7 +64,7 @@ void Parser::parse(Bytes data) {
   try {
     parse_obus(data);
   } catch (...) {
-    // A frame with damage is over: tile groups to come must not complete it.
+    // A damaged frame is dropped: later tile groups must not complete it.
     seen_frame_header_ = false;
     throw;
   }
@@ -147,7 +147,7 @@ void Parser::sequence_header_obu(Bytes data) {
   seq_ = std::make_shared<const SequenceHeader>(read_sequence_header(reader));
   const int op = options_.operating_point <= seq_->operating_points_cnt_minus_1
                      ? options_.operating_point
-                     : 0;  // 7.20 note: a choice that the stream does not have means the first
+                     : 0;  // 7.20 note: an operating point that is missing means the first
   operating_point_idc_ = seq_->operating_point_idc[op];
 }
 
@@ -175,8 +175,8 @@ std::size_t Parser::frame_header_obu(Bytes data, int temporal_id, int spatial_id
     slots_[i].order_hint = infos[i].order_hint;
     if (infos[i].header == nullptr) slots_[i].frame.reset();
   }
-  // Containers may leave temporal delimiters out. A temporal unit has one shown frame for each
-  // spatial layer, in ascending order (7.5).
+  // Containers may omit temporal delimiters. A temporal unit has one shown frame for each spatial
+  // layer, in ascending order (7.5).
   if (temporal_unit_ < 0 || spatial_id <= shown_spatial_id_) start_temporal_unit();
   if (header_.show_frame || header_.show_existing_frame) shown_spatial_id_ = spatial_id;
   event_ = std::make_unique<Event>();
@@ -205,7 +205,7 @@ std::array<const FrameState*, TOTAL_REFS_PER_FRAME> Parser::references() const {
   return refs;
 }
 
-// What uncompressed_header( ) sets up besides its values: CDFs, segment ids, motion field
+// The state that uncompressed_header( ) sets up besides its values: CDFs, segment ids, motion field
 void Parser::start_frame() {
   state_ = std::make_shared<FrameState>();
   state_->decode_index = num_events_;
@@ -248,7 +248,7 @@ void Parser::start_frame() {
     context_.cdfs.init_non_coeff_cdfs();
     context_.cdfs.init_coeff_cdfs(header_.base_q_idx);
   } else {
-    // load_cdfs( ) and load_previous_segment_ids( ); the header checked that the frame is there
+    // load_cdfs( ) and load_previous_segment_ids( ); the header has checked that the frame exists
     const FrameState& previous = *slots_[header_.ref_frame_idx[header_.primary_ref_frame]].frame;
     context_.cdfs = previous.cdfs;
     if (header_.segmentation_enabled && previous.header.mi_rows == header_.mi_rows &&
@@ -321,9 +321,10 @@ void Parser::tile_group_obu(Bytes data) {
   if (tile_num_ == num_tiles) finish_frame();
 }
 
-// Tiles do not depend on each other (5.11.2): each thread takes the next one, none after an error.
-// Of several errors that of the first tile is reported, so that threads change nothing: tiles are
-// taken in order, so no tile before the first damaged one is left out.
+// Tiles do not depend on each other (5.11.2). Each thread takes the next tile until one has an
+// error. If several tiles have errors, that of the first tile is reported. Since tiles are taken in
+// order, all tiles before it have been parsed, so the result does not depend on the number of
+// threads.
 void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   // Starting a thread takes about as long as parsing some kilobytes.
   constexpr std::size_t kBytesPerThread = 8192;
@@ -365,7 +366,7 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   {
     JoinedThreads threads;
     for (std::size_t i = 1; i < num_threads; ++i) {
-      // What no thread takes the others do.
+      // If a thread cannot be started, the others parse all tiles.
       if (!threads.start([&work, parser = tile_parsers_[i].get()] { work(*parser); })) break;
     }
     work(*tile_parsers_[0]);
@@ -375,7 +376,7 @@ void Parser::parse_tiles(const std::vector<TileData>& tiles) {
   }
 }
 
-// The local warps of all tiles in one array, and the blocks' places in it
+// The local warps of all tiles in one array, and the index of each block's warp
 void Parser::collect_local_warps() {
   for (std::size_t tile = 0; tile < tile_local_warps_.size(); ++tile) {
     const std::vector<LocalWarp>& warps = tile_local_warps_[tile];
@@ -392,7 +393,7 @@ void Parser::collect_local_warps() {
   }
 }
 
-// The blocks of all tiles in one array, and each unit's place in it
+// The blocks of all tiles in one array, and the index of each unit's block
 void Parser::collect_blocks() {
   std::size_t count = 0;
   for (const std::size_t num_blocks : tile_num_blocks_) count += num_blocks;
@@ -451,7 +452,7 @@ void Parser::show_existing_frame() {
   event_->shown_decode_index = shown->decode_index;
   event_->header.order_hint = shown->header.order_hint;
   if (header_.frame_type == KEY_FRAME) {
-    // 7.21 Reference frame loading process: the loaded frame goes into every slot
+    // 7.21 Reference frame loading process: the loaded frame is stored in every slot
     update_references(shown, header_.refresh_frame_flags);
   } else {
     update_references(nullptr, 0);

@@ -1,4 +1,4 @@
-// The parser: temporal units in, one event per decoded or repeated frame out.
+// The parser reads temporal units and gives one event per decoded or repeated frame.
 #pragma once
 
 #include <array>
@@ -15,11 +15,11 @@ namespace colmap_av1::av1 {
 
 struct ParserOptions {
   int operating_point = 0;
-  // Reads the headers alone; events then hold no blocks.
+  // Reads only the headers; events then have no blocks.
   bool headers_only = false;
-  // Threads that parse the tiles of a tile group side by side; the result is the same.
+  // Number of threads that parse the tiles of a tile group; the result does not depend on it.
   int num_threads = 1;
-  // Refuses tiles whose trailing bits are not those that the specification demands.
+  // Tiles whose trailing bits are not those that the specification requires are errors.
   bool strict = false;
   // Largest accepted frame in luma samples.
   std::int64_t max_frame_size = std::int64_t{1} << 28;
@@ -28,25 +28,26 @@ struct ParserOptions {
 // A decoded frame or a show_existing_frame header, in bitstream order.
 struct Event {
   FrameHeader header;
-  int decode_index = 0;  // number of this event
+  int decode_index = 0;  // index of this event
   int temporal_unit = 0;
   int obu_offset = 0;  // of the frame's first OBU in its temporal unit, in bytes
   int num_tile_groups = 0;
-  int num_wrong_trailing_bits = 0;  // tiles that end otherwise than the specification demands
+  int num_wrong_trailing_bits = 0;  // tiles that do not end as the specification requires
   int shown_decode_index = -1;      // show_existing_frame: the event that decoded the frame
-  // By RefFrame; -1 and 0 where there is none.
+  // By RefFrame; -1 and 0 if there is no frame.
   std::array<int, TOTAL_REFS_PER_FRAME> ref_decode_index{};
   std::array<std::array<int, 2>, TOTAL_REFS_PER_FRAME> ref_size{};  // UpscaledWidth, FrameHeight
   std::array<int, TOTAL_REFS_PER_FRAME> ref_order_hint{};
   // Reference slots after the reference frame update process
   std::array<int, NUM_REF_FRAMES> slot_decode_index{};
   std::vector<BlockInfo> blocks;          // in decoding order
-  std::vector<std::int32_t> block_index;  // [mi_rows][mi_cols], which block each unit is in
+  std::vector<std::int32_t> block_index;  // [mi_rows][mi_cols], the block of each unit
   std::vector<LocalWarp> local_warps;
   std::vector<int> tile_sizes;  // in bytes, in tile order
 };
 
-// What parsing can start again from at a shown key frame, which refers to no frame before it.
+// The state from which parsing can start again at a shown key frame, which refers to no earlier
+// frame.
 struct RestartPoint {
   std::shared_ptr<const SequenceHeader> seq;
   int operating_point_idc = 0;
@@ -60,22 +61,22 @@ class Parser {
   explicit Parser(const ParserOptions& options) : options_(options) {}
 
   // Parses a temporal unit, or a part of one, of the low-overhead format (section 5.2). An OBU
-  // without a size field reaches to the end of the data. Completed frames are appended to
-  // events() also when a later one throws BitstreamError or LimitError. That frame is dropped;
-  // frames that refer to the slots it would have filled find what was there before.
+  // without a size field extends to the end of the data. Complete frames are appended to events()
+  // even if a later frame throws BitstreamError or LimitError. That frame is dropped, and the
+  // reference slots that it would have refreshed keep their frames.
   void parse(std::span<const std::uint8_t> data);
 
-  // Throws BitstreamError when the stream ends inside a frame.
+  // Throws BitstreamError if the stream ends inside a frame.
   void finish() const;
 
-  // Where the parser stands. Throws BitstreamError inside a frame.
+  // The current state of the parser. Throws BitstreamError inside a frame.
   RestartPoint restart_point() const;
-  // Goes on from a point that a parser of the same stream and operating point gave. Up to the next
-  // shown key frame, frames that refer to others are errors.
+  // Continues from a point of another parser of the same stream and operating point. Until the next
+  // shown key frame, frames that refer to other frames are errors.
   void restart(const RestartPoint& point);
 
   std::vector<std::unique_ptr<Event>>& events() { return events_; }
-  // The sequence header in force; null before the first.
+  // The current sequence header; null before the first one.
   const SequenceHeader* sequence_header() const { return seq_.get(); }
   int operating_point_idc() const { return operating_point_idc_; }
 
@@ -92,7 +93,7 @@ class Parser {
   }
   void parse_obus(std::span<const std::uint8_t> data);
   void sequence_header_obu(std::span<const std::uint8_t> data);
-  // Returns the bytes of the header.
+  // Returns the size of the header in bytes.
   std::size_t frame_header_obu(std::span<const std::uint8_t> data, int temporal_id, int spatial_id);
   void start_frame();
   void tile_group_obu(std::span<const std::uint8_t> data);

@@ -33,7 +33,7 @@ void TileParser::parse(FrameContext& frame, int tile_row, int tile_col,
 
 // 5.11.2 Decode tile syntax
 void TileParser::decode_tile() {
-  // clear_above_context( ); blocks may reach a superblock's width beyond the frame
+  // clear_above_context( ); blocks may extend beyond the frame by the width of a superblock
   const std::size_t columns = static_cast<std::size_t>(header_->mi_cols) + kMaxSb4;
   coefficients_.start_tile(*seq_, *header_);
   above_seg_pred_.assign(columns, 0);

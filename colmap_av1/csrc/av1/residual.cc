@@ -1,5 +1,5 @@
-// Transform sizes and the walk over transform blocks (specification sections 5.11.15 to 5.11.17 and
-// 5.11.34 to 5.11.37; contexts as in 8.3.2).
+// Transform sizes and the loops over transform blocks (specification sections 5.11.15 to 5.11.17
+// and 5.11.34 to 5.11.37; contexts as in 8.3.2).
 #include <algorithm>
 #include <bit>
 
@@ -10,7 +10,7 @@
 namespace colmap_av1::av1 {
 namespace {
 
-// By the logarithms of width and height less 2, TX_SIZES_ALL where there is none
+// By the logarithms of width and height minus 2; TX_SIZES_ALL if there is no such size
 constexpr auto kTxSizes = [] {
   std::array<std::array<std::uint8_t, 5>, 5> sizes{};
   for (auto& row : sizes) row.fill(TX_SIZES_ALL);
@@ -20,7 +20,7 @@ constexpr auto kTxSizes = [] {
   return sizes;
 }();
 
-// find_tx_size( ) of powers of two from 4 to 64
+// find_tx_size( ) for powers of two from 4 to 64
 int find_tx_size(int w, int h) {
   const int log2_w = std::bit_width(static_cast<unsigned>(w)) - 3;
   const int log2_h = std::bit_width(static_cast<unsigned>(h)) - 3;
@@ -54,7 +54,7 @@ void TileParser::read_block_tx_size() {
                   bw4_, b_->tx_size);
     }
   }
-  // The contexts see the block's size where nothing is coded (get_above_tx_width( )).
+  // Contexts use the size of the block if nothing is coded (get_above_tx_width( )).
   const bool whole = b_->skip && b_->is_inter;
   set_tx_context(row0, col0, bw4_, bh4_, whole ? kBlockWidth[b_->mi_size] : kTxWidth[b_->tx_size],
                  whole ? kBlockHeight[b_->mi_size] : kTxHeight[b_->tx_size]);

@@ -12,18 +12,18 @@
 
 namespace colmap_av1::av1 {
 
-// What follows the last symbol of a tile. The specification demands a bit 1 and zeros to the end.
-// Encoders have shipped that wrote something else there, which decoders do not look at. More than
-// a byte or two is no ending, though: then the symbols before were not those that were coded.
+// The bits after the last symbol of a tile. The specification requires a bit 1 and zeros to the
+// end. Some encoders write other bits, which decoders ignore. More than a byte or two cannot be
+// padding, though: the symbols before it were then decoded wrongly.
 enum class TrailingBits { kValid, kOther, kData, kPastEnd };
 
 // Reads symbols coded with adaptive cumulative distributions.
 //
 // Two representations differ from the text of the specification, with the same results:
-// - CDF arrays hold 32768 - cdf ("implementations may prefer to store the inverse cdf"),
-//   the last entry stays the adaptation counter;
-// - SymbolValue is the top 16 bits of a 64-bit window that is refilled bytewise. Data enter
-//   inverted, as the specification's exclusive-or with ones does bit by bit.
+// - CDF arrays hold 32768 - cdf ("implementations may prefer to store the inverse cdf");
+//   the last entry is still the adaptation counter.
+// - SymbolValue is the top 16 bits of a 64-bit window that is refilled by bytes. The data are
+//   inverted, like the specification's bitwise exclusive-or with ones.
 class SymbolDecoder {
  public:
   // 8.2.2 Initialization process for symbol decoder
@@ -38,15 +38,15 @@ class SymbolDecoder {
     refill();
   }
 
-  // 8.2.6 Symbol decoding process, N the number of symbols of the array
+  // 8.2.6 Symbol decoding process; N is the number of symbols of the array
   template <int N>
   int symbol(std::uint16_t* icdf) {
     static_assert(N >= 2 && N <= 16);
     if constexpr (N == 2) {
       return flag(icdf);
     } else {
-      // Decoded symbols are close to random, so the search runs without branches: every bound
-      // is computed, and the symbol is the number of bounds above the value.
+      // Decoded symbols are nearly random, so the search has no branches: every bound is computed,
+      // and the symbol is the number of bounds above the value.
       if constexpr (kVectors && N <= 4) {
         return symbol_by_words<N>(icdf);
       } else {
@@ -60,13 +60,13 @@ class SymbolDecoder {
     }
   }
 
-  // A symbol of a whole array, which ends with its adaptation counter.
+  // Decodes a symbol with a whole array, which ends with its adaptation counter.
   template <std::size_t M>
   int read(std::uint16_t (&icdf)[M]) {
     return symbol<static_cast<int>(M) - 1>(icdf);
   }
 
-  // A symbol of an array of two.
+  // Decodes a symbol with an array of two symbols.
   bool flag(std::uint16_t* icdf) {
     const std::uint32_t v = icdf[0];
     const bool result = flag_without_update(v);
@@ -74,7 +74,7 @@ class SymbolDecoder {
       const std::uint32_t count = icdf[2];
       const std::uint32_t rate = 4 + (count >> 4);
       const std::uint32_t target = result ? 32768 : 0;
-      const std::uint32_t up = (target - v) >> rate;  // of a symbol 1: the bound rises
+      const std::uint32_t up = (target - v) >> rate;  // for symbol 1: the bound rises
       const std::uint32_t down = v >> rate;
       icdf[0] = static_cast<std::uint16_t>(result ? v + up : v - down);
       icdf[2] = static_cast<std::uint16_t>(count + 1 - (count >> 5));
@@ -82,7 +82,7 @@ class SymbolDecoder {
     return result;
   }
 
-  // A two-valued symbol whose distribution is built for the call and not adapted.
+  // Decodes a binary symbol with a distribution that is built for this call and not adapted.
   bool flag_without_update(std::uint32_t icdf0) {
     const std::uint32_t value = static_cast<std::uint32_t>(window_ >> 48);
     const std::uint32_t current = (((range_ >> 8) * (icdf0 >> 6)) >> 1) + 4;
@@ -110,7 +110,7 @@ class SymbolDecoder {
       // All ones for a bit 0, all zeros for a 1
       const std::uint64_t mask = static_cast<std::uint64_t>(window_ < subtrahend) - 1;
       const std::uint32_t range = half + ((range_ - 2 * half) & static_cast<std::uint32_t>(mask));
-      // Halves of a range lie between 16380 and 32895, so two bits tell the shift.
+      // Half of a range lies between 16380 and 32895, so two bits determine the shift.
       const int bits = 2 - static_cast<int>(range >> 14);
       range_ = range << bits;
       window_ = (window_ - (subtrahend & mask)) << bits;
@@ -128,10 +128,10 @@ class SymbolDecoder {
     return (v << 1) - m + bit();
   }
 
-  // Whether more bits were taken than a valid tile takes from behind its end (8.2.4).
+  // Whether more bits were read past the end than in a valid tile (8.2.4).
   bool is_past_end() const { return 8 * (end_ - data_) + available_ - padding_bits_ < -14; }
 
-  // 8.2.4 Exit process for symbol decoder: what the bits after the last symbol are.
+  // 8.2.4 Exit process for symbol decoder: classifies the bits after the last symbol.
   TrailingBits trailing_bits() const {
     const std::int64_t size_bits = 8 * (end_ - begin_);
     const std::int64_t consumed = 8 * (data_ - begin_) + padding_bits_ - available_;
@@ -139,20 +139,20 @@ class SymbolDecoder {
     const std::int64_t position = consumed - 15;  // trailingBitPosition
     const std::uint8_t* first = begin_ + (position >> 3);
     const unsigned mask = 0xFFU >> (position & 7);
-    const std::uint8_t* last = end_;  // behind the last byte that is not 0
+    const std::uint8_t* last = end_;  // one past the last nonzero byte
     while (last > first + 1 && last[-1] == 0) --last;
     const bool is_first = last == first + 1;
     if (is_first && (*first & mask) == ((mask + 1) >> 1)) return TrailingBits::kValid;
-    // Zeros alone pad nothing: a hole in a file looks so.
+    // Zeros alone are not valid padding: a hole in a file looks like this.
     if (is_first && (*first & mask) == 0) last = end_;
     constexpr std::int64_t kOtherBytes = 2;
     return last - first <= kOtherBytes ? TrailingBits::kOther : TrailingBits::kData;
   }
 
  private:
-  // Each symbol waits for the one before, and vectors take long to enter and to leave. So the few
-  // bounds of a small array are found in words, at the top of 64 bits as SymbolValue is, and
-  // vectors, which find them once more, only adapt the array.
+  // Each symbol depends on the previous one, and moving values into and out of vectors is slow. The
+  // few bounds of a small array are therefore computed in scalars, in the top of 64 bits like
+  // SymbolValue. Vectors compute them again, but only to adapt the array.
   template <int N>
   int symbol_by_words(std::uint16_t* icdf) {
     const std::uint64_t r = range_ >> 8;
@@ -173,7 +173,7 @@ class SymbolDecoder {
     return static_cast<int>(symbol);
   }
 
-  // Entries that find_symbol writes: whole vectors, of 4 lanes at least.
+  // Number of entries that find_symbol writes: whole vectors of at least 4 lanes.
   template <int N>
   static constexpr int kLanes = N <= 4   ? 4
                                 : N <= 8 ? 8
@@ -190,9 +190,9 @@ class SymbolDecoder {
 #if defined(__SSE2__) || defined(_M_X64)
   static constexpr bool kVectors = true;
 
-  // Bounds of all symbols into `bounds`, the symbol as result, and the adaptation of the array.
-  // Lanes behind the last symbol are read and written back unchanged (CdfContext has room behind
-  // its last array).
+  // Writes the bounds of all symbols to `bounds`, returns the symbol, and adapts the array. Lanes
+  // after the last symbol are read and written back unchanged (CdfContext has padding after its
+  // last array).
   template <int N>
   int find_symbol(std::uint16_t* icdf, std::uint16_t* bounds) {
     constexpr int kParts = N <= 8 ? 1 : 2;
@@ -201,7 +201,7 @@ class SymbolDecoder {
     const __m128i value = broadcast<N>(_mm_cvtsi32_si128(static_cast<int>(window_ >> 48)));
     const __m128i lane = _mm_set_epi16(7, 6, 5, 4, 3, 2, 1, 0);
     __m128i f[kParts];
-    __m128i from_symbol[kParts];  // all ones in the lanes of the symbol and behind
+    __m128i from_symbol[kParts];  // all ones in the lanes from the symbol on
     unsigned mask = 0;
     for (int k = 0; k < kParts; ++k) {
       f[k] = load<N>(icdf + 8 * k);
@@ -210,7 +210,7 @@ class SymbolDecoder {
           _mm_slli_epi16(_mm_sub_epi16(_mm_set1_epi16(static_cast<short>(N - 1 - 8 * k)), lane), 2);
       const __m128i bound = _mm_add_epi16(_mm_mulhi_epu16(scaled, r), least);
       store<N>(bounds + 8 * k, bound);
-      // bound <= value, unsigned. It holds in the last lane, where the bound is 0.
+      // bound <= value, unsigned. This is true in the last lane, where the bound is 0.
       from_symbol[k] = _mm_cmpeq_epi16(_mm_subs_epu16(bound, value), _mm_setzero_si128());
       mask |= static_cast<unsigned>(_mm_movemask_epi8(from_symbol[k])) << (16 * k);
     }
@@ -289,7 +289,7 @@ class SymbolDecoder {
 #endif
 
   void renormalize(std::uint32_t range, std::uint32_t subtrahend) {
-    // 15 - FloorLog2( range ), in words that show the compiler an operand other than 0
+    // 15 - FloorLog2( range ), written so that the compiler sees a nonzero operand
     const int bits = std::countl_zero(2 * range | 1) - 15;
     range_ = range << bits;
     window_ = (window_ - (static_cast<std::uint64_t>(subtrahend) << 48)) << bits;
@@ -300,7 +300,7 @@ class SymbolDecoder {
   void refill() {
     int shift = 40 - available_;
     if (end_ - data_ >= 8) {
-      // As many whole bytes as fit, in one load.
+      // Load as many whole bytes as fit at once.
       std::uint64_t bytes = 0;
       for (int i = 0; i < 8; ++i) bytes = (bytes << 8) | data_[i];
       const int count = (shift >> 3) + 1;
@@ -314,7 +314,7 @@ class SymbolDecoder {
       if (data_ < end_) {
         byte = *data_++;
       } else {
-        padding_bits_ += 8;  // zero bits behind the end of the data (section 8.2.2)
+        padding_bits_ += 8;  // zero bits after the end of the data (section 8.2.2)
       }
       window_ |= (byte ^ 0xFF) << shift;
       available_ += 8;

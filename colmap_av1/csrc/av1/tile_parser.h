@@ -15,20 +15,20 @@
 namespace colmap_av1::av1 {
 
 // Parses the blocks of a tile into FrameContext::grid and FrameContext::blocks. Nothing is
-// reconstructed. Its buffers are kept between tiles and frames.
+// reconstructed. Its buffers are reused for later tiles and frames.
 //
-// The methods are spread over files by subject: partition.cc, mode_info.cc, ref_frames.cc,
+// The methods are divided among files by subject: partition.cc, mode_info.cc, ref_frames.cc,
 // palette.cc, mv_syntax.cc, residual.cc.
 class TileParser {
  public:
-  // Parses a tile; blocks are written from `blocks` on. Throws BitstreamError.
+  // Parses a tile; blocks are written to the memory that starts at `blocks`. Throws BitstreamError.
   void parse(FrameContext& frame, int tile_row, int tile_col, std::span<const std::uint8_t> data,
              BlockInfo* blocks);
 
   // Blocks of the last tile in decoding order.
   std::size_t num_blocks() const { return static_cast<std::size_t>(next_block_ - first_block_); }
   const std::vector<LocalWarp>& local_warps() const { return local_warps_; }
-  // Whether the tile ends with the bits that the specification demands.
+  // Whether the tile ends with the bits that the specification requires.
   bool trailing_bits_valid() const { return trailing_bits_valid_; }
   // CDFs after the last symbol (the "Saved" arrays of the exit process, 8.2.4).
   const CdfContext& cdfs() const { return cdf_; }
@@ -136,14 +136,14 @@ class TileParser {
 
   // The block
   BlockInfo* b_ = nullptr;
-  const BlockInfo* above_ = nullptr;  // null where AvailU is 0
-  const BlockInfo* left_ = nullptr;   // null where AvailL is 0
+  const BlockInfo* above_ = nullptr;  // null if AvailU is 0
+  const BlockInfo* left_ = nullptr;   // null if AvailL is 0
   int bw4_ = 0, bh4_ = 0;
   bool lossless_ = false;
   std::array<std::array<std::uint16_t, PALETTE_COLORS>, 2> palette_colors_{};
   std::array<std::uint8_t, 64 * 64> color_map_{};
   std::array<std::uint8_t, kMaxSb4 * kMaxSb4> inter_tx_sizes_{};
-  // RefFrame of the neighbours, as inter_frame_mode_info( ) sets them up
+  // RefFrame of the neighbours, set by inter_frame_mode_info( )
   std::array<int, 2> above_ref_frame_{}, left_ref_frame_{};
   bool above_intra_ = false, left_intra_ = false, above_single_ = false, left_single_ = false;
   std::array<std::uint8_t, TOTAL_REFS_PER_FRAME> ref_counts_{};  // count_refs( )

@@ -45,7 +45,7 @@ bool warp_valid(const WarpParams& p) {
   const auto reduce = [](std::int64_t x) {
     return std::abs(round2_signed(x, WARP_PARAM_REDUCE_BITS) * (1 << WARP_PARAM_REDUCE_BITS));
   };
-  // Leaves |p[3]| below 2^14: the products below fit 64 bits, whatever p[4] is.
+  // This leaves |p[3]| below 2^14, so the products below fit in 64 bits for every p[4].
   if (4 * reduce(alpha0) + 7 * reduce(beta0) >= kOne) return false;
   const Divisor divisor = resolve_divisor(p[2]);
   const std::int64_t v = static_cast<std::int64_t>(p[4]) * kOne;
@@ -85,7 +85,7 @@ LocalWarp estimate_local_warp(const BlockInfo& block, std::span<const WarpSample
   // wide and samples come from blocks that touch this one, so |sx|, |sy| <= 1024 in 1/8 sample,
   // |dx|, |dy| < 1024 + LS_MV_MAX, and each of the 8 terms of a sum is below 2^18.4. Sums stay
   // below 2^21.4, determinants and the divided values below 2^43.8; the factor is at most 2^14,
-  // or 2^16 where shift is negative.
+  // or 2^16 if shift is negative.
   const std::int64_t det = a00 * a11 - a01 * a01;
   if (det == 0) return warp;
   Divisor divisor = resolve_divisor(det);

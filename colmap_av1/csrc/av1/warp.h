@@ -7,7 +7,7 @@
 
 namespace colmap_av1::av1 {
 
-// An entry of CandList: position in this frame and in the reference, in 1/8 luma samples
+// An entry of CandList: positions in this frame and in the reference, in 1/8 luma samples
 struct WarpSample {
   int row = 0;
   int col = 0;
@@ -18,7 +18,7 @@ struct WarpSample {
 // 7.11.3.6 Setup shear process: warpValid
 bool warp_valid(const WarpParams& warp_params);
 
-// 7.11.3.8 Warp estimation process, and the check of the shear that 7.11.3.1 adds
+// 7.11.3.8 Warp estimation process, and the shear check of 7.11.3.1
 LocalWarp estimate_local_warp(const BlockInfo& block, std::span<const WarpSample> samples);
 
 }  // namespace colmap_av1::av1

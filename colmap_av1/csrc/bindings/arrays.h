@@ -1,4 +1,4 @@
-// Arrays to and from NumPy, without a copy.
+// Passes arrays to and from NumPy without copying.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -11,11 +11,11 @@
 
 namespace colmap_av1 {
 
-// What the core reads.
+// An array that the core reads.
 template <typename T, typename Shape>
 using InputArray = nanobind::ndarray<const T, Shape, nanobind::c_contig, nanobind::device::cpu>;
 
-// Hands a vector's memory to NumPy.
+// Transfers the memory of a vector to NumPy.
 template <typename T, typename U, typename A>
 nanobind::object adopt(std::vector<U, A>&& data, std::initializer_list<std::size_t> shape) {
   static_assert(sizeof(U) % sizeof(T) == 0);

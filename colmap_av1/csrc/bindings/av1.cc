@@ -152,7 +152,7 @@ nb::dict sequence_dict(const SequenceHeader& s, int operating_point_idc) {
 }
 
 // The blocks of a decoded frame as bytes, the index of each unit's block, and the local warps. The
-// first two are moved out, so this works once.
+// first two are moved out of the event, so this can be called once.
 nb::tuple take_blocks(Event& event) {
   const auto rows = static_cast<std::size_t>(event.header.mi_rows);
   const auto cols = static_cast<std::size_t>(event.header.mi_cols);

@@ -9,7 +9,7 @@
 
 namespace colmap_av1 {
 
-// The bytes of an object that has the buffer protocol, while it lives.
+// Holds the bytes of a Python object with the buffer protocol.
 class Buffer {
  public:
   explicit Buffer(nanobind::handle object) {

@@ -49,7 +49,7 @@ std::array<std::int32_t, 8> read_indices(nb::handle frame, const char* name) {
   return indices;
 }
 
-// NumPy's name of a field's type
+// NumPy's name for the type of a field
 template <typename T>
 std::string format_of(const T&) {
   static_assert(std::is_integral_v<T>);
@@ -64,7 +64,7 @@ std::string format_of(const std::array<T, kSize>& values) {
   return "(" + std::to_string(kSize) + ",)" + format_of(values[0]);
 }
 
-// BlockInfo as NumPy's record type
+// BlockInfo as a NumPy record type
 nb::object block_dtype() {
   const av1::BlockInfo block;
   nb::list names;

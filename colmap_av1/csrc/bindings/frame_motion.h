@@ -1,4 +1,4 @@
-// The package's FrameMotion as the core reads it.
+// Converts the package's FrameMotion for the core.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -11,8 +11,8 @@
 
 namespace colmap_av1 {
 
-// Holds the arrays of a FrameMotion object. Throws nanobind::type_error for a value of another
-// type, std::invalid_argument for arrays that do not fit each other.
+// Holds the arrays of a FrameMotion object. Throws nanobind::type_error for a value of a wrong
+// type, and std::invalid_argument for inconsistent arrays.
 class HeldFrameMotion {
  public:
   explicit HeldFrameMotion(nanobind::handle frame);

@@ -1,4 +1,4 @@
-// Python's view of the geometry core: arrays in, arrays out, the GIL released between.
+// Python bindings of the geometry core: functions on arrays that release the GIL.
 
 #include "bindings/geometry.h"
 
@@ -244,34 +244,33 @@ void bind_geometry(nb::module_& m) {
         "view"_a, "rays"_a, "sigma"_a, "first"_a, "last"_a, "min_observations"_a,
         "max_reprojection_error"_a, "min_angle"_a, "max_depth_error"_a.none(), "sigma_floor"_a,
         "error_to_sigma"_a,
-        "Points of the tracks from `first` to before `last`: (xyz, error, count, observation, "
-        "num_agreeing, num_tracks).");
+        "Triangulate the tracks from `first` up to but excluding `last`: (xyz, error, count, "
+        "observation, num_agreeing, num_tracks).");
   m.def("correlate_patches", &correlate_patches, "one"_a, "at_one"_a, "two"_a, "at_two"_a,
         nb::kw_only(), "min_deviation"_a,
         "Correlations [n, d] of the patches around positions [n, 2] in one grey picture with those "
         "around positions [n, d, 2] in another.");
   m.def("find_patches", &find_patches, "patches"_a, "index"_a, nb::kw_only(), "middle"_a,
         "change"_a, "target"_a, "start"_a, "max_move"_a,
-        "Where a grey picture shows patches [p, side, side] as another view changes them: (xy "
-        "[n, 2], pixels by which the way back misses [n], inf where they are not found, likeness "
-        "[n]).");
+        "Search a grey picture for patches [p, side, side] that another view deforms: (xy [n, 2], "
+        "forward-backward error in pixels [n], inf if not found, likeness [n]).");
   m.def("reprojection_errors", &reprojection_errors, nb::kw_only(), "cam_from_world"_a, "focal"_a,
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a,
         "Reprojection error in pixels of each observation of points, inf behind the camera.");
   m.def("widest_angles", &widest_angles, nb::kw_only(), "centres"_a, "xyz"_a, "offsets"_a, "view"_a,
-        "Angle in radians at which the rays of each point meet, about the widest.");
+        "Largest triangulation angle of each point in radians, slightly too small at worst.");
   m.def("hanging_observations", &hanging_observations, nb::kw_only(), "cam_from_world"_a, "focal"_a,
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a, "before"_a, "as_near"_a,
         "support"_a, "around"_a, "fewest_around"_a,
-        "Of each point, the number of its observations in which it hangs before what is around.");
+        "Number of observations of each point as a floater, in front of what is around it.");
   m.def("points_in_view", &points_in_view, "cam_from_world"_a, "low"_a, "high"_a, "xyz"_a,
-        "The points before a camera whose rays lie within bounds: (index, xyz in the camera).");
+        "The points in front of a camera with rays within bounds: (index, xyz in the camera).");
   m.def("points_in_picture", &points_in_picture, "cam_from_world"_a, "pinhole"_a, "width"_a,
         "height"_a, "xyz"_a,
-        "The points that lie in a pinhole camera's picture: (index, xy, depth).");
+        "The points that project into a pinhole camera's picture: (index, xy, depth).");
   m.def("nearest_in_cells", &nearest_in_cells, "xy"_a, "depth"_a, nb::kw_only(), "cell"_a,
         "columns"_a, "rows"_a,
-        "Least of the depths [n] at pixels [n, 2] in each cell of a picture, [rows, columns].");
+        "Smallest of the depths [n] at pixels [n, 2] in each cell of a picture: [rows, columns].");
   m.def("best_at_spacings", &best_at_spacings, "xy"_a, "depth"_a, "rank"_a, nb::kw_only(),
         "width"_a, "height"_a, "spacings"_a, "steps_per_octave"_a, "most_steps"_a,
         "Index of the first spacing at which each point is the best of its cell and surface.");

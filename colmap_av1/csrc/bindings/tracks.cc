@@ -1,4 +1,4 @@
-// Python's view of the tracks core: frames and arrays in, arrays out, the GIL released between.
+// Python bindings of the tracks core: frames and arrays in, arrays out; the GIL is released.
 
 #include "bindings/tracks.h"
 
@@ -95,7 +95,7 @@ void bind_tracks(nb::module_& m) {
 
   m.def("select_spread", &select_spread, nb::kw_only(), "num_frames"_a, "offsets"_a, "frame"_a,
         "xy"_a, "order"_a, "spacing"_a, "max_tracks_per_image"_a, "min_length"_a,
-        "Flags, uint8 [num_observations], of a spread choice of tracks, best first in `order`.");
+        "Select spread tracks, the best first in `order`: flags, uint8 [num_observations].");
 }
 
 }  // namespace colmap_av1

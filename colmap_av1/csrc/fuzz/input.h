@@ -1,5 +1,5 @@
-// What the fuzzers share: their input, bytes that say how to run and then temporal units, and the
-// check of what is promised.
+// Common parts of the fuzzers: their input, which has option bytes and then temporal units, and the
+// check of conditions.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@ class Input {
 
   bool empty() const { return rest_.empty(); }
 
-  // Past the end come zeros: every input is a valid one.
+  // Zeros follow after the end, so that every input is valid.
   std::uint8_t byte() {
     if (rest_.empty()) return 0;
     const std::uint8_t value = rest_.front();
@@ -39,7 +39,7 @@ class Input {
   }
 
   // A temporal unit: its size in four bytes, little-endian, and its data. A size beyond the end
-  // means what is left, so that a cut or grown input still says something.
+  // means the rest, so that a truncated or extended input is still useful.
   std::span<const std::uint8_t> unit() {
     const std::size_t size = std::min<std::size_t>(number<std::uint32_t>(), rest_.size());
     const auto unit = rest_.first(size);

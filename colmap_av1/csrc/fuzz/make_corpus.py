@@ -1,11 +1,11 @@
-"""Writes the fuzzers' seeds: IVF files as inputs of parser_fuzzer and track_builder_fuzzer.
+"""Write the seeds of the fuzzers: IVF files as inputs of parser_fuzzer and track_builder_fuzzer.
 
     python make_corpus.py corpus FILE.ivf...
 
 Each file gives corpus/parser/NAME and corpus/track_builder/NAME with as many of its first
-temporal units as the size limit lets in; corpus/track_builder/random_N makes block data up, and
-corpus/model/random_N points and pictures. The committed seeds were made from the conformance
-kit's streams and damaged files and, but for those of the model, thinned out by libFuzzer's
+temporal units as fit the size limit. corpus/track_builder/random_N are random block data, and
+corpus/model/random_N random points and pictures. The committed seeds were made from the streams and
+damaged files of the conformance kit and, except for those of the model, reduced by libFuzzer's
 -merge=1.
 """
 
@@ -24,15 +24,15 @@ _IVF_FRAME_HEADER_SIZE = 12
 _PARSER_OPTIONS = bytes([0x00])
 _TRACK_BUILDER_OPTIONS = bytes([0x00, 0xFD])
 _NUM_RANDOM = 4
-# Of the model: kinds of input that its first byte says, and bytes of a seed. In every second one
-# nearly all numbers are small, as those of real scenes are.
+# For the model: number of kinds of input, which the first byte selects, and bytes of a seed. In
+# every second seed nearly all numbers are small, like those of real scenes.
 _NUM_KINDS = 3
 _MODEL_SIZE = 900
 _SMALL = range(100, 156)
 
 
 def temporal_units(ivf: bytes) -> list[bytes]:
-    """The units of an IVF file; of a damaged one those that can be found."""
+    """The temporal units of an IVF file; if it is damaged, those that can be found."""
     units = []
     position = _IVF_HEADER_SIZE
     while position + _IVF_FRAME_HEADER_SIZE <= len(ivf):

@@ -1,5 +1,5 @@
-// Any numbers as points, cameras and pictures, as a caller of the Python module could give them:
-// what does not fit is refused, and what is found lies where it should.
+// Passes arbitrary numbers as points, cameras and pictures, as a caller of the Python module could.
+// Inconsistent arrays must be rejected, and results must lie within their bounds.
 
 #include <algorithm>
 #include <array>
@@ -28,7 +28,7 @@ namespace geometry = colmap_av1::geometry;
 using Doubles = std::vector<double>;
 using Indices = std::vector<std::int64_t>;
 
-// Numbers near 0, as rays and places are, and those at which arithmetic ends.
+// Numbers near 0, like rays and positions, and numbers at the limits of arithmetic.
 double real(Input& input) {
   constexpr double kLargest = std::numeric_limits<double>::max();
   constexpr std::array<double, 6> kEdges{
@@ -45,7 +45,7 @@ Doubles reals(Input& input, std::size_t count) {
   return found;
 }
 
-// Now and then one more than there are, or one less than none.
+// An index that is sometimes out of range by one, at either end.
 Indices indices(Input& input, std::size_t count, std::size_t size) {
   Indices found(count);
   for (std::int64_t& value : found) {
@@ -56,7 +56,7 @@ Indices indices(Input& input, std::size_t count, std::size_t size) {
   return found;
 }
 
-// Where each of so many rows begins and the last one ends, nearly always in order.
+// Offsets of rows, which are nearly always in order.
 Indices offsets(Input& input, std::size_t count, std::size_t total) {
   Indices found(count + 1);
   for (std::int64_t& value : found) value = input.byte() % static_cast<std::int64_t>(total + 1);
@@ -66,7 +66,7 @@ Indices offsets(Input& input, std::size_t count, std::size_t total) {
   return found;
 }
 
-// Calls a function of the core; what it refuses is no matter.
+// Calls a function of the core, which may reject its input.
 template <typename Call>
 void refused_or(const Call& call) {
   try {
@@ -173,7 +173,7 @@ void run_pictures(Input& input) {
   refused_or([&] {
     const Indices stages =
         geometry::best_at_spacings(shown.xy, shown.depth, rank, width, height, options);
-    // The first point is the best one, wherever it is.
+    // The first point has the best rank, so it is selected wherever it is.
     check(stages.empty() || stages.front() == 0, "the best point is wanted first");
   });
   rank.resize(depths.size());
@@ -201,7 +201,7 @@ void run_patches(Input& input) {
   const Indices index = indices(input, num_sought, pixels.empty() ? 0 : 1);
   std::vector<float> change(4 * num_sought);
   for (float& value : change) value = static_cast<float>(real(input));
-  // The picture itself where it is a square, so that something is found.
+  // A square picture is its own patch, so that something is found.
   const geometry::CutPatches patches{
       .pixels = pixels, .side = width, .index = index, .middle = places, .change = change};
   const auto max_move = static_cast<float>(real(input));

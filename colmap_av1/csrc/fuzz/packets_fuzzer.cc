@@ -1,7 +1,8 @@
-// Any bytes as what a container hands over: the OBUs of its configuration (an av1C box), then
-// packets. They are read as the package reads them: headers first, which say where groups of frames
-// start that refer to none before; then whole, once from the start and once group by group, as
-// threads do. Both must give the same frames and end at the same packet.
+// Passes arbitrary bytes as the content of a container: the OBUs of its configuration (an av1C
+// box), then packets. They are read like the package reads them. First the headers, which determine
+// where groups of frames start that refer to no earlier frames. Then everything, once from the
+// start and once group by group, like threads do. Both must give the same frames and end at the
+// same packet.
 
 #include <cstddef>
 #include <cstdint>
@@ -27,7 +28,7 @@ using colmap_av1::fuzz::check;
 using Packet = std::vector<std::uint8_t>;
 using Events = std::vector<std::unique_ptr<Event>>;
 
-// A few bytes ask for a whole frame; these bound the time of one input.
+// A few bytes can require a large frame; these limits bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 256 * 256;
 constexpr std::size_t kMaxPackets = 32;
 constexpr std::size_t kMaxEvents = 32;
@@ -37,7 +38,7 @@ struct Group {
   std::optional<RestartPoint> start;  // none at the start of the stream
 };
 
-// Parses a packet and moves its events out; false where the stream is damaged there.
+// Parses a packet and moves its events out; false if the packet is damaged.
 bool parse(Parser& parser, const Packet& packet, Events& events) {
   bool whole = true;
   try {
@@ -60,7 +61,7 @@ std::vector<Group> groups_of(const std::vector<Packet>& packets, ParserOptions o
     std::optional<RestartPoint> start;
     try {
       start = parser.restart_point();
-    } catch (const BitstreamError&) {  // inside a frame
+    } catch (const BitstreamError&) {  // the parser is inside a frame
     }
     Events events;
     const bool whole = parse(parser, packets[i], events);
@@ -110,7 +111,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   }
   const std::vector<Group> groups = groups_of(packets, options);
 
-  // The first packet that is damaged or goes beyond what is tried.
+  // The first packet that is damaged or exceeds the limits.
   Parser parser(options);
   std::vector<Events> events(packets.size());
   std::size_t num_whole = 0;

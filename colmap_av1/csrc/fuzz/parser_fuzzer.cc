@@ -1,5 +1,5 @@
-// Any bytes as an AV1 stream. Besides what the sanitizers see, the events must keep the promises
-// that their users index arrays by.
+// Passes arbitrary bytes as an AV1 stream. In addition to the checks of the sanitizers, values of
+// the events that callers use as array indices must be in range.
 
 #include <cstddef>
 #include <cstdint>
@@ -20,7 +20,7 @@ using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
 using colmap_av1::fuzz::check;
 
-// A few bytes ask for a whole frame; these bound the time of one input.
+// A few bytes can require a large frame; these limits bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 512 * 512;
 constexpr std::size_t kMaxEvents = 32;
 
@@ -76,11 +76,11 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   std::size_t num_events = 0;
   std::span<const std::uint8_t> first;
   const auto parse = [&](std::span<const std::uint8_t> unit) {
-    // The parser sees a copy: a read past the unit is a read past an allocation.
+    // The parser gets a copy, so that a read past the unit is a read past an allocation.
     const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
     try {
       parser.parse(copy);
-    } catch (const BitstreamError&) {  // a caller may go on after an error
+    } catch (const BitstreamError&) {  // a caller may continue after an error
     } catch (const LimitError&) {
     }
     num_events += parser.events().size();
@@ -93,7 +93,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     parse(unit);
   }
   try {
-    // Whatever follows, as a reader goes on that starts at a later group of frames
+    // Any data may follow a restart, as when a reader starts at a later group of frames.
     parser.restart(parser.restart_point());
     parse(first);
     parser.finish();

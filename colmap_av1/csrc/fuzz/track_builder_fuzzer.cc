@@ -1,5 +1,5 @@
-// Any bytes as the motion of a video: parsed from temporal units, as `read_motion` would hand it
-// over, or block data made up from the bytes, as a caller of the Python module could.
+// Passes arbitrary bytes as the motion of a video: either parsed from temporal units, like
+// `read_motion` does, or as block data made from the bytes, as a caller of the Python module could.
 
 #include <array>
 #include <cstddef>
@@ -33,11 +33,11 @@ using colmap_av1::tracks::TrackArrays;
 using colmap_av1::tracks::TrackBuilder;
 using colmap_av1::tracks::TrackBuilderOptions;
 
-// They bound the time of one input.
+// These limits bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 256 * 256;
 constexpr std::size_t kMaxFrames = 24;
 
-// A frame with what it borrows.
+// A frame with the data that it refers to.
 struct Frame {
   FrameMotion motion;
   std::vector<BlockInfo> blocks;
@@ -71,7 +71,7 @@ TrackBuilderOptions read_options(Input& input) {
   return options;
 }
 
-// Displacements and tracks of a frame. False where it contradicts itself.
+// Computes displacements and tracks of a frame; false if its data are inconsistent.
 bool add(TrackBuilder& builder, const FrameMotion& frame) {
   try {
     colmap_av1::tracks::check_frame_motion(frame);
@@ -123,7 +123,7 @@ std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only, std::
   return std::move(parser.events());
 }
 
-// What `read_motion` makes of the events (motion/reading.py)
+// Converts events to frames like `read_motion` (motion/reading.py)
 void run_parsed(Input input, TrackBuilder& builder) {
   std::vector<int> shown;
   int last_unit = -1;
@@ -171,7 +171,7 @@ void run_parsed(Input input, TrackBuilder& builder) {
   }
 }
 
-// A number as a caller could get it wrong: the edges are where sums overflow.
+// A number that a caller could pass by mistake, including those at which sums overflow.
 std::int32_t wrong_number(Input& input) {
   const unsigned choice = input.byte();
   switch (choice & 7) {
@@ -184,7 +184,7 @@ std::int32_t wrong_number(Input& input) {
   }
 }
 
-// Block data that no parser has looked at
+// Block data that no parser has checked
 void run_made_up(Input input, TrackBuilder& builder) {
   int num_shown = 0;
   for (std::size_t count = 0; !input.empty() && count < kMaxFrames; ++count) {
@@ -194,7 +194,7 @@ void run_made_up(Input input, TrackBuilder& builder) {
     auto& motion = frame.motion;
     motion.mi_rows = input.byte() % 17;
     motion.mi_cols = input.byte() % 17;
-    const bool wild = (choice & 1) != 0;  // frame-wide numbers that no stream holds
+    const bool wild = (choice & 1) != 0;  // values of the frame that no stream can have
     const bool wild_units = (choice & 0x82) == 0x82;
     motion.frame_width = wild ? wrong_number(input) : 4 * motion.mi_cols;
     motion.height = wild ? wrong_number(input) : 4 * motion.mi_rows;

@@ -1,4 +1,4 @@
-// Points of the world, and the cameras that see them: poses are [3][4], x_cam = R x + t.
+// Points in the world and cameras that observe them. Poses are [3][4], x_cam = R x + t.
 #pragma once
 
 #include <algorithm>
@@ -21,7 +21,7 @@ inline Vector between(const double* from, const double* to) {
   return {to[0] - from[0], to[1] - from[1], to[2] - from[2]};
 }
 
-// Unit vector from one place to another; 0 where they are the same.
+// Unit vector from one point to another; 0 if they are equal.
 inline Vector unit_vector(const double* from, const double* to) {
   Vector ray = between(from, to);
   const double norm = length(ray);
@@ -31,7 +31,7 @@ inline Vector unit_vector(const double* from, const double* to) {
   return ray;
 }
 
-// Where the camera of a pose is.
+// The position of the camera with a pose.
 inline Vector camera_centre(const double* pose) {
   Vector centre{};
   for (std::size_t i = 0; i < 3; ++i) {
@@ -40,7 +40,7 @@ inline Vector camera_centre(const double* pose) {
   return centre;
 }
 
-// A point of the world in a camera's own coordinates.
+// A point in camera coordinates.
 inline Vector to_camera(const double* pose, const double* point) {
   Vector found{};
   for (std::size_t i = 0; i < 3; ++i) {
@@ -50,7 +50,7 @@ inline Vector to_camera(const double* pose, const double* point) {
   return found;
 }
 
-// Where a camera should see a point, and how far that is from where it does.
+// The projection of a point into a camera, and its reprojection error.
 struct Projection {
   double x = 0;  // ray (x / z, y / z)
   double y = 0;
@@ -58,7 +58,7 @@ struct Projection {
   double error2 = std::numeric_limits<double>::infinity();  // px^2; infinite behind the camera
 };
 
-// The projection of a point that is seen at a ray (x, y); focal lengths turn errors into pixels.
+// Projects a point that is observed at a ray (x, y); focal lengths convert errors to pixels.
 inline Projection project(const double* pose, const double* focal, double x, double y,
                           const double* point) {
   const auto [u, v, depth] = to_camera(pose, point);
@@ -74,9 +74,9 @@ inline Projection project(const double* pose, const double* focal, double x, dou
   return found;
 }
 
-// Angle in radians at which rays meet, of which `ray_of` gives unit vectors by their number:
-// against those of the first and the last one, so at most a little less than the widest. 0 for rays
-// that are not finite.
+// Triangulation angle in radians of rays, of which `ray_of` gives unit vectors by index. Only
+// angles to the first and the last ray are compared, so the result can be slightly less than the
+// largest angle. 0 for rays that are not finite.
 template <typename RayOf>
 double widest_angle(std::size_t count, const RayOf& ray_of) {
   if (count == 0) return 0;

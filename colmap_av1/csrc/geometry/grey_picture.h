@@ -1,4 +1,4 @@
-// Grey pictures, and what lies between their pixels.
+// Grey pictures, and bilinear interpolation between their pixels.
 #pragma once
 
 #include <algorithm>
@@ -11,22 +11,22 @@
 
 namespace colmap_av1::geometry {
 
-// Borrowed: a grey picture, rows one after the other.
+// A view of a grey picture, row by row.
 struct GreyPicture {
   std::span<const std::uint8_t> pixels;  // [height][width]
   std::int64_t width = 0;
   std::int64_t height = 0;
 };
 
-// Rows are as long as several processor registers, so that a compiler works on whole ones; what
-// lies beyond the side does not count.
+// Rows are padded to a multiple of 4 values, so that the compiler can use whole vector registers.
+// The padding is ignored.
 constexpr int lanes_of(int side) { return (side + 3) / 4 * 4; }
 
 template <int kSide>
 using Block = std::array<std::array<float, lanes_of(kSide)>, kSide>;
 
-// A picture as numbers to compute with, that goes on for some pixels beyond its edges as it ends
-// there. Throws std::invalid_argument where its pixels do not fit its size.
+// A picture of floats whose border is replicated by a margin of some pixels. Throws
+// std::invalid_argument if the pixels do not match the size.
 class FloatPicture {
  public:
   explicit FloatPicture(const GreyPicture& picture, std::int64_t margin = 0) : margin_(margin) {
@@ -34,7 +34,7 @@ class FloatPicture {
         picture.pixels.size() != static_cast<std::size_t>(picture.width * picture.height)) {
       throw std::invalid_argument("pixels do not fit the picture's size");
     }
-    // One without pixels has no edge to go on from.
+    // A picture without pixels has no border to replicate.
     if (picture.pixels.empty()) return;
     width_ = picture.width + 2 * margin;
     height_ = picture.height + 2 * margin;
@@ -49,14 +49,14 @@ class FloatPicture {
     }
   }
 
-  // The block of pixels around (x, y), bilinearly, the centre of the first pixel at (0.5, 0.5); and
-  // whether it lies within the picture and what goes on beyond it.
+  // Interpolates the block of pixels around (x, y); the centre of the first pixel is (0.5, 0.5).
+  // Returns whether the block lies within the picture and its margin.
   template <int kSide>
   bool sample(float x, float y, Block<kSide>& block) const {
     constexpr int kLanes = lanes_of(kSide);
     const float left = x - 0.5F * kSide + static_cast<float>(margin_);
     const float top = y - 0.5F * kSide + static_cast<float>(margin_);
-    // Of pixels that are read the last ones are one beyond the block. False for what is no number.
+    // One pixel beyond the block is read. The condition is false for NaN.
     if (!(left >= 0 && top >= 0 && left < static_cast<float>(width_ - kLanes) &&
           top < static_cast<float>(height_ - kSide))) {
       return false;

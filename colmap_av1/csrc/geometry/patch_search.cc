@@ -11,16 +11,16 @@
 namespace colmap_av1::geometry {
 namespace {
 
-// Side in pixels of what is compared.
+// Side in pixels of the compared windows.
 constexpr int kWindow = 11;
-// Steps at most, the pixels below which one is the last, and those that the last may have: what
-// creeps on is no place that the picture shows.
+// Largest number of steps, the length in pixels below which a step is the last one, and the largest
+// length of the last step. A search that still moves has not found the patch.
 constexpr int kMostSteps = 10;
 constexpr float kLastStep = 0.005F;
 constexpr float kAtRest = 0.03F;
-// Least square of what changes from pixel to pixel along any direction, in grey values.
+// Smallest mean squared gradient along any direction, in squared grey levels per squared pixel.
 constexpr float kLeastChange = 0.1F;
-// Pixels by which pictures go on beyond their edges.
+// Number of pixels by which the border of a picture is replicated.
 constexpr std::int64_t kMargin = 16;
 
 template <std::size_t kCount>
@@ -37,12 +37,11 @@ struct Step {
   float y = 0;
 };
 
-// What a window shows, and how that changes from pixel to pixel. Lanes beyond the side are 0, and
-// do not count.
+// The pixels of a window and their gradients. Lanes beyond the side are 0 and ignored.
 template <int kSide>
 class Window {
  public:
-  // From what is in it and one pixel around; false where that has no corner.
+  // Sets the window from its pixels and a border of one pixel; false if it shows no corner.
   bool set(const Block<kSide + 2>& around) {
     for (int r = 0; r < kSide; ++r) {
       const auto& above = around[r];
@@ -74,7 +73,7 @@ class Window {
     return true;
   }
 
-  // By how much what a block shows lies off this.
+  // The offset of the content of a block from that of this window.
   Step step_to(const Block<kSide>& block) const {
     Row sums_x{};
     Row sums_y{};
@@ -92,7 +91,7 @@ class Window {
 
   const Block<kSide>& grey() const { return grey_; }
 
-  // Normalised cross-correlation of what two windows show.
+  // Normalised cross-correlation of two windows.
   float likeness(const Window& other) const {
     const Block<kSide> one = without_mean(grey_);
     const Block<kSide> two = without_mean(other.grey_);
@@ -149,7 +148,7 @@ struct Place {
   float y = 0;
 };
 
-// The place of a window in a picture, looked for from a place on.
+// Searches for the position of a window in a picture, from a start position.
 std::optional<Place> find(const Window<kWindow>& window, const FloatPicture& target, float max_move,
                           Place start) {
   auto [x, y] = start;
@@ -176,7 +175,8 @@ std::optional<Place> find(const Window<kWindow>& window, const FloatPicture& tar
   return Place{x, y};
 }
 
-// The block of pixels that a changed patch shows around its middle; false where it has too few.
+// Samples the block of pixels around the point of a deformed patch; false if the patch is too
+// small.
 bool sample_patch(const CutPatches& patches, std::size_t i, Block<kWindow + 2>& block) {
   constexpr int kSide = kWindow + 2;
   const auto last = static_cast<float>(patches.side - 1);
@@ -242,7 +242,7 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
     }
     found.xy[2 * i] = place->x;
     found.xy[2 * i + 1] = place->y;
-    // The first step on the way back: to where it began, if that is what is shown there.
+    // The first step of the backward search leads to the start if the content is the same.
     const Step back = shown.step_to(sought.grey());
     found.missed[i] = std::max(std::abs(back.x), std::abs(back.y));
     found.likeness[i] = sought.likeness(shown);

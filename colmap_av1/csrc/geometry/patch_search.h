@@ -1,4 +1,4 @@
-// Patches cut out of pictures, found in another picture by Lucas-Kanade.
+// Search of patches from some pictures in another picture by Lucas-Kanade.
 #pragma once
 
 #include <cstdint>
@@ -9,28 +9,28 @@
 
 namespace colmap_av1::geometry {
 
-// What is to be found: squares cut out of pictures, and how another picture shows them.
+// The patches to search: squares cut out of pictures, and how another picture deforms them.
 struct CutPatches {
   std::span<const std::uint8_t> pixels;  // [num_patches][side][side]
   std::int64_t side = 0;                 // odd
-  std::span<const std::int64_t> index;   // [n] which patch is sought
-  std::span<const float> middle;  // [n][2] pixels by which its point lies off the patch's middle
+  std::span<const std::int64_t> index;   // [n] which patch to search
+  std::span<const float> middle;  // [n][2] offset in pixels of its point from the patch's centre
   std::span<const float>
-      change;  // [n][2][2] pixels (x, y) of the patch to one along x, and along y
+      change;  // [n][2][2] affine map from pixels of the other picture to those of the patch
 };
 
-// Where patches are found.
+// The positions of patches.
 struct FoundPatches {
   std::vector<float> xy;        // [n][2]
-  std::vector<float> missed;    // [n] pixels by which the way back misses; inf: not found
-  std::vector<float> likeness;  // [n] normalised cross-correlation of what both show
+  std::vector<float> missed;    // [n] forward-backward error in pixels; inf: not found
+  std::vector<float> likeness;  // [n] normalised cross-correlation of both windows
 };
 
-// Looks for 11x11 pixels around the points of patches near the positions `start` [n][2], (x, y) in
-// pixels, the centre of the first one at (0.5, 0.5), by inverse compositional steps (Baker and
-// Matthews, "Lucas-Kanade 20 Years On", 2004); the picture goes on beyond its edges as it ends. Not
-// found is what has no corner, what moves by more than `max_move` pixels along x or y, and what
-// does not come to rest. Throws std::invalid_argument for arrays that do not fit.
+// Searches for 11x11 pixels around the points of patches near the positions `start` [n][2], (x, y)
+// in pixels; the centre of the first pixel is (0.5, 0.5). Inverse compositional steps are used
+// (Baker and Matthews, "Lucas-Kanade 20 Years On", 2004), and the border of the picture is
+// replicated. A patch is not found if it shows no corner, moves by more than `max_move` pixels
+// along x or y, or does not converge. Throws std::invalid_argument for inconsistent arrays.
 FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
                           std::span<const float> start, float max_move);
 

@@ -13,7 +13,7 @@ static_assert(lanes_of(kPatch) == kPatch, "each lane counts");
 using Patch = Block<kPatch>;
 using Row = Patch::value_type;
 
-// By halves: a processor adds what does not wait for each other at once.
+// Sums by halves, because a processor can do independent additions in parallel.
 float sum_of(Row row) {
   for (int half = kPatch / 2; half > 0; half /= 2) {
     for (int i = 0; i < half; ++i) {
@@ -33,7 +33,7 @@ float mean_of(const Patch& patch) {
   return sum_of(sums) / kSamples;
 }
 
-// Makes the mean of a patch 0 and its norm 1; false where it is too flat for that.
+// Normalises a patch to mean 0 and norm 1; false if it has too little contrast.
 bool normalise(Patch& patch, float min_norm) {
   const float mean = mean_of(patch);
   Row squares{};
@@ -55,7 +55,7 @@ bool normalise(Patch& patch, float min_norm) {
   return true;
 }
 
-// Correlation of a normalised patch with one that is not; -1 where that is too flat.
+// Correlation of a normalised patch with another patch; -1 if that has too little contrast.
 float correlation(const Patch& normalised, const Patch& other, float min_norm) {
   const float mean = mean_of(other);
   Row squares{};
@@ -82,7 +82,7 @@ std::vector<float> correlate_patches(const GreyPicture& one, std::span<const flo
     throw std::invalid_argument("positions do not fit each other");
   }
   const std::size_t tried = count == 0 ? 0 : at_two.size() / at_one.size();
-  const float min_norm = min_deviation * kPatch;  // the root of the number of samples
+  const float min_norm = min_deviation * kPatch;  // kPatch is the root of the number of samples
   const FloatPicture first(one);
   const FloatPicture second(two);
   std::vector<float> found(count * tried, -1.0F);

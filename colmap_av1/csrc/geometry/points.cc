@@ -11,7 +11,7 @@
 namespace colmap_av1::geometry {
 namespace {
 
-// Throws for points, rows of observations and views that do not fit each other.
+// Throws for inconsistent points, observations and views.
 void check_rows(std::size_t num_points, std::span<const std::int64_t> offsets, std::size_t total) {
   if (offsets.size() != num_points + 1 || offsets.front() != 0 ||
       offsets.back() != static_cast<std::int64_t>(total) ||
@@ -39,15 +39,15 @@ void check(const SeenPoints& points) {
   check_indices(points.observation, points.view.size());
 }
 
-// A point in an image: in which square, and how far from the camera.
+// An observation of a point: its square in the image, and its distance from the camera.
 struct InSquare {
-  double row = 0;  // whole numbers, as the column
+  double row = 0;  // an integer, like the column
   double column = 0;
   double distance = 0;
   std::int64_t point = 0;
 };
 
-// Counts the points that hang among those of one square; their order is changed.
+// Counts the floaters among the points of one square, and changes the order of the points.
 void count_hanging(std::span<InSquare> square, const HangingOptions& options,
                    std::vector<std::int64_t>& counts) {
   if (static_cast<std::int64_t>(square.size()) < options.fewest_around) return;
@@ -55,7 +55,7 @@ void count_hanging(std::span<InSquare> square, const HangingOptions& options,
   std::nth_element(square.begin(), middle, square.end(),
                    [](const InSquare& a, const InSquare& b) { return a.distance < b.distance; });
   const double limit = options.before * middle->distance;
-  // What is nearer than the middle one lies before it now.
+  // After nth_element, points nearer than the median come before it.
   for (const InSquare& own : std::span(square.begin(), middle)) {
     if (!(own.distance < limit)) continue;
     const auto near = std::count_if(square.begin(), square.end(), [&](const InSquare& other) {
@@ -66,14 +66,14 @@ void count_hanging(std::span<InSquare> square, const HangingOptions& options,
   }
 }
 
-// The observations of points, one view after the other.
+// The observations of points, sorted by view.
 struct ByViews {
   struct Seen {
     std::int64_t point = 0;
     std::int64_t observation = 0;
   };
   std::vector<Seen> seen;
-  std::vector<std::int64_t> bounds;  // view v has those from bounds[v] to before bounds[v + 1]
+  std::vector<std::int64_t> bounds;  // view v has observations bounds[v] to bounds[v + 1] - 1
 };
 
 ByViews order_by_views(const SeenPoints& points, std::size_t num_views) {
@@ -153,7 +153,7 @@ std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
                          .column = std::floor(ray[0] * focal[0] / options.around),
                          .distance = length(between(centre.data(), points.xyz.data() + 3 * point)),
                          .point = point};
-      // What is no number has no place in any order.
+      // NaN cannot be sorted.
       if (std::isfinite(own.row) && std::isfinite(own.column) && std::isfinite(own.distance)) {
         seen.push_back(own);
       }

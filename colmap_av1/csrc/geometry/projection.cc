@@ -12,7 +12,7 @@
 namespace colmap_av1::geometry {
 namespace {
 
-// Points worked on at a time.
+// Number of points that are processed at a time.
 constexpr std::size_t kChunk = 1024;
 
 template <typename T, std::size_t size>
@@ -20,10 +20,10 @@ void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& 
   to.insert(to.end(), from.begin(), from.begin() + static_cast<std::ptrdiff_t>(count));
 }
 
-// Goes through points a chunk at a time. `write` is given a place in the chunk and a point in the
-// camera, writes what is wanted of it there, and says whether it is seen; `take` then takes over
-// what the first places hold. Every point is written, and stays where the next one does not
-// overwrite it: which ones are seen is too random for a processor to foretell.
+// Processes points in chunks. `write` gets an index in the chunk and a point in camera coordinates,
+// writes its values at that index, and returns whether it is visible. `take` then takes the first
+// values of the chunk. Every point is written, and an invisible one is overwritten by the next:
+// visibility is too random for branch prediction.
 template <typename Write, typename Take>
 void for_seen(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
               std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
@@ -70,8 +70,8 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
         std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
-        // As pixels times depth: most points are not seen, and a division takes as long as all
-        // else.
+        // Pixels times depth are compared: most points are not visible, and a division would take
+        // as long as all the rest.
         const auto [u, v, z] = at;
         const double x = camera.focal_x * u + camera.centre_x * z;
         const double y = camera.focal_y * v + camera.centre_y * z;
@@ -82,7 +82,7 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
           const double z = local[3 * i + 2];
           const double x = camera.focal_x * (local[3 * i] / z) + camera.centre_x;
           const double y = camera.focal_y * (local[3 * i + 1] / z) + camera.centre_y;
-          // Rounded, what lies at the edge must not lie beyond.
+          // Rounding must not move points beyond the edge.
           pixels[2 * i] = std::clamp(x, 0.0, last_x);
           pixels[2 * i + 1] = std::clamp(y, 0.0, last_y);
           depth[i] = z;
@@ -100,7 +100,7 @@ std::vector<double> nearest_in_cells(std::span<const double> xy, std::span<const
   }
   std::vector<double> nearest(static_cast<std::size_t>(columns * rows),
                               std::numeric_limits<double>::infinity());
-  // Of what lies before the first cell, and what is no number, the first one.
+  // Points before the first cell, and NaN, count for the first cell.
   const auto place = [cell](double at, std::int64_t cells) {
     const double last = static_cast<double>(cells - 1);
     return at > 0 ? static_cast<std::int64_t>(std::min(at / cell, last)) : 0;

@@ -30,7 +30,7 @@ void check(std::span<const double> xy, std::span<const double> depth,
   }
 }
 
-// Steps of depth beyond the nearest point's.
+// Number of depth steps of each point beyond the nearest point.
 std::vector<std::int64_t> steps_of(std::span<const double> depth, const SurfaceOptions& options) {
   std::vector<double> steps(depth.size());
   double least = std::numeric_limits<double>::infinity();
@@ -38,7 +38,7 @@ std::vector<std::int64_t> steps_of(std::span<const double> depth, const SurfaceO
     steps[i] = std::floor(options.steps_per_octave * std::log2(depth[i]));
     least = std::min(least, steps[i]);
   }
-  // What is no number, by steps beyond all bounds, is of the last one.
+  // NaN, from an overflow of steps, counts as the last step.
   const auto last = static_cast<double>(options.most_steps - 1);
   std::vector<std::int64_t> found(depth.size());
   std::transform(steps.begin(), steps.end(), found.begin(), [&](double step) {

@@ -1,4 +1,4 @@
-// Points that lie on the same surface, and close to each other in a picture.
+// Selection among points that are close to each other in a picture and lie on the same surface.
 #pragma once
 
 #include <cstdint>
@@ -8,15 +8,15 @@
 namespace colmap_av1::geometry {
 
 struct SurfaceOptions {
-  std::span<const std::int64_t> spacings;  // px; widths of cells, wide ones first
-  double steps_per_octave = 0;             // of depth; what is a step apart is another surface
-  std::int64_t most_steps = 0;             // from which on all is one surface
+  std::span<const std::int64_t> spacings;  // px; widths of cells, descending
+  double steps_per_octave = 0;             // of depth; points a step apart are on other surfaces
+  std::int64_t most_steps = 0;             // number of steps; all beyond the last is one surface
 };
 
-// Of points in a picture, the index of the first spacing at which each is the best one of its cell
-// and surface; the number of spacings where it is at none. Pixels are [n][2] and lie within the
-// picture, depths are finite and above 0; the best point is that of the least rank. Throws
-// std::invalid_argument for what does not fit.
+// For each point in a picture, the index of the first spacing at which it is the best point of its
+// cell and surface; the number of spacings if there is none. Pixels are [n][2] and lie within the
+// picture; depths are finite and above 0. The best point has the smallest rank. Throws
+// std::invalid_argument for inconsistent arrays and invalid values.
 std::vector<std::int64_t> best_at_spacings(std::span<const double> xy,
                                            std::span<const double> depth,
                                            std::span<const std::int64_t> rank, std::int64_t width,

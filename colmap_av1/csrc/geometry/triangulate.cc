@@ -12,16 +12,16 @@
 namespace colmap_av1::geometry {
 namespace {
 
-// Two rays that a first guess is made of, by their place in the track from 0 to 1.
+// Pairs of rays for the initial value, given by their position in the track from 0 to 1.
 constexpr std::array<std::array<double, 2>, 4> kGuesses{
     {{0.0, 1.0}, {0.0, 0.5}, {0.5, 1.0}, {0.25, 0.75}}};
 constexpr int kIterations = 4;
-// A step that leaves more than this share of a track's cost is its last.
+// The last step is the one that leaves more than this share of a track's cost.
 constexpr double kConverged = 0.999;
-// Squared error in px^2 at which an observation counts half.
+// Squared error in px^2 at which the weight of an observation is halved.
 constexpr double kSoftError2 = 1.0;
 // Smallest determinant of the normal equations, as a share of their cubed trace, and smallest
-// squared sine between two rays, that are no plain singularities.
+// squared sine between two rays, that are not considered singular.
 constexpr double kSingular = 1e-12;
 constexpr double kInfinite = std::numeric_limits<double>::infinity();
 
@@ -38,14 +38,14 @@ Projection projection_of(const Observation& seen, const Vector& point) {
   return project(seen.pose, seen.focal, seen.x, seen.y, point.data());
 }
 
-// What is beyond the limit costs no more than that.
+// The cost of an observation is at most that at the limit.
 double cost_of(std::span<const Observation> track, const Vector& point, double limit) {
   double cost = 0;
   for (const Observation& seen : track) cost += std::min(projection_of(seen, point).error2, limit);
   return cost;
 }
 
-// Unit vector of a ray in the world.
+// Unit vector of a ray in world coordinates.
 Vector direction(const Observation& seen) {
   Vector found{};
   for (std::size_t i = 0; i < 3; ++i) {
@@ -56,7 +56,7 @@ Vector direction(const Observation& seen) {
   return found;
 }
 
-// The point midway between two rays, where they come closest.
+// The point midway between two rays where they are closest to each other.
 Vector midpoint(const Observation& a, const Observation& b) {
   const Vector da = direction(a);
   const Vector db = direction(b);
@@ -94,7 +94,7 @@ Guess first_guess(std::span<const Observation> track, double limit) {
   return best;
 }
 
-// Solves the symmetric equations of a Gauss-Newton step, upper triangle given; zero where singular.
+// Solves the symmetric equations of a Gauss-Newton step, given their upper triangle; 0 if singular.
 Vector solve(const std::array<double, 6>& n, const Vector& gradient) {
   const auto [a, b, c, d, e, f] = n;  // a b c / . d e / . . f
   const double trace = a + d + f;
@@ -152,7 +152,7 @@ Vector locate(std::span<const Observation> track, double limit) {
     const Vector moved{point[0] - step[0], point[1] - step[1], point[2] - step[2]};
     const double then = cost_of(track, moved, limit);
     const bool goes_on = then < kConverged * cost;
-    // A step that makes things worse is not taken.
+    // A step that increases the cost is rejected.
     if (then < cost) {
       point = moved;
       cost = then;
@@ -168,11 +168,11 @@ double angle_of(std::span<const Observation> kept, const Vector& point) {
   });
 }
 
-// Whether a point of this angle and mean error has an accurate depth.
+// Whether a point with this angle and mean error has an accurate depth.
 bool is_sure(double angle, double error, const double* focal, const TriangulateOptions& options) {
   if (angle < options.min_angle) return false;
   if (!options.max_depth_error) return true;
-  // All observations of a track may be off alike, which its errors show only in part.
+  // Observations of a track may share an error, which its reprojection errors show only in part.
   const double pixels = std::hypot(options.sigma_floor, options.error_to_sigma * error);
   return pixels <= *options.max_depth_error * ((focal[0] + focal[1]) / 2) * angle;
 }
@@ -203,7 +203,7 @@ void check(const PosedTracks& tracks, std::int64_t first, std::int64_t last) {
   }
 }
 
-// The observations of a track with a ray.
+// The observations of a track that have a finite ray.
 void gather(const PosedTracks& tracks, std::int64_t track, double sigma_floor,
             std::vector<Observation>& found) {
   found.clear();

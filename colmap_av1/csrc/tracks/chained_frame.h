@@ -1,4 +1,4 @@
-// A frame whose units, or equal parts of them, hold tracks.
+// A frame whose cells hold tracks. A cell is a unit or one of the equal parts of a unit.
 #pragma once
 
 #include <cstddef>
@@ -10,17 +10,17 @@
 
 namespace colmap_av1::tracks {
 
-// A cell holds at most one track, at its sub-pixel place in pixels of the picture. Most seeds are
-// never carried on: a seed becomes a track when it is.
+// A cell holds at most one track, at a sub-pixel position in pixels of the picture. Most seeds are
+// never continued; a seed becomes a track when it is continued.
 inline constexpr std::int32_t kNoTrack = -1;
 inline constexpr std::int32_t kSeed = -2;
 struct Cell {
   std::int32_t track = kNoTrack;
   Point position;
-  float variance = 0.F;  // of the position against the track's seed, in coded px^2
+  float variance = 0.F;  // of the position relative to the track's seed, in coded px^2
 };
 
-// The equal squares that units are cut into.
+// The grid of equal squares into which units are divided.
 struct CellGrid {
   explicit CellGrid(int cells_along_unit)
       : cells(cells_along_unit),
@@ -28,14 +28,14 @@ struct CellGrid {
         half_cell(kUnit / 2.F / static_cast<float>(cells_along_unit)) {}
 
   int cells;        // along either side of a unit: 1, 2 or 4
-  int log_cells;    // to the base 2
+  int log_cells;    // log2(cells)
   float half_cell;  // half a cell's width, in coded pixels
 
   Point centre(int row, int col) const {
     return {half_cell * static_cast<float>(2 * col + 1),
             half_cell * static_cast<float>(2 * row + 1)};
   }
-  // Half-open, so that touching cells share no position.
+  // Cells are half-open, so that neighbouring cells share no position.
   bool is_in_cell(Point position, Point centre) const {
     return position.x >= centre.x - half_cell && position.x < centre.x + half_cell &&
            position.y >= centre.y - half_cell && position.y < centre.y + half_cell;
@@ -44,13 +44,13 @@ struct CellGrid {
 
 struct ChainedFrame {
   TrustedMotion motion;
-  std::int32_t order = -1;  // among the frames that were chained; -1: waits for its turn
+  std::int32_t order = -1;  // among the chained frames; -1: not chained yet
   int cell_rows = 0;
   int cell_cols = 0;
   std::int64_t first_serial = 0;  // of the seed in the first cell
   std::vector<Cell> cells;
-  // Velocity per shown frame by which the track came here, less the frame's dominant motion; NaN
-  // at a seed. Empty without the cosine test.
+  // Velocity of the track's last step per shown frame, minus the frame's dominant motion; NaN for a
+  // seed. Empty without the cosine test.
   std::vector<Point> velocity;
 
   bool is_chained() const { return order >= 0; }

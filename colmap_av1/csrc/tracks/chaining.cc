@@ -25,7 +25,7 @@ void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& st
   }
 }
 
-// The units that may move a track into the current frame.
+// Notes the units that may move a track into the current frame.
 void Chainer::note_open_units(std::span<const Link> links) {
   open_units_.clear();
   if (std::all_of(links.begin(), links.end(), [](const Link& link) { return link.forward; })) {
@@ -39,7 +39,7 @@ void Chainer::note_open_units(std::span<const Link> links) {
   }
 }
 
-// Whether a cell of the current frame's unit holds no track yet.
+// Whether any cell of a unit of the current frame has no track yet.
 bool Chainer::is_open(OpenUnit unit) const {
   const int size = grid_.cells;
   const Cell* first = current_->cells.data() +
@@ -61,14 +61,14 @@ void Chainer::chain_backward(const Link& link) {
   for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
 }
 
-// By the current frame's displacements: every free cell asks for the longest track that it
-// finds, every track goes to the cell that puts it nearest to its centre (a stable
-// matching, so the order of cells does not matter).
+// With the displacements of the current frame: every free cell claims the longest track that it
+// finds, and every track goes to the cell in which it is nearest to the centre. This is a stable
+// matching, so the order of cells does not matter.
 void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion.lists[list];
   claims_.resize(link.other->cells.size());
   beside_unit_ = -1;
-  // A cell as large as its unit is searched in no more time than the unit is judged.
+  // If a cell is as large as its unit, searching it is as fast as checking the unit first.
   const bool judges_units = grid_.cells > 1;
   std::size_t num_open = 0;
   for (const OpenUnit open : open_units_) {
@@ -94,7 +94,7 @@ void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   claimed_.clear();
 }
 
-// The cells of a frame whose tracks have no place in the current frame yet.
+// Notes the cells of a frame whose tracks are not yet continued into the current frame.
 void Chainer::note_unplaced(const ChainedFrame& other) {
   unplaced_.resize(other.cells.size());
   unplaced_units_.assign(other.motion.mi_size.size(), 0);
@@ -109,7 +109,7 @@ void Chainer::note_unplaced(const ChainedFrame& other) {
   }
 }
 
-// The track of a cell has got its place.
+// Notes that the track of a cell has been continued.
 void Chainer::note_placed(const ChainedFrame& other, int cell) {
   unplaced_[cell] = 0;
   const int size = grid_.cells;
@@ -125,10 +125,10 @@ void Chainer::note_placed(const ChainedFrame& other, int cell) {
   unplaced_units_[row * other.motion.cols + col] = any;
 }
 
-// Whether the cells of a unit can find any track, to search them only then.
+// Whether the cells of a unit can find any track; otherwise they need not be searched.
 bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motion,
                              Reach reach) const {
-  // A valid warp stretches a unit by less than half its size; beside it motion is alike.
+  // A valid warp stretches a unit by less than half its size, and neighbours move similarly.
   float pixels = 0.75F * kUnit;
   if (reach == Reach::kBeside) {
     if (bridge_ > kUnit) return true;
@@ -146,7 +146,7 @@ bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motio
   return false;
 }
 
-// A cell that loses its claim to the asker looks for another track in turn.
+// Lets a cell claim a track. A cell that loses its claim to it searches for another track in turn.
 void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) {
   while (true) {
     Found best;
@@ -165,8 +165,8 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) 
   }
 }
 
-// The longest track that a cell has a better claim on than the cell that holds it, by the motion
-// of a unit; `best` where that is longer.
+// The longest track that the motion of a unit leads to and on which the cell has a better claim
+// than the cell that has claimed it; `best` if that is longer.
 Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
                                    Found best) const {
   const ChainedFrame& other = *link.other;
@@ -201,8 +201,8 @@ Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const U
   return best;
 }
 
-// The displacements of the units beside a unit that its cells look for tracks by, too: where these
-// point apart, tracks lie in the gap that their blocks leave.
+// Notes the displacements of neighbouring units that the cells of a unit use, too. Where
+// displacements of neighbouring blocks diverge, tracks lie in the gap between their targets.
 void Chainer::note_motion_beside(const Link& link, int list, int unit) {
   if (unit == beside_unit_) return;
   beside_unit_ = unit;
@@ -219,7 +219,7 @@ void Chainer::note_motion_beside(const Link& link, int list, int unit) {
     for (int c = std::max(0, col - 1); c <= std::min(frame.visible_cols - 1, col + 1); ++c) {
       const UnitMotion& other = motion[r * frame.cols + c];
       if (!link.refs[other.ref] || !moves_alike(other, own, bridge_)) continue;
-      // The cells have looked there already.
+      // The cells have already searched there.
       if (is_same(other, own)) continue;
       if (std::any_of(beside_.begin(), beside_.end(),
                       [&](const UnitMotion* noted) { return is_same(other, *noted); })) {
@@ -230,7 +230,7 @@ void Chainer::note_motion_beside(const Link& link, int list, int unit) {
   }
 }
 
-// The vectors of small blocks are the better ones.
+// Ties are broken by block size, because vectors of small blocks are better.
 bool Chainer::is_better(const Claim& claim, const Claim& holder) const {
   if (holder.cell < 0) return true;
   if (claim.cost != holder.cost) return claim.cost < holder.cost;
@@ -240,10 +240,10 @@ bool Chainer::is_better(const Claim& claim, const Claim& holder) const {
   return area(claim) != area(holder) ? area(claim) < area(holder) : claim.cell < holder.cell;
 }
 
-// The other frame's cells within reach of a position in coded pixels of the current one, the reach
-// itself left out on the right and below.
+// The cells of the other frame within reach of a position in coded pixels of the current frame.
+// Cells that begin exactly at the right or lower limit are excluded.
 Chainer::Window Chainer::around(const Link& link, Point position, float reach) {
-  // Far outside there are no cells; the clamp keeps the cast defined.
+  // The clamp keeps the cast defined for positions far outside, where there are no cells.
   const auto first = [](float cell, int count) {
     return static_cast<int>(std::clamp(cell, 0.F, static_cast<float>(count)));
   };
@@ -259,8 +259,8 @@ Chainer::Window Chainer::around(const Link& link, Point position, float reach) {
           last((position.x + reach) * link.to_cells_x, other.cell_cols)};
 }
 
-// By the other frame's displacements: every track moves with the unit it lies in, and a
-// free cell takes the longest one that lands in it.
+// With the displacements of the other frame: every track moves with its unit, and a free cell gets
+// the longest track that lands in it.
 void Chainer::chain_forward(const Link& link, int list) {
   ChainedFrame& other = *link.other;
   const auto& motion = other.motion.lists[list];
@@ -281,7 +281,7 @@ void Chainer::chain_forward(const Link& link, int list) {
   claimed_.clear();
 }
 
-// Claims the current frame's cell that a track of the other one lands in.
+// Claims the cell of the current frame in which a track of the other frame lands.
 void Chainer::push_track(const Link& link, int cell, const UnitMotion& motion) {
   const ChainedFrame& other = *link.other;
   const Cell& source = other.cells[cell];
@@ -309,7 +309,8 @@ void Chainer::push_track(const Link& link, int cell, const UnitMotion& motion) {
   claims_[target] = claim;
 }
 
-// Of two tracks that want one cell the longer goes on: another one can start at any time.
+// If two tracks lead to one cell, the longer one is continued, because a new one can start at any
+// time.
 bool Chainer::is_preferred(const ChainedFrame& frame, int cell, const Claim& claim, int other_cell,
                            const Claim& other_claim) const {
   const std::int32_t own_length = store_->length(frame, frame.cells[cell]);
@@ -317,7 +318,7 @@ bool Chainer::is_preferred(const ChainedFrame& frame, int cell, const Claim& cla
   return own_length != other_length ? own_length > other_length : claim.cost < other_claim.cost;
 }
 
-// Gives the track of another frame's cell its place in a cell of the current frame.
+// Continues the track in a cell of another frame into a cell of the current frame.
 void Chainer::carry_on(ChainedFrame& other, int other_cell, int cell, const Claim& claim) {
   std::int32_t track = other.cells[other_cell].track;
   if (track == kSeed) track = store_->start(other, static_cast<std::size_t>(other_cell));

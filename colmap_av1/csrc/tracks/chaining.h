@@ -1,4 +1,4 @@
-// Carries tracks into a frame along the displacements that link it to frames with tracks.
+// Continues tracks into a frame along the displacements that link it to frames with tracks.
 #pragma once
 
 #include <array>
@@ -15,35 +15,35 @@
 
 namespace colmap_av1::tracks {
 
-// Where two tracks want one cell the longer goes on; where two cells want one track, the one that
-// puts it nearest to its centre has it.
+// If two tracks lead to one cell, the longer one is continued. If two cells claim one track, the
+// cell gets it in which the track is nearest to the centre.
 class Chainer {
  public:
   Chainer(const TrackBuilderOptions& options, const CellGrid& grid);
 
-  // Gives tracks of the linked frames their places in the current frame's cells, which are empty.
-  // The links are followed in their order.
+  // Continues tracks of the linked frames into the cells of the current frame, which are empty. The
+  // links are followed in order.
   void chain(ChainedFrame& current, std::span<Link> links, TrackStore& store);
 
  private:
-  // What a cell would do with a track, and how well it fits.
+  // The position that a track would get by a cell's displacement, and how well it fits.
   struct Claim {
-    std::int32_t cell = -1;  // of the frame whose displacement it is
+    std::int32_t cell = -1;  // in the frame that has the displacement
     float cost = 0.F;        // distance from the claiming cell's centre, in coded pixels
     Point position;          // in the current frame, coded pixels
     Point velocity;
     float variance = 0.F;
   };
-  // The best track for a cell so far.
+  // The best track found for a cell so far.
   struct Found {
-    int cell = -1;  // of the frame with tracks
+    int cell = -1;  // in the frame with tracks
     Claim claim;
   };
   struct OpenUnit {
     std::int32_t row = 0;
     std::int32_t col = 0;
   };
-  // A cell of the current frame that asks for a track.
+  // A cell of the current frame that searches for a track.
   struct Asker {
     int cell = -1;
     int unit = -1;
@@ -51,11 +51,12 @@ class Chainer {
   };
   struct Window {
     int top = 0;
-    int bottom = -1;  // included, as is right
+    int bottom = -1;  // inclusive, like right
     int left = 0;
     int right = -1;
   };
-  // Whose displacements a cell looks for tracks by: its unit's, or those of the units beside.
+  // Which displacements a cell uses to search for tracks: its unit's, or those of neighbouring
+  // units.
   enum class Reach { kOwn, kBeside };
 
   void note_open_units(std::span<const Link> links);
@@ -84,18 +85,18 @@ class Chainer {
   float bridge_;  // in px; 0: off
   CosineTest cosine_;
 
-  // While a frame is chained.
+  // Set while a frame is chained.
   ChainedFrame* current_ = nullptr;
   TrackStore* store_ = nullptr;
-  // Buffers that are kept from frame to frame.
-  std::vector<Claim> claims_;          // by cell, free between links
-  std::vector<std::int32_t> claimed_;  // those that are not
+  // Buffers that are reused for every frame.
+  std::vector<Claim> claims_;          // by cell; all empty between links
+  std::vector<std::int32_t> claimed_;  // cells with a claim
   std::vector<OpenUnit> open_units_;   // of the current frame, in raster order
-  // Of a frame with tracks: cells whose tracks have no place in the current frame yet, and units
-  // that have such cells.
+  // For a frame with tracks: the cells whose tracks are not yet continued into the current frame,
+  // and the units that have such cells.
   std::vector<std::uint8_t> unplaced_;
   std::vector<std::uint8_t> unplaced_units_;
-  // Of a unit of the current frame: the motion of those beside it that it looks for tracks by.
+  // For a unit of the current frame: the motion of its neighbours that its cells use, too.
   int beside_unit_ = -1;
   std::vector<const UnitMotion*> beside_;
 };

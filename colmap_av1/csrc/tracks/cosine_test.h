@@ -1,4 +1,4 @@
-// The test that ends a track where its motion changes abruptly.
+// The test that ends a track when its motion changes abruptly.
 #pragma once
 
 #include <optional>
@@ -13,28 +13,29 @@
 namespace colmap_av1::tracks {
 
 // Space-time cosine (the angular error of Barron, Fleet and Beauchemin, IJCV 1994) between the
-// motion of a step and the one predicted from the step before: the same motion relative to the
-// dominant one.
+// motion of a step and the motion predicted from the previous step, which is the same motion
+// relative to the dominant motion.
 class CosineTest {
  public:
   explicit CosineTest(const TrackBuilderOptions& options);
 
   bool is_on() const { return least_.has_value(); }
 
-  // Gives a frame's cells the velocity of seeds.
+  // Sets the velocities of a frame's cells to that of seeds.
   void start_frame(ChainedFrame& frame) const;
-  // Sets the link's dominant motion.
+  // Sets the dominant motion of a link.
   void prepare(const ChainedFrame& current, Link& link);
-  // Whether the track in a cell of the link's other frame may take the step `from` to `moved`, in
-  // coded pixels of the frame whose displacement it is: the track's relative velocity after the
-  // step, in pixels of the current picture, or nothing. Any velocity where the test is off.
+  // Tests the step of a track from `from` to `moved`, in coded pixels of the frame that has the
+  // displacement; `other_cell` is in the link's other frame. Returns the track's relative velocity
+  // after the step, in pixels of the current picture; nothing if the test fails. If the test is
+  // off, any velocity is returned.
   std::optional<Point> passed(const Link& link, int other_cell, Point from, Point moved) const;
 
  private:
   std::optional<double> least_;
   bool relative_to_dominant_;
   double scale2_;
-  // Buffers that are kept from frame to frame.
+  // Buffers that are reused for every frame.
   std::vector<MotionSample> samples_;
   std::vector<float> scratch_;
 };

@@ -57,8 +57,8 @@ Displacement DisplacementModel::at(int unit, int list) const {
   return result;
 }
 
-// The specification's coordinates are zero at the first sample's centre, ours at its
-// corner: half a pixel goes off before and on after.
+// In the specification the origin is the centre of the first sample, here it is its corner. Half a
+// pixel is therefore subtracted before and added after.
 Position apply_warp(const av1::WarpParams& params, Position at) {
   const double x = at.x - 0.5;
   const double y = at.y - 0.5;

@@ -9,15 +9,16 @@
 
 namespace colmap_av1::tracks {
 
-// Where one unit's content lies in a reference frame.
+// The displacement of one unit into a reference frame.
 struct Displacement {
-  int ref = 0;  // RefFrame, 0: none
+  int ref = 0;  // RefFrame; 0: none
   float dx = 0.F;
   float dy = 0.F;
-  const av1::WarpParams* warp = nullptr;  // affine model in force, null for a translation
+  const av1::WarpParams* warp = nullptr;  // affine model; null for a translation
 };
 
-// The rules of 7.11.3.1 that choose between translation, local and global warp. Borrows the frame.
+// The rules of 7.11.3.1 that select translation, local or global warp. Keeps a reference to the
+// frame.
 class DisplacementModel {
  public:
   explicit DisplacementModel(const FrameMotion& frame);
@@ -30,19 +31,19 @@ class DisplacementModel {
   std::array<bool, kNumRefs> global_warp_{};
 };
 
-// A position in pixels, corner origin.
+// A position in pixels; the origin is the picture's corner.
 struct Position {
   double x = 0;
   double y = 0;
 };
 
-// Where an affine warp model takes a position (7.11.3.5).
+// The position to which an affine warp model moves a position (7.11.3.5).
 Position apply_warp(const av1::WarpParams& params, Position at);
 
-// The position that apply_warp takes to `at`; none for a singular model.
+// The position that apply_warp moves to `at`; nothing for a singular model.
 std::optional<Position> invert_warp(const av1::WarpParams& params, Position at);
 
-// [mi_rows, mi_cols, 2] (x, y), NaN where the list references no frame.
+// [mi_rows, mi_cols, 2] (x, y); NaN if the list references no frame.
 std::vector<float> displacement(const FrameMotion& frame, int list);
 
 }  // namespace colmap_av1::tracks

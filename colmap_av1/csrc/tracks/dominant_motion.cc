@@ -13,8 +13,8 @@ constexpr std::size_t kMinSamples = 64;
 constexpr int kIterations = 6;
 constexpr double kTukey = 4.685;  // 95 % efficiency on Gaussian residuals
 constexpr double kMadToSigma = 1.4826;
-constexpr double kMinSigma = 0.25;  // px, the grain of the vectors themselves
-constexpr double kRidge = 1e-4;     // keeps the slopes of a one-sided sample small
+constexpr double kMinSigma = 0.25;  // px, the resolution of the vectors
+constexpr double kRidge = 1e-4;     // keeps the slopes small if samples lie on one side only
 
 double median(std::vector<float>& values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
@@ -22,7 +22,7 @@ double median(std::vector<float>& values) {
   return *middle;
 }
 
-// Solves the symmetric positive definite system a x = b by Cholesky's method; nothing where it is
+// Solves the symmetric positive definite system a x = b by Cholesky decomposition; nothing if it is
 // not positive definite.
 std::optional<std::array<double, 3>> solve3(const double (&a)[3][3], const double (&b)[3]) {
   double l[3][3] = {};

@@ -1,4 +1,4 @@
-// The motion that most of a frame shares: what the camera did, shake included.
+// The motion that most of a frame shares, which is that of the camera, including shake.
 #pragma once
 
 #include <array>
@@ -32,8 +32,8 @@ struct DominantMotion {
 };
 
 // Affine motion field by iteratively reweighted least squares (Tukey's biweight,
-// started at the median). Not valid with too few samples to tell a majority.
-// `scratch` is working memory kept by the caller.
+// started at the median). Not valid if the samples are too few to determine a majority.
+// `scratch` is working memory that the caller reuses.
 DominantMotion fit_dominant_motion(std::span<const MotionSample> samples, double width,
                                    double height, std::vector<float>& scratch);
 

@@ -9,7 +9,7 @@ namespace colmap_av1::tracks {
 namespace {
 
 constexpr double kShare = 0.9;
-constexpr double kWithin = 0.25;  // px, the grain of most vectors
+constexpr double kWithin = 0.25;  // px, the resolution of most vectors
 
 }  // namespace
 

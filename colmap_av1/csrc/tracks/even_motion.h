@@ -1,4 +1,4 @@
-// Frames that move evenly: of a camera that stands still, or passes something flat.
+// Frames with even motion, from a camera that stands still or moves along a flat surface.
 #pragma once
 
 #include <span>
@@ -7,18 +7,19 @@
 
 namespace colmap_av1::tracks {
 
-// A unit's displacement, and the shown frames to that it leads to, negative into the past.
+// The displacement of a unit, and the number of shown frames that it spans; negative: into the
+// past.
 struct TimedMotion {
   MotionSample sample;
   int interval = 0;
 };
 
-// The one motion of a frame. Encoders code such frames in their largest blocks, which elsewhere are
-// plain surfaces that any vector predicts, and so not trusted.
+// The single affine motion of a frame. Encoders code such frames in their largest blocks. In other
+// frames large blocks are not trusted, because they show plain surfaces that any vector predicts.
 class EvenMotion {
  public:
-  // `spread` are units all over the picture: those that move. Of a picture in which fewer than
-  // nine in ten of them move as one affine motion says, nothing agrees.
+  // `spread` are moving units that are spread over the whole picture. If fewer than nine in ten of
+  // them agree with a single affine motion, nothing agrees.
   EvenMotion(std::span<const TimedMotion> spread, double width, double height);
 
   bool agrees(const TimedMotion& motion) const;

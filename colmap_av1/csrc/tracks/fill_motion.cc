@@ -8,7 +8,7 @@
 namespace colmap_av1::tracks {
 namespace {
 
-constexpr int kMaxBridge = 8;  // units to the motion on either side
+constexpr int kMaxBridge = 8;  // largest distance in units to the motion on either side
 
 enum class Axis { kAcross, kDown };
 
@@ -16,8 +16,8 @@ int block_units(int mi_size, Axis axis) {
   return (axis == Axis::kAcross ? av1::kBlockWidth[mi_size] : av1::kBlockHeight[mi_size]) / 4;
 }
 
-// What a unit moves by, beyond its block's vector, towards the block before or behind it on an
-// axis.
+// The difference of a unit's interpolated motion from its block's vector, along one axis, towards
+// the block before or after it.
 Point towards_neighbour(const TrustedMotion& motion, const std::vector<UnitMotion>& blocks,
                         float limit, int row, int col, Axis axis) {
   const int unit = row * motion.cols + col;
@@ -40,7 +40,7 @@ Point towards_neighbour(const TrustedMotion& motion, const std::vector<UnitMotio
   return {share * (other.dx - own.dx), share * (other.dy - own.dy)};
 }
 
-// The first unit that moves, from a unit in one direction, and its distance in units. Null beyond
+// The nearest unit with motion in one direction from a unit, and its distance in units. Null beyond
 // kMaxBridge.
 struct Bank {
   const UnitMotion* motion = nullptr;
@@ -58,7 +58,7 @@ Bank nearest_motion(const TrustedMotion& motion, const std::vector<UnitMotion>& 
   return {};
 }
 
-// The motion between those on either side of a unit, ref 0 where they do not agree.
+// The motion interpolated between those on both sides of a unit; ref 0 if they do not agree.
 UnitMotion motion_between(const TrustedMotion& motion, const std::vector<UnitMotion>& units,
                           float limit, int row, int col) {
   UnitMotion between;

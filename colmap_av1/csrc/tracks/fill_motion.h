@@ -1,4 +1,4 @@
-// Motion between blocks: within them, and where a block has none that may be trusted.
+// Interpolates motion between blocks: within a block, and in blocks without trusted motion.
 #pragma once
 
 #include <vector>
@@ -7,15 +7,16 @@
 
 namespace colmap_av1::tracks {
 
-// A block has one vector, the best for all of it; what it shows moves smoothly. Every unit is given
-// the vector between the centres of its block and of the blocks beside it that move alike, across
-// and down: their displacements differ by less than `limit` coded pixels. A warp already says how
-// its block moves from place to place; at the border to one, its unit's displacement counts where
-// that unit lies. `unfilled` is working memory kept by the caller.
+// A block has one vector, the best for the whole block, but real motion varies smoothly. The vector
+// of every unit is interpolated between the centres of its block and of neighbouring blocks, across
+// and down, if their displacements differ by less than `limit` coded pixels. A warp already
+// describes how the motion varies within its block. At the border of a warped block, the
+// displacement of its nearest unit is used, at the position of that unit. `unfilled` is working
+// memory that the caller reuses.
 void interpolate_blocks(float limit, std::vector<UnitMotion>& unfilled, TrustedMotion& motion);
 
-// Units of a block without motion that may be trusted, such as an intra one, move as what lies on
-// either side where that moves alike, across and down: each is given the motion between.
+// Units of a block without trusted motion, such as an intra block, get the motion interpolated
+// between the units on both sides of the block, across and down, if these move similarly.
 void bridge_blocks(float limit, std::vector<UnitMotion>& unfilled, TrustedMotion& motion);
 
 }  // namespace colmap_av1::tracks

@@ -5,7 +5,7 @@
 namespace colmap_av1::tracks {
 namespace {
 
-constexpr int kMaxSide = 65536;  // a frame header has 16 bits for a size less one
+constexpr int kMaxSide = 65536;  // a frame header has 16 bits for a size minus one
 
 }  // namespace
 

@@ -1,4 +1,4 @@
-// Block data of one coded frame: the package's FrameMotion, as far as tracks need it.
+// Block data of one coded frame: the part of the package's FrameMotion that tracks need.
 #pragma once
 
 #include <array>
@@ -10,9 +10,10 @@
 
 namespace colmap_av1::tracks {
 
-inline constexpr int kNumRefs = av1::TOTAL_REFS_PER_FRAME;  // RefFrame 0..7, 0 is INTRA_FRAME
+inline constexpr int kNumRefs = av1::TOTAL_REFS_PER_FRAME;  // RefFrame 0..7; 0 is INTRA_FRAME
 
-// Values under the specification's names; arrays by RefFrame, and borrowed ones of blocks.
+// Values under the specification's names. Arrays are indexed by RefFrame; those of blocks are
+// views.
 struct FrameMotion {
   int decode_index = 0;
   int display_index = -1;
@@ -30,7 +31,7 @@ struct FrameMotion {
   int mi_rows = 0;
   int mi_cols = 0;
   std::span<const av1::BlockInfo> blocks;
-  std::span<const std::int32_t> block_index;  // [mi_rows][mi_cols], the block of each 4x4 luma unit
+  std::span<const std::int32_t> block_index;  // [mi_rows][mi_cols], block of each 4x4 luma unit
   std::span<const av1::WarpParams> local_warp_params;
 
   int num_units() const { return mi_rows * mi_cols; }
@@ -39,8 +40,8 @@ struct FrameMotion {
   }
 };
 
-// Throws std::invalid_argument for a size that no frame has or that the units do not cover, and
-// where a value would index outside a table.
+// Throws std::invalid_argument for an invalid size, a size that the units do not cover, or a value
+// that would index outside a table.
 void check_frame_motion(const FrameMotion& frame);
 
 }  // namespace colmap_av1::tracks

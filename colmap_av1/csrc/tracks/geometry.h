@@ -1,4 +1,4 @@
-// Places in a frame and its 4x4 luma units.
+// Positions in a frame and its 4x4 luma units.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +13,7 @@ struct Point {
   float y = 0.F;
 };
 
-// Along the axis on which they lie farther apart.
+// The distance of two points along the axis on which they are farther apart.
 inline float distance(Point a, Point b) {
   return std::max(std::abs(a.x - b.x), std::abs(a.y - b.y));
 }

@@ -7,7 +7,8 @@
 namespace colmap_av1::tracks {
 namespace {
 
-// By the displacements of the other frame where `forward`, else by the current one's.
+// With the displacements of the other frame if `forward`, otherwise with those of the current
+// frame.
 Link make_link(const TrustedMotion& current, ChainedFrame& other_frame, bool forward,
                const CellGrid& grid) {
   const TrustedMotion& other = other_frame.motion;

@@ -1,4 +1,4 @@
-// Which frames displacements link, and by whose.
+// Which frames are linked by displacements, and in which direction.
 #pragma once
 
 #include <array>
@@ -12,34 +12,35 @@
 
 namespace colmap_av1::tracks {
 
-// A frame with tracks that displacements link to the frame being chained: from the current frame's
-// units (backward) or from the other's (forward).
+// A frame with tracks that is linked to the frame being chained by displacements of the current
+// frame's units (backward) or of the other frame's units (forward).
 struct Link {
   ChainedFrame* other = nullptr;
   bool forward = false;
-  std::array<bool, kNumRefs> refs{};  // the RefFrame values that name the link
+  std::array<bool, kNumRefs> refs{};  // the RefFrame values of the link
   int distance = 0;                   // in shown frames
-  int interval = 0;                   // other less current display index, 0 if unknown
-  // To coded pixels of the current frame, from pixels of the other's picture and to its cells.
+  int interval = 0;                   // other minus current display index; 0 if unknown
+  // Scales from pixels of the other picture to coded pixels of the current frame, and from these to
+  // cells of the other frame.
   float from_picture_x = 1.F;
   float from_picture_y = 1.F;
   float to_cells_x = 1.F;
   float to_cells_y = 1.F;
-  // To the current picture, from the other one.
+  // Scale from the other picture to the current picture.
   float picture_x = 1.F;
   float picture_y = 1.F;
-  // To pixels of the current picture per shown frame, from a displacement.
+  // Scale from a displacement to pixels of the current picture per shown frame.
   double to_velocity_x = 0;
   double to_velocity_y = 0;
-  DominantMotion dominant;  // of the field that the displacements come from; set by CosineTest
+  DominantMotion dominant;  // of the displacement field; set by CosineTest
 };
 
-// Whether displacements of a frame that chaining may follow lead to another one.
+// Whether a frame has displacements into another one that chaining may follow.
 bool leads_to(const TrustedMotion& from, const TrustedMotion& to,
               const TrackBuilderOptions& options);
 
-// The links of the current frame to chained ones, nearest in display first; a frame that is never
-// shown has no place in time and comes last.
+// The links of the current frame to chained frames, ordered by display distance. A frame that is
+// never shown has no display time and comes last.
 std::vector<Link> find_links(const ChainedFrame& current,
                              std::span<const std::unique_ptr<ChainedFrame>> frames,
                              const CellGrid& grid, const TrackBuilderOptions& options);

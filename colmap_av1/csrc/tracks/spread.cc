@@ -40,7 +40,7 @@ std::vector<std::uint8_t> select_spread(const TrackView& tracks,
                                         const SpreadOptions& options) {
   check(tracks, order);
   const std::size_t total = tracks.frame.size();
-  // The grid of every picture ends at the outermost observation.
+  // The grid of every picture extends to the outermost observation.
   std::int64_t cols = 1;
   std::int64_t rows = 1;
   const auto cell_at = [&](float value) {

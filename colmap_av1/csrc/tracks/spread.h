@@ -1,4 +1,4 @@
-// Chooses tracks that are spread over the pictures.
+// Selects tracks that are spread over the pictures.
 #pragma once
 
 #include <cstdint>
@@ -8,12 +8,12 @@
 namespace colmap_av1::tracks {
 
 struct SpreadOptions {
-  double spacing = 0;            // px between the tracks of a picture, on average; 0: any
-  int max_tracks_per_image = 0;  // 0: any number
+  double spacing = 0;            // average px between the tracks of a picture; 0: no limit
+  int max_tracks_per_image = 0;  // 0: no limit
   int min_length = 1;
 };
 
-// Borrowed tracks in the layout of TrackArrays.
+// A view of tracks in the layout of TrackArrays.
 struct TrackView {
   int num_frames = 0;
   std::span<const std::int64_t> offsets;
@@ -21,11 +21,11 @@ struct TrackView {
   std::span<const float> xy;
 };
 
-// One flag for each observation: 1 where it is kept. Tracks are taken in `order`, best first. One
-// is kept where at least half of its observations lie in pictures that are not full, and there in
-// cells, `spacing` wide, that no better track lies in. It loses the observations in full pictures,
-// and is left out where fewer than `min_length` remain. Throws std::invalid_argument for arrays
-// that do not fit each other.
+// Returns one flag for each observation: 1 if it is kept. Tracks are selected in `order`, best
+// first. A track is kept if at least half of its observations lie in pictures that are not full,
+// and there in cells of width `spacing` without a better track. It loses its observations in full
+// pictures, and is removed if fewer than `min_length` remain. Throws std::invalid_argument for
+// inconsistent arrays.
 std::vector<std::uint8_t> select_spread(const TrackView& tracks,
                                         std::span<const std::int64_t> order,
                                         const SpreadOptions& options);

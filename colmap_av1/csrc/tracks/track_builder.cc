@@ -32,7 +32,7 @@ void TrackBuilder::add(const FrameMotion& coded) {
   if (!frame.is_shown()) {
     chain_frame(frame);
   } else if (coded.show_frame) {
-    // Frames are output in display order: all before this one have been read.
+    // Frames are output in display order, so all frames before this one have been read.
     last_display_ = coded.display_index;
     chain_up_to(coded.display_index);
   }
@@ -111,12 +111,12 @@ void TrackBuilder::chain_frame(ChainedFrame& frame) {
   if (frame.is_shown()) store_.observe(frame);
 }
 
-// In the centre of every square of `seeding` x `seeding` cells that holds no track.
+// Starts a track in the centre of every square of `seeding` x `seeding` cells without a track.
 void TrackBuilder::seed(ChainedFrame& frame) const {
   const int size = options_.seeding;
   const float half = grid_.half_cell * static_cast<float>(size);
   const auto is_empty = [&](int row, int col) {
-    // Squares larger than a unit may reach beyond the frame.
+    // Squares larger than a unit may extend beyond the frame.
     for (int r = row; r < std::min(row + size, frame.cell_rows); ++r) {
       for (int c = col; c < std::min(col + size, frame.cell_cols); ++c) {
         if (frame.cells[r * frame.cell_cols + c].track != kNoTrack) return false;
@@ -136,7 +136,7 @@ void TrackBuilder::seed(ChainedFrame& frame) const {
   }
 }
 
-// Lets go of the frames that no frame to come can be linked to.
+// Releases the frames to which no later frame can be linked.
 void TrackBuilder::release_frames(std::span<const std::int32_t> slots) {
   const auto is_needed = [&](const ChainedFrame& frame) {
     if (!frame.is_chained()) return true;

@@ -16,21 +16,20 @@
 
 namespace colmap_av1::tracks {
 
-// Frames come in bitstream order and are chained in display order, so that a frame that
+// Frames are added in bitstream order and chained in display order, so that a frame that
 // was coded far ahead is reached by the short steps of the frames between, not by its own
-// long and poor vectors. Memory: the frames in reference slots, those that displacements
-// still link to a frame that waits for its turn, and the store's tracks.
+// long and inaccurate vectors. Memory holds the frames in reference slots, the frames that
+// displacements link to a frame that is not chained yet, and the tracks of the store.
 class TrackBuilder {
  public:
-  // Throws std::invalid_argument for cells that no unit can be cut into.
+  // Throws std::invalid_argument for cells into which a unit cannot be divided.
   explicit TrackBuilder(const TrackBuilderOptions& options);
   TrackBuilder(const TrackBuilder&) = delete;
   TrackBuilder& operator=(const TrackBuilder&) = delete;
   TrackBuilder(TrackBuilder&&) = default;
   TrackBuilder& operator=(TrackBuilder&&) = default;
 
-  // Throws std::invalid_argument for block data or an order of frames that contradicts
-  // itself.
+  // Throws std::invalid_argument for inconsistent block data or a wrong order of frames.
   void add(const FrameMotion& frame);
 
   // The kept tracks in the order of their seeds. The builder is empty afterwards.
@@ -50,11 +49,11 @@ class TrackBuilder {
   Chainer chainer_;
   TrackStore store_;
   int num_frames_ = 0;
-  int last_display_ = -1;  // of the frames shown so far
+  int last_display_ = -1;  // largest display index so far
   std::int32_t frames_chained_ = 0;
   std::int64_t next_serial_ = 0;
   std::vector<std::unique_ptr<ChainedFrame>> frames_;       // in bitstream order
-  std::vector<std::unique_ptr<ChainedFrame>> idle_frames_;  // their memory is used again
+  std::vector<std::unique_ptr<ChainedFrame>> idle_frames_;  // their memory is reused
   TrustScratch scratch_;
 };
 

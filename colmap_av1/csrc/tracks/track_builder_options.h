@@ -1,4 +1,4 @@
-// What can be chosen about tracks.
+// Options of building tracks.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +8,8 @@
 
 namespace colmap_av1::tracks {
 
-// A limit without a value is off. Meaning and units: TrackOptions in the package's
-// options/tracks.py.
+// A limit without a value is off. TrackOptions in the package's options/tracks.py documents
+// meanings and units.
 struct TrackBuilderOptions {
   int min_length = 4;
   std::optional<double> cosine;
@@ -23,9 +23,9 @@ struct TrackBuilderOptions {
   std::optional<double> interpolation;
   std::optional<double> bridge;
   int cells = 1;  // along either side of a unit
-  // Along either side of a square of them that a track starts in; divides cells, or twice as many.
+  // Number of cells along either side of a square in which a track starts; a divisor of 2 * cells.
   int seeding = 1;
-  // Display indices of the frames whose observations are kept; without a value those of all.
+  // Display indices of the frames whose observations are kept; without a value, all frames.
   std::optional<std::vector<std::int32_t>> observed;
 
   bool is_within_reach(int interval) const {

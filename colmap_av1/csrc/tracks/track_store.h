@@ -1,4 +1,4 @@
-// Keeps tracks while they live, and those that are long enough beyond.
+// Stores tracks while they are alive, and keeps those that are long enough when they end.
 #pragma once
 
 #include <array>
@@ -23,63 +23,62 @@ struct TrackArrays {
   std::vector<float> sigma;
 };
 
-// Memory: the observations of tracks that are alive or long enough to keep, in the frames whose
-// observations are wanted.
+// Memory holds the observations of tracks that are alive or long enough, in the observed frames.
 class TrackStore {
  public:
-  // `observed`: display indices of these frames; without a value all are, else a track that only
-  // one of them sees is not kept.
+  // `observed`: display indices of the observed frames; without a value, all frames. With a value,
+  // a track that is observed in only one of these frames is not kept.
   TrackStore(int min_length, std::optional<std::vector<std::int32_t>> observed);
 
-  // Size of the pictures that positions are given in.
+  // Size of the pictures in whose pixels positions are given.
   void set_size(int width, int height);
   bool has_size() const { return width_ != 0; }
 
-  // Shown frames that have seen a cell's track.
+  // Number of shown frames in which a cell's track has been observed.
   std::int32_t length(const ChainedFrame& frame, const Cell& cell) const {
     if (cell.track == kSeed) return frame.is_shown() ? 1 : 0;
     return tracks_[cell.track].length;
   }
-  // Whether a cell holds a track that has no place in a frame yet.
+  // Whether a cell holds a track that is not continued into a frame yet.
   bool is_unplaced(const Cell& cell, const ChainedFrame& frame) const {
     return cell.track == kSeed || (cell.track != kNoTrack && last_seen_[cell.track] != frame.order);
   }
 
-  // Makes a track of the seed in a cell, seen there where the frame is shown.
+  // Turns the seed in a cell into a track, with an observation there if the frame is shown.
   std::int32_t start(ChainedFrame& frame, std::size_t cell);
-  // Another frame holds the track.
+  // Records that one more frame holds the track.
   void hold(std::int32_t track, const ChainedFrame& frame) {
     last_seen_[track] = frame.order;
     ++tracks_[track].frames;
   }
-  // A shown frame sees the tracks that it holds.
+  // Adds observations of all tracks that a shown frame holds.
   void observe(const ChainedFrame& frame);
-  // A frame is gone: a track that no frame holds any more is over.
+  // Releases a frame. A track that no frame holds any more ends.
   void release(ChainedFrame& frame);
 
-  // The kept tracks in the order of their seeds. No frame holds a track any more; the store is of
-  // no use afterwards.
+  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more, and
+  // the store cannot be used afterwards.
   TrackArrays finish();
 
  private:
-  // Small: tracks are looked up all the time, in no order.
+  // Kept small, because tracks are accessed often and in random order.
   struct Track {
     std::int32_t last_stretch = -1;
-    std::int32_t length = 0;    // shown frames that have seen it
-    std::int32_t observed = 0;  // observations that are kept of it
-    std::int32_t frames = 0;    // that hold it
+    std::int32_t length = 0;    // number of shown frames with an observation
+    std::int32_t observed = 0;  // number of observations that are kept
+    std::int32_t frames = 0;    // number of frames that hold it
   };
   struct Observation {
     std::int32_t frame = 0;
     Point position;
     float sigma = 0.F;
   };
-  // Observations of a track that lives, a line of the cache at a time.
+  // Some observations of a live track, in one cache line.
   static constexpr int kStretch = 4;
   struct alignas(64) Stretch {
     std::array<Observation, kStretch> observations;
   };
-  // Those of the tracks that are kept. A deque grows without being copied.
+  // Observations of finished tracks. A deque grows without copying.
   struct Done {
     std::deque<std::int32_t> frame;
     std::deque<float> xy;
@@ -87,7 +86,7 @@ class TrackStore {
   };
   struct Kept {
     std::int64_t serial = 0;
-    std::ptrdiff_t first = 0;  // of its observations among those that are done
+    std::ptrdiff_t first = 0;  // index of its first observation among the finished ones
     std::int32_t length = 0;
   };
 
@@ -101,13 +100,13 @@ class TrackStore {
   int width_ = 0;
   int height_ = 0;
   std::vector<Track> tracks_;
-  std::vector<std::int32_t> last_seen_;  // order of the last frame that took each track up
-  std::vector<std::int64_t> serials_;    // of the tracks' seeds
+  std::vector<std::int32_t> last_seen_;  // order of the last frame that continued each track
+  std::vector<std::int64_t> serials_;    // serial numbers of the tracks' seeds
   std::vector<std::int32_t> free_tracks_;
   std::deque<Stretch> stretches_;
-  std::vector<std::int32_t> previous_stretch_;  // of the same track, by stretch
+  std::vector<std::int32_t> previous_stretch_;  // by stretch, the previous one of the same track
   std::vector<std::int32_t> free_stretches_;
-  std::vector<Kept> kept_;  // in the order in which they ended, as their observations are
+  std::vector<Kept> kept_;  // in the order in which they ended, like their observations
   Done done_;
 };
 

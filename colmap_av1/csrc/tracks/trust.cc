@@ -8,7 +8,7 @@
 namespace colmap_av1::tracks {
 namespace {
 
-// Logarithm of the variance in px^2, linear in these traits; fitted by
+// The logarithm of the variance in px^2 is linear in these traits. Fitted by
 // examples/benchmarks/fit_trust.py.
 constexpr float kConstant = -2.77F;
 constexpr float kDisagreement = 0.87F;  // times log(0.1 px + disagreement)
@@ -19,11 +19,11 @@ constexpr float kOverlapped = 0.19F;
 constexpr float kWarped = -0.31F;
 constexpr float kNewVector = -1.37F;
 
-// A block that nothing around it speaks for or against.
+// For a block without neighbours to compare with.
 constexpr float kUnknownDisagreement = 0.5F;
 constexpr float kMaxSigma = 4.F;
 
-// The encoder searched for the vector rather than take a neighbour's.
+// Whether the encoder coded a new vector instead of using a neighbour's.
 bool has_new_vector(int y_mode) { return y_mode == av1::NEWMV || y_mode == av1::NEW_NEWMV; }
 
 }  // namespace

@@ -20,18 +20,18 @@ namespace {
 
 using Verdict = TrustScratch::Verdict;
 
-// Units that say whether a frame moves evenly, about.
+// Approximate number of sampled units that decide whether a frame moves evenly.
 constexpr int kEvenSamples = 2048;
-constexpr int kSuperblock = 16;  // in units, of the smaller ones
-// Share of them that lie in blocks small enough where the picture shows something. Where a camera
-// stands still, and without noise, they are 0.02.
+constexpr int kSuperblock = 16;  // in units; the smaller of the two sizes
+// At least this share of the sampled units lies in small blocks if the picture shows any detail.
+// For a camera that stands still, without noise, the share is 0.02.
 constexpr double kDetail = 0.01;
 
-// How the units around a block move, against the block.
+// How the motion of the units around a block compares with that of the block.
 struct Agreement {
   int judged = 0;
   int agreeing = 0;
-  double distance = 0;  // summed over the judged ones
+  double distance = 0;  // sum over the judged units
 };
 
 bool has_compounds(const FrameMotion& frame) {
@@ -70,7 +70,7 @@ void keep_warps(const FrameMotion& frame, TrustedMotion& motion) {
   motion.warps.insert(motion.warps.end(), frame.gm_params.begin(), frame.gm_params.end());
 }
 
-// The place of a displacement's warp among the kept ones, -1 for a translation
+// The index of a displacement's warp among the kept warps; -1 for a translation
 std::int32_t kept_warp(const FrameMotion& frame, const Displacement& d) {
   if (d.warp == nullptr) return -1;
   const auto num_local = static_cast<std::ptrdiff_t>(frame.local_warp_params.size());
@@ -84,7 +84,7 @@ bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool co
   return coded || !options.max_uncoded_block_area || block_area <= *options.max_uncoded_block_area;
 }
 
-// Whether motion from `from` to `to` keeps away from the picture's edge.
+// Whether motion from `from` to `to` keeps its distance from the edge of the picture.
 bool is_within_border(const TrustedMotion& motion, float border, Point from, Point to) {
   const auto is_in_border = [&](Point p) {
     return p.x < border || p.y < border || p.x > motion.coded_width - border ||
@@ -97,15 +97,15 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
   return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
 }
 
-// What moves evenly, of the frame's first list. Nothing where blocks are all small enough, nor
-// where hardly any are: of one colour, all of a picture seems to stand.
+// The even motion in the frame's first list. There is none if all blocks are small enough. There is
+// none either if hardly any are, because a picture of one colour seems to stand still.
 EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
                        const DisplacementModel& model, const TrustedMotion& motion) {
   const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
   int num_small = 0;
   int num_large = 0;
   std::vector<TimedMotion> spread;
-  // Beyond the last whole superblock blocks are small for want of room.
+  // Blocks after the last whole superblock are excluded, because they are small for lack of space.
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
@@ -123,8 +123,8 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   return {spread, motion.coded_width, motion.height};
 }
 
-// The displacements of visible units by the rules that need no other unit but those of the picture
-// as a whole.
+// Reads the displacements of visible units, by the rules that do not compare a unit with its
+// neighbours.
 void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
                         TrustedMotion& motion) {
   const DisplacementModel model(frame);
@@ -151,8 +151,9 @@ void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& opt
   }
 }
 
-// Of a unit's motion to that of another unit, in px, by the list that comes nearest, motion into
-// other frames scaled to the interval; infinite where nothing can be compared.
+// The difference of a unit's motion to that of another unit in px, using the list with the smallest
+// difference. Motion into other frames is scaled to the interval. Infinite if nothing can be
+// compared.
 double disagreement(const TrustedMotion& motion, const UnitMotion& own, int other_unit) {
   const double interval = motion.ref_interval[own.ref];
   double best = std::numeric_limits<double>::infinity();
@@ -171,8 +172,8 @@ double disagreement(const TrustedMotion& motion, const UnitMotion& own, int othe
   return best;
 }
 
-// Holds the units around the block that starts at (row, col) each against the unit of the block
-// that it touches.
+// Compares each unit around the block that starts at (row, col) with the unit of the block that it
+// touches.
 Agreement judge_border(const TrustedMotion& motion, std::optional<double> smoothness, int row,
                        int col, int list) {
   Agreement result;
@@ -187,7 +188,7 @@ Agreement judge_border(const TrustedMotion& motion, std::optional<double> smooth
     if (std::isinf(distance)) return;
     ++result.judged;
     result.distance += distance;
-    // Motion that is large changes much from place to place.
+    // Large motion also varies more from position to position.
     const double length = std::sqrt(own.dx * own.dx + own.dy * own.dy);
     if (smoothness && distance <= *smoothness * (1 + length / 8)) ++result.agreeing;
   };
@@ -205,8 +206,8 @@ Agreement judge_border(const TrustedMotion& motion, std::optional<double> smooth
   return result;
 }
 
-// Of the block whose first unit is at (row, col). At the picture's border, other units of a block
-// may be trusted than the first.
+// Judges the block whose first unit is at (row, col). At the border of the picture, the first unit
+// of a block may be distrusted and others trusted.
 Verdict judge_block(const FrameMotion& frame, const TrackBuilderOptions& options,
                     const TrustedMotion& motion, int row, int col, int list) {
   const int unit = row * motion.cols + col;
@@ -226,9 +227,9 @@ Verdict judge_block(const FrameMotion& frame, const TrackBuilderOptions& options
   return {sigma * sigma, options.smoothness && 2 * around.agreeing < around.judged};
 }
 
-// Says how far to trust the lists of every block, and takes out those that most of the units
-// around it contradict. A block of w x h units lies at a multiple of (w, h), so its origin follows
-// from its size.
+// Determines how much to trust the lists of every block, and removes those that most of the units
+// around the block contradict. A block of w x h units lies at a multiple of (w, h), so its size
+// determines its origin.
 void judge_blocks(const FrameMotion& frame, const TrackBuilderOptions& options,
                   TrustScratch& scratch, TrustedMotion& motion) {
   auto& verdicts = scratch.verdicts;

@@ -1,4 +1,4 @@
-// The motion of a coded frame as far as it may be trusted, unit by unit.
+// The trusted motion of a coded frame, unit by unit.
 #pragma once
 
 #include <array>
@@ -14,12 +14,12 @@
 
 namespace colmap_av1::tracks {
 
-// A unit's motion by one of its lists: ref 0 where there is none to trust.
+// The motion of a unit in one of its lists; ref 0 if there is none that is trusted.
 struct UnitMotion {
   float dx = 0.F;  // at the unit's centre, in coded pixels
   float dy = 0.F;
-  std::int32_t warp = -1;  // index in TrustedMotion::warps, -1 for a translation
-  float variance = 0.F;    // expected of the displacement, in coded px^2
+  std::int32_t warp = -1;  // index in TrustedMotion::warps; -1 for a translation
+  float variance = 0.F;    // expected variance of the displacement, in coded px^2
   std::int8_t ref = 0;
 };
 
@@ -33,12 +33,12 @@ struct TrustedMotion {
   float width = 0.F;
   float height = 0.F;
   float coded_width = 0.F;
-  float upscale = 1.F;  // picture pixels to a coded one, above 1 by super-resolution
+  float upscale = 1.F;  // picture pixels per coded pixel, above 1 with super-resolution
   std::array<int, kNumRefs> ref_decode_index{};
-  std::array<int, kNumRefs> ref_interval{};      // in shown frames, 0 where unknown
+  std::array<int, kNumRefs> ref_interval{};      // in shown frames; 0 if unknown
   std::array<std::vector<UnitMotion>, 2> lists;  // the second stays unused without compounds
   int num_lists = 0;
-  std::array<int, kNumRefs> num_linked{};  // entries of the lists, by their ref
+  std::array<int, kNumRefs> num_linked{};  // number of entries of the lists, by ref
   std::vector<av1::WarpParams> warps;
   std::vector<std::uint8_t> mi_size;
 
@@ -61,12 +61,12 @@ struct TrustedMotion {
     return {kUnit * (static_cast<float>(unit % cols) + 0.5F),
             kUnit * (static_cast<float>(unit / cols) + 0.5F)};
   }
-  int block_area(int unit) const;  // of the block that a unit belongs to, in px^2
+  int block_area(int unit) const;  // of the block that contains a unit, in px^2
 };
 
-// Working memory of read_trusted_motion, kept by the caller from frame to frame.
+// Working memory of read_trusted_motion, which the caller reuses for every frame.
 struct TrustScratch {
-  // How far to trust a block's motion.
+  // How much to trust the motion of a block.
   struct Verdict {
     float variance = 0.F;
     bool rough = false;
@@ -75,8 +75,8 @@ struct TrustScratch {
   std::vector<UnitMotion> unfilled;
 };
 
-// Copies what chaining needs of a coded frame, by the trust rules of `options`. Overwrites
-// `motion`, whose memory is used again. The frame has passed check_frame_motion.
+// Copies the motion of a coded frame that is trusted by the rules of `options`. Overwrites
+// `motion`, whose memory is reused. The frame must have passed check_frame_motion.
 void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
                          TrustScratch& scratch, TrustedMotion& motion);
 
@@ -84,14 +84,14 @@ inline bool moves_alike(const UnitMotion& a, const UnitMotion& b, float limit) {
   return distance({a.dx, a.dy}, {b.dx, b.dy}) < limit;
 }
 
-// Where a unit's motion takes a position in coded pixels.
+// The position to which a unit's motion moves a position, in coded pixels.
 inline Point move(const TrustedMotion& frame, const UnitMotion& motion, Point position) {
   if (motion.warp < 0) return {position.x + motion.dx, position.y + motion.dy};
   const Position moved = apply_warp(frame.warps[motion.warp], {position.x, position.y});
   return {static_cast<float>(moved.x), static_cast<float>(moved.y)};
 }
 
-// The position that `move` takes to `target`; none where the warp has no inverse.
+// The position that `move` moves to `target`; nothing if the warp has no inverse.
 inline std::optional<Point> move_back(const TrustedMotion& frame, const UnitMotion& motion,
                                       Point target) {
   if (motion.warp < 0) return Point{target.x - motion.dx, target.y - motion.dy};

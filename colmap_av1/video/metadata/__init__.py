@@ -1,1 +1,1 @@
-"""What containers carry beside the pictures: where, by which lens and how they were taken."""
+"""Metadata of a video: GPS positions, gravity, focal length and spherical projection."""

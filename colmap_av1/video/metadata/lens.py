@@ -1,4 +1,4 @@
-"""The focal length that a container says, as phones write it."""
+"""The focal length in the metadata of a container, which phones write."""
 
 from __future__ import annotations
 
@@ -7,50 +7,51 @@ import re
 
 from colmap_av1.util.texts import shown
 
-# Of the picture that a focal length in millimetres is equivalent to, CIPA DCG-001: 36 x 24.
+# Diagonal in millimetres of the 36 x 24 mm frame that equivalent focal lengths refer to (CIPA
+# DCG-001).
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 _TAG = "camera.focal_length.35mm_equivalent"
-# No lens of a camera that films has others.
+# Values outside this range, in millimetres, are implausible.
 _SHORTEST, _LONGEST = 6.0, 1200.0
 
 
 def said_focal_length(
     tags: tuple[tuple[str, str], ...], size: tuple[int, int], pixel_aspect: float = 1.0
 ) -> float | None:
-    """The focal length that a container says, by the diagonal of its pictures.
+    """The focal length that a container gives, converted by the diagonal of the pictures.
 
     Args:
-        tags: names in lower case, and values, of what the container says.
+        tags: metadata of the container: (name in lower case, value) pairs.
         size: (width, height) of the pictures in pixels.
-        pixel_aspect: width of a pixel over its height.
+        pixel_aspect: width of a pixel divided by its height.
 
     Returns:
-        In heights of a pixel; None where it says none, or none that can be one.
+        The focal length in pixel heights; None if it is missing or implausible.
     """
-    millimetres = _millimetres(_said(tags))
+    millimetres = _millimetres(_tag_value(tags))
     if millimetres is None:
         return None
     return millimetres / _FILM_DIAGONAL * math.hypot(size[0] * pixel_aspect, size[1])
 
 
 def doubtful_lens(tags: tuple[tuple[str, str], ...]) -> str | None:
-    """A focal length that a container says and no lens has, in words; None: there is none."""
-    said = _said(tags).strip()
-    if not said or _millimetres(said) is not None:
+    """Describe an implausible focal length that a container gives; None if there is none."""
+    text = _tag_value(tags).strip()
+    if not text or _millimetres(text) is not None:
         return None
     return (
-        f"the container says a focal length of '{shown(said)}' mm (of 35 mm film), which no lens "
-        "that films has: that is left out"
+        f"the container's focal length of '{shown(text)}' mm (35 mm equivalent) is implausible: it "
+        "is ignored"
     )
 
 
-def _said(tags: tuple[tuple[str, str], ...]) -> str:
+def _tag_value(tags: tuple[tuple[str, str], ...]) -> str:
     return next((value for name, value in tags if name.endswith(_TAG)), "")
 
 
-def _millimetres(said: str) -> float | None:
-    """The number that is said; None where it is none, or no lens has it."""
-    if re.fullmatch(r"\s*\d+(\.\d+)?\s*", said) is None:
+def _millimetres(text: str) -> float | None:
+    """The focal length as a number; None if it is not a number or is implausible."""
+    if re.fullmatch(r"\s*\d+(\.\d+)?\s*", text) is None:
         return None
-    millimetres = float(said)
+    millimetres = float(text)
     return millimetres if _SHORTEST <= millimetres <= _LONGEST else None

@@ -1,4 +1,4 @@
-"""Which positions can be those of a camera."""
+"""Which positions are valid."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 
 def are_places(places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which latitudes, longitudes and altitudes [n, 3] can be those of a camera.
+    """Which positions (latitude, longitude, altitude), float64 [n, 3], are valid for a camera.
 
-    Both angles 0 is what receivers write without a fix.
+    Latitude and longitude 0 are invalid, because receivers write them without a fix.
     """
     latitude, longitude, altitude = np.nan_to_num(places, nan=np.inf).T
     on_earth = (abs(latitude) <= 90) & (abs(longitude) <= 180) & (abs(altitude) < 1e5)

@@ -1,7 +1,8 @@
-"""Where a video was taken, as its container or a file beside it says.
+"""GPS positions and gravity of a video, from its container or from a file with the same name.
 
-GoPro writes positions in a data track (GPMF), DJI as subtitles, in the file or in an .srt beside
-it; phones write one for the whole video. FFmpeg demuxes them all, .srt files, too.
+GoPro cameras write positions to a data track (GPMF). DJI drones write them as subtitles, in the
+video or in an .srt file with the same name. Phones write one position for the whole video. FFmpeg
+demuxes all of these, including .srt files.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ from colmap_av1.video.metadata.gpmf import Payload, read_payload
 from colmap_av1.video.metadata.places import are_places
 from colmap_av1.video.metadata.subtitles import holds_position, read_position, to_places
 
-# As Apple and Android spell one position: ISO 6709, annex H, in degrees.
+# Apple and Android write one position in these tags, in degrees as in ISO 6709, annex H.
 _TAGS = ("com.apple.quicktime.location.iso6709", "location", "location-eng", "xyz")
 _NUMBER = r"[+-]?\d+(?:\.\d+)?"
 _ISO_6709 = re.compile(rf"({_NUMBER})([+-]\d+(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?(?:CRS\S*)?/?")
-# The key that every packet of GoPro's track begins with: PyAV does not name the codec of data.
+# Every packet of GoPro's track begins with this key. PyAV does not name the codec of data streams.
 _GPMF = b"DEVC"
-_NOT_UNDERSTOOD = "holds no positions that are understood"
+_UNKNOWN_FORMAT = "has no positions in a known format"
 # FFmpeg's AVDISCARD_DEFAULT and AVDISCARD_ALL.
 _READ, _SKIP = 0, 48
-# Longest time between two positions that those of frames are interpolated over, in seconds.
+# Positions are interpolated between neighbours that are at most this many seconds apart.
 _LONGEST_GAP = 3.0
 
 
 @dataclass(frozen=True)
 class _Packet:
-    """Start and duration in seconds, and content."""
+    """Start and duration of a packet in seconds, and its content."""
 
     start: float
     duration: float
@@ -48,21 +49,21 @@ class _Packet:
 
 @dataclass(frozen=True)
 class Positions:
-    """Where a video was taken, and how it was held.
+    """GPS positions and directions of gravity of a video.
 
     Attributes:
-        source: what says it, for messages.
+        source: where they come from, for messages.
         times: float64 [n] seconds after the video's first picture, ascending.
         places: float64 [n, 3] latitude and longitude in degrees, altitude in metres (WGS 84;
-            0 where it is unknown).
-        place: the one position of the whole video, likewise; None: none is said.
+            0 if unknown).
+        place: one position for the whole video, in the same units; None if not given.
         gravity_times: float64 [m] as `times`.
-        gravity: float64 [m, 3] direction of gravity in axes of the camera, which are the image's
-            but for their order and signs.
-        stream: index of the stream of the video that holds times and places; None: another file
-            does, or none.
-        first_picture: time in seconds of the video's first picture as players count it.
-        left_out: what is said and cannot be used, in words; None: nothing.
+        gravity: float64 [m, 3] direction of gravity in camera axes, which are the image axes in
+            another order and with other signs.
+        stream: index of the stream of the video that holds times and places; None if another file
+            holds them, or there are none.
+        first_picture: time in seconds of the video's first picture, on the clock of players.
+        left_out: description of the data that is ignored; None if nothing is ignored.
     """
 
     source: str
@@ -77,23 +78,20 @@ class Positions:
 
 
 def doubtful_place(tags: tuple[tuple[str, str], ...]) -> str | None:
-    """The one position that a container says and that can be none, in words; None: there is none.
+    """Describe an invalid position that a container gives for the whole video; None if none.
 
     Args:
-        tags: names in lower case, and values, of what the container says.
+        tags: metadata of the container: (name in lower case, value) pairs.
     """
-    said = dict(tags)
-    text = next((said[tag].strip() for tag in _TAGS if said.get(tag, "").strip()), None)
-    if text is None or _one_place(said) is not None:
+    metadata = dict(tags)
+    text = next((metadata[tag].strip() for tag in _TAGS if metadata.get(tag, "").strip()), None)
+    if text is None or _one_place(metadata) is not None:
         return None
-    return (
-        f"the container says that it was filmed at '{shown(text)}', which is no place on "
-        "Earth: that is left out"
-    )
+    return f"the container's position '{shown(text)}' is not a place on Earth: it is ignored"
 
 
 def read_positions(video: VideoFile) -> Positions | None:
-    """Read the positions of a video; None where nothing says any, or no tag one that can be one.
+    """Read the positions of a video; None if there is no data and no valid tag.
 
     Raises:
         VideoError: the file cannot be opened.
@@ -108,9 +106,9 @@ def read_positions(video: VideoFile) -> Positions | None:
             found = _of_data(container, packets, start)
             if found is None or found.left_out is not None:
                 found = _of_subtitles(container, packets, start, place) or found
-    beside = _file_beside(video.path)
-    if beside is not None and (found is None or not (len(found.times) or len(found.gravity))):
-        found = _of_file_beside(beside, place) or found
+    srt_file = _srt_file(video.path)
+    if srt_file is not None and (found is None or not (len(found.times) or len(found.gravity))):
+        found = _of_srt_file(srt_file, place) or found
     if found is not None:
         return replace(found, place=place, first_picture=start)
     nothing = np.empty(0), np.empty((0, 3))
@@ -120,12 +118,15 @@ def read_positions(video: VideoFile) -> Positions | None:
 def interpolate(
     times: NDArray[np.float64], known_times: NDArray[np.float64], known: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Values at some times between known ones; NaN before, after, and in long gaps.
+    """Interpolate known values linearly; NaN before the first, after the last, and in long gaps.
 
     Args:
         times: float64 [n] seconds.
-        known_times: float64 [m] ascending.
-        known: float64 [m, k].
+        known_times: float64 [m] seconds, ascending.
+        known: float64 [m, k] values at these times.
+
+    Returns:
+        float64 [n, k] values at `times`.
     """
     found = np.full((len(times), known.shape[1]), np.nan)
     if len(known_times) < 2:
@@ -133,7 +134,7 @@ def interpolate(
     after = np.clip(np.searchsorted(known_times, times), 1, len(known_times) - 1)
     start, end = known_times[after - 1], known_times[after]
     step = end - start
-    # The last position holds until the next would come.
+    # The last value is used for one more step, until the next value would follow.
     within = (times >= start - step) & (times <= end + step) & (step <= _LONGEST_GAP)
     share = np.clip((times - start) / step, 0, 1)[:, None]
     between = known[after - 1] + share * (known[after] - known[after - 1])
@@ -141,26 +142,26 @@ def interpolate(
     return found
 
 
-def _file_beside(video: Path) -> Path | None:
+def _srt_file(video: Path) -> Path | None:
     return next((p for s in (".srt", ".SRT") if (p := video.with_suffix(s)).is_file()), None)
 
 
-def _of_file_beside(path: Path, place: tuple[float, float, float] | None) -> Positions | None:
+def _of_srt_file(path: Path, place: tuple[float, float, float] | None) -> Positions | None:
     try:
         with open_container(path) as container:
             found = _of_subtitles(container, _packets(container), 0.0, place)
     except VideoError:
         nothing = np.empty(0), np.empty((0, 3))
-        left_out = f"{path} {_NOT_UNDERSTOOD}"
+        left_out = f"{path} {_UNKNOWN_FORMAT}"
         return Positions(str(path), *nothing, None, *nothing, left_out=left_out)
     return replace(found, source=str(path), stream=None) if found else None
 
 
 def _first_picture(video: VideoFile, container: Any) -> float:
-    """Time of a video's first picture as players count it, who may hide it.
+    """Time of a video's first picture on the clock of players, even if an edit list hides it.
 
-    Telemetry has edits of its own, or none: pictures coded out of order are shown later, and edits
-    make up for that.
+    An edit list shifts the pictures to compensate the delay of coding out of order. Telemetry has
+    another edit list, or none.
     """
     stream = container.streams[video.index]
     if "mov" not in video.container:
@@ -200,7 +201,7 @@ def _packets(container: Any) -> dict[int, list[_Packet]]:
     streams = [*container.streams.data, *container.streams.subtitles]
     found: dict[int, list[_Packet]] = {stream.index: [] for stream in streams}
     for other in container.streams:
-        if hasattr(other, "discard"):  # of later PyAV: what is not wanted is not even read
+        if hasattr(other, "discard"):  # newer PyAV can skip other streams without reading them
             other.discard = type(other.discard)(_READ if other in streams else _SKIP)
     data = {stream.index for stream in container.streams.data}
     with contextlib.suppress(av.error.FFmpegError, OSError):
@@ -234,7 +235,7 @@ def _of_data(container: Any, packets: dict[int, list[_Packet]], start: float) ->
     source = f"the GoPro track of {container.name}"
     left_out = _left_out(source, places[~kept])
     if not kept.any() and left_out is None and any(_has_receiver(p.content) for p in found):
-        left_out = f"{source} holds no position: the receiver had no fix, or the track is damaged"
+        left_out = f"{source} has no positions: the receiver had no fix, or the track is damaged"
     if not kept.any() and not held.any() and left_out is None:
         return None
     return Positions(
@@ -248,23 +249,23 @@ def _of_data(container: Any, packets: dict[int, list[_Packet]], start: float) ->
 
 
 def _has_receiver(payload: bytes) -> bool:
-    """Whether a packet of GoPro's is to hold positions, or what is said of their fix."""
+    """Whether a GoPro packet has fields for positions or their fix."""
     return any(key in payload for key in (b"GPS5", b"GPS9", b"GPSF"))
 
 
 def _left_out(source: str, refused: NDArray[np.float64], unreadable: int = 0) -> str | None:
-    """What is said of positions [n, 3] that can be none; those of no fix go without saying."""
+    """The message for ignored positions [n, 3]; None if there are only positions without a fix."""
     count = int((np.nan_to_num(refused[:, :2]) != 0).any(axis=1).sum()) + unreadable
     if count == 0:
         return None
-    return f"{source}: {count} of its positions can be none on Earth: they are left out"
+    return f"{source}: ignored {count} invalid GPS positions"
 
 
 def _spread(
     payloads: Sequence[tuple[float, float, Payload]],
     of: Callable[[Payload], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Samples of all packets, and their times: each packet's are evenly spread over it."""
+    """Times and values of the samples of all packets, spaced evenly within each packet."""
     times = [np.empty(0)]
     values = [np.empty((0, 3))]
     for start, duration, payload in payloads:
@@ -305,11 +306,11 @@ def _of_texts(
     places, doubt = to_places([own for _, own in found], place)
     kept = are_places(places)
     if doubt is not None:
-        left_out: str | None = f"{source}: positions that are not certain, {doubt}, are not used"
+        left_out: str | None = f"{source}: positions are ignored because it is unclear {doubt}"
     elif found or not unreadable:
         left_out = _left_out(source, places[~kept], unreadable)
     else:
-        left_out = f"{source} {_NOT_UNDERSTOOD}"
+        left_out = f"{source} {_UNKNOWN_FORMAT}"
     if not kept.any() and left_out is None:
         return None
     nothing = np.empty(0), np.empty((0, 3))
@@ -320,6 +321,6 @@ def _of_texts(
 def _ascending(
     times: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """By time, each time once."""
+    """Sort by time, and keep one value per time."""
     at, first = np.unique(times, return_index=True)
     return at, values[first]

@@ -1,4 +1,4 @@
-"""Videos of all directions, which no one camera model fits, and how views are cut from them."""
+"""Spherical videos, which no camera model fits, and the command that cuts views from them."""
 
 from __future__ import annotations
 
@@ -11,60 +11,60 @@ from typing import Any
 
 from colmap_av1.errors import VideoError
 
-# AVSphericalProjection of FFmpeg: its name, and that of its filter v360's input.
+# FFmpeg's AVSphericalProjection: name for messages, and the matching input of its filter v360.
 _PROJECTIONS = {
     0: ("equirectangular", "equirect"),
-    1: ("those of a cube map", "c3x2"),
+    1: ("cube maps", "c3x2"),
     2: ("equirectangular", "equirect"),
     3: ("half equirectangular", "hequirect"),
 }
-# Views that are cut: their directions in degrees, and the field of view, which lets them overlap.
+# Directions of the views in degrees, and their field of view, which is so wide that they overlap.
 _YAWS = {"equirect": (0, 90, 180, -90), "c3x2": (0, 90, 180, -90), "hequirect": (-40, 40)}
 _FIELD_OF_VIEW = 100
 _MULTIPLE = 16
-# No camera writes smaller ones.
-_LEAST_WIDTH = 1920
+# Spherical cameras do not write narrower pictures.
+_MIN_WIDTH = 1920
 
 
 def projection_of(side_data: Sequence[Any]) -> int | None:
-    """FFmpeg's number of the projection that a decoded frame has; None where it is a plane's."""
+    """FFmpeg's number of the spherical projection of a decoded frame; None if it has none."""
     data = next((d for d in side_data if d.type.name == "SPHERICAL"), None)
     number = struct.unpack("=i", bytes(data)[:4])[0] if data is not None else None
     return number if number in _PROJECTIONS else None
 
 
 def check_is_plane(path: Path, projection: int | None, width: int) -> None:
-    """Refuse pictures of all directions, with the line that cuts views from them.
+    """Check that a video is not spherical; the error has the command that cuts views from it.
 
     Args:
         path: the video.
-        projection: as `projection_of` gives it.
-        width: of its pictures, in pixels; views get their resolution.
+        projection: as returned by `projection_of`.
+        width: width of its pictures in pixels, which determines the resolution of the views.
 
     Raises:
-        VideoError: they are.
+        VideoError: the video is spherical.
     """
     if projection is None:
         return
     name, of_filter = _PROJECTIONS[projection]
     raise VideoError(
-        f"{path}: its pictures are {name}, of all directions, which is no camera's model: cut "
-        f"views from it, and give each as --video: {_line(path, of_filter, width)}"
+        f"{path}: its pictures are {name}, which no camera model fits: cut views from it and give "
+        f"each as --video: {_line(path, of_filter, width)}"
     )
 
 
 def hint(path: Path, projection: int | None, size: tuple[int, int]) -> list[str]:
-    """A warning where pictures are as large and wide as equirectangular ones that do not say so."""
-    if projection is not None or size[0] != 2 * size[1] or size[0] < _LEAST_WIDTH:
+    """A warning if pictures have the shape of equirectangular ones but no such metadata."""
+    if projection is not None or size[0] != 2 * size[1] or size[0] < _MIN_WIDTH:
         return []
     return [
-        f"{path}: its pictures are twice as wide as high, as those of all directions are: if they "
+        f"{path}: its pictures are twice as wide as high, like those of spherical video: if they "
         f"are equirectangular, cut views from it: {_line(path, 'equirect', size[0])}"
     ]
 
 
 def _line(path: Path, of_filter: str, width: int) -> str:
-    """A line for a shell that cuts views from a video."""
+    """The shell command that cuts views from a video."""
     around = math.pi if of_filter == "hequirect" else 2 * math.pi
     side = 2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * width / around
     side = max(round(side / _MULTIPLE) * _MULTIPLE, _MULTIPLE)

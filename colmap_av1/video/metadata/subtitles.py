@@ -7,8 +7,8 @@
 | `GPS(59.3,18.0,0.0M)` | latitude first | accuracy | DJI Matrice 300 |
 | `GPS(E: 18.0, N: 59.3, 12.5m)` | named | altitude | Autel |
 
-The order of other spellings is unknown. Some Mavic Air 2 write radians in place of degrees. Source:
-the sample files of DJI_SRT_Parser, and ExifTool's reader of subtitles.
+The order in other spellings is unknown. Some Mavic Air 2 write radians instead of degrees. Source:
+the sample files of DJI_SRT_Parser, and ExifTool's subtitle reader.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ _ALTITUDES = (
     re.compile(rf"\bHb\s*:\s*({_NUMBER})"),
     re.compile(rf"\bH\s+({_NUMBER})m"),
 )
-# A text that holds one of these names, or a pair of numbers as precise, holds a position.
-_SAYS_PLACE = re.compile(
+# A text with one of these names, or with two numbers of four decimals or more, holds a position.
+_HOLDS_POSITION = re.compile(
     r"\b(?:lat|latitude|lon|lng|longt?itude|GPS|RTK)\b|-?\d+\.\d{4,}\D+\d+\.\d{4,}", re.IGNORECASE
 )
-# What is written in place of a position without a fix.
+# Written instead of a position if there is no fix.
 _NO_FIX = re.compile(r"\((?:\s*n/a\s*,?)+", re.IGNORECASE)
-# No video covers a path longer than this, in radians of latitude or longitude.
+# Largest extent of the path of a video, in radians of latitude or longitude (64 km).
 _LONGEST_PATH = 0.01
-# Degrees between a path and the position of its video, at most.
+# Largest distance in degrees between a path and the position of its video.
 _NEAR = 1.0
 
 
@@ -64,13 +64,13 @@ class Order(Enum):
 
 @dataclass(frozen=True)
 class WrittenPosition:
-    """A position as a subtitle spells it.
+    """A position as written in a subtitle.
 
     Attributes:
         angles: the two angles in the order in which they are written; latitude and longitude
-            where they are named.
+            if they are named.
         order: which of them comes first.
-        altitude: in metres; 0 where it is unknown.
+        altitude: in metres; 0 if unknown.
     """
 
     angles: tuple[float, float]
@@ -79,12 +79,12 @@ class WrittenPosition:
 
 
 def holds_position(text: str) -> bool:
-    """Whether a subtitle holds a position, in this or another spelling; false without a fix."""
-    return _SAYS_PLACE.search(text) is not None and _NO_FIX.search(text) is None
+    """Whether a subtitle holds a position, also in an unknown format; false without a fix."""
+    return _HOLDS_POSITION.search(text) is not None and _NO_FIX.search(text) is None
 
 
 def read_position(text: str) -> WrittenPosition | None:
-    """The position in a subtitle; None where it holds none that is understood."""
+    """The position in a subtitle; None if it holds none in a known format."""
     match = next((m for pattern in _ALTITUDES if (m := pattern.search(text))), None)
     altitude = float(match[1]) if match else 0.0
     latitude, longitude = _LATITUDE.search(text), _LONGITUDE.search(text)
@@ -112,15 +112,15 @@ def to_places(
 ) -> tuple[NDArray[np.float64], str | None]:
     """Latitude, longitude and altitude of the positions of one video.
 
-    The spelling gives the order and unit of the angles, unless most of them can be no place on
-    Earth that way, or the position of the whole video contradicts it.
+    The format determines the order and unit of the angles, unless that makes most positions
+    invalid or contradicts the position of the whole video.
 
     Args:
         written: the positions.
-        place: the position of the whole video; None: unknown.
+        place: the position of the whole video; None if unknown.
 
     Returns:
-        float64 [n, 3], NaN if their order or unit is not certain; and in that case a description of
+        float64 [n, 3], NaN if their order or unit is uncertain, and in that case a description of
         what is uncertain.
     """
     places = np.full((len(written), 3), np.nan)
@@ -143,7 +143,11 @@ def to_places(
 def _readings(
     angles: NDArray[np.float64], order: Order
 ) -> tuple[list[NDArray[np.float64]], str, bool]:
-    """The possible readings of angles [n, 2], the likeliest first; what differs; is it certain."""
+    """Possible interpretations of angles [n, 2].
+
+    Returns:
+        The interpretations, the most likely first; how they differ; whether the first is certain.
+    """
     swapped = angles[:, ::-1]
     if order is Order.NAMED:
         known = angles[(angles != 0).any(axis=1)]
@@ -164,7 +168,7 @@ def _readings(
 def _choose(
     readings: list[NDArray[np.float64]], is_certain: bool, place: tuple[float, float, float] | None
 ) -> NDArray[np.float64] | None:
-    """The reading that range, video and spelling agree on; None where they leave two."""
+    """The interpretation that range, video and format agree on; None if two remain."""
     known = (readings[0] != 0).any(axis=1)
     if len(readings) == 1 or not known.any():
         return readings[0]

@@ -1,4 +1,4 @@
-"""Where a video was taken, carried over to a stream that is made of it."""
+"""Copy GPS positions and gravity from a video to the stream converted from it."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from numpy.typing import NDArray
 from colmap_av1.video.container import VideoFile, open_container, read_file
 from colmap_av1.video.metadata.positions import Positions, read_positions
 
-# Apple's and Android's names of tags, which FFmpeg writes to .mp4 files only when told to.
+# Tags of Apple and Android begin with this. FFmpeg needs an option to write them to .mp4 files.
 _KEYS = "com."
-# FFmpeg's words for subtitles, by the formats that hold them, and containers of the same kind.
+# For each output format that holds subtitles, the codec, and the input container with that codec.
 _SUBTITLES = {"mp4": ("mov_text", "mov"), "matroska": ("srt", "matroska")}
-# Seconds by which times may differ that are the same: containers round them.
+# Equal times may differ by less than this many seconds because containers round them.
 _SAME_TIME = 0.01
 
 
 def carrying(
     video: VideoFile, found: Positions | None, output_format: str
 ) -> tuple[list[str], list[str]]:
-    """FFmpeg's words that take positions and gravity over from a video.
+    """FFmpeg's arguments that copy positions and gravity from a video.
 
     Args:
-        video: the video, which is the first input without regard to edits of its frames.
-        found: what it says.
-        output_format: FFmpeg's name of the stream's format.
+        video: the video, which is ffmpeg's first input, with its edit list ignored.
+        found: its positions and gravity.
+        output_format: ffmpeg's name of the output format.
 
     Returns:
-        Words of a second input, and of the output; none of what the format cannot hold.
+        Arguments for a second input, and for the output; empty if the format cannot hold them.
     """
     words = []
     if output_format == "mp4" and any(name.startswith(_KEYS) for name, _ in video.tags):
@@ -45,13 +45,14 @@ def carrying(
         how = ["-c:d", "copy", "-copy_unknown"]
     else:
         return [], words
-    # Edits place telemetry beside the frames, of which the stream has those, too, that they hide.
+    # The stream begins with the frames that the edit list hides, so telemetry, which follows the
+    # edit list, must be shifted.
     again = ["-itsoffset", f"{-found.first_picture:.6f}", "-i", f"file:{video}"]
     return again, [*words, "-map", f"1:{found.stream}", *how]
 
 
 def loss_of(video: VideoFile, found: Positions | None, stream: Path) -> str | None:
-    """What a stream lacks of where its video was taken, in words; None where it lacks nothing."""
+    """Describe which positions of its video a stream lacks; None if it lacks none."""
     if found is None:
         return None
     kept = read_positions(read_file(stream))
@@ -64,15 +65,15 @@ def loss_of(video: VideoFile, found: Positions | None, stream: Path) -> str | No
         return None
     if found.stream is None and len(found.times):
         return (
-            f"{found.source} says where {video} was taken, and belongs to that: copy it to "
+            f"{found.source} holds the positions of {video}, which the stream lacks: copy it to "
             f"{stream.with_suffix('.srt')}, too"
         )
     return (
-        f"{stream} does not hold where {video} was taken: give an output that ends in .mp4, or "
-        "give later commands the video itself"
+        f"{stream} does not contain the positions of {video}: give an output that ends in .mp4, "
+        "or give later commands the video itself"
     )
 
 
 def _are_alike(times: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Whether times are the same, but for less than a frame."""
+    """Whether times are equal up to less than a frame."""
     return len(times) == len(others) and bool((np.abs(times - others) < _SAME_TIME).all())
