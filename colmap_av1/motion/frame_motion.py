@@ -58,7 +58,7 @@ class FrameMotion:
         block_index: int32 [mi_rows, mi_cols] index of the block that contains each unit.
         local_warp_params: int32 [n, 6] LocalWarpParams (7.11.3.8), 16 fractional bits.
         ref_frame: int8 [mi_rows, mi_cols, 2] RefFrame: 0 INTRA, 1..7 LAST..ALTREF, -1 none.
-        mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list][0 = row, 1 = column] in 1/8 px.
+        mv: int16 [mi_rows, mi_cols, 2, 2] Mv[list] as (row, column) in 1/8 px.
         mi_size: uint8 MiSize (BLOCK_4X4 = 0 .. BLOCK_64X16 = 21).
         y_mode: uint8 YMode (DC_PRED = 0 .. NEW_NEWMV = 24).
         is_inter: uint8; 1 also with use_intrabc.

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).resolve().parent
-DOCUMENTS = (BENCHMARKS.parents[1] / "README.md", BENCHMARKS / "README.md")
+DOCUMENTS = tuple(BENCHMARKS.parents[1] / name for name in ("README.md", "docs/benchmarks.md"))
 MARKED = re.compile(r"(<!-- table ([^\n]+) -->\n).*?(<!-- end of table -->\n)", re.DOTALL)
 SPANS = (1, 2, 4, 8, 16)
 LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
@@ -163,7 +163,7 @@ def track_columns(rows: Sequence[Row]) -> list[Column]:
 
 
 def model_columns(rows: Sequence[Row]) -> list[Column]:
-    """The columns that describe models and what they take, beside the reference's."""
+    """The columns that describe models and their cost, compared with the reference's."""
     base = next((row for row in rows if row["frontend"] == REFERENCE), None)
 
     def took(row: Row, name: str) -> str:
@@ -294,8 +294,8 @@ def phone_to_folder(rows: list[Row]) -> str:
         Column("images", lambda row: f"{row['registered'] or '-'} of {row['images'] or '-'}"),
         figure("points", "points", ",.0f"),
         figure("reprojection error", "error_px", ".3f", " px"),
-        figure("camera centres", "ate_of_extent", ".2%"),
-        Column("far views px", far_views),
+        figure("error of camera centres", "ate_of_extent", ".2%"),
+        Column("long-range epipolar px", far_views),
         less("seconds", "seconds", ".0f"),
         less("CPU seconds", "cpu_s", ".0f"),
         Column("from AV1", from_stream),
@@ -309,6 +309,37 @@ def phone_to_folder(rows: list[Row]) -> str:
         ),
     )
     return f"{markdown(columns, shown, left=2)}\n{measured_at(shown, 'clip')}"
+
+
+def summary(rows: list[Row], *clips: str) -> str:
+    """The clips in a row each: COLMAP's mapper and `reconstruct`, with SIFT's figures in brackets.
+
+    Errors of camera centres are those against true poses.
+    """
+    whole = {(row["clip"], row["way"]): row for row in rows}
+
+    def both(heading: str, way: str, name: str, spelling: str) -> Column:
+        def cell(line: Row) -> str:
+            ours, sift = whole[line["clip"], way], whole[line["clip"], SIFT_FROM_FILE]
+            if not ours[name]:
+                return "-"
+            return f"**{number(ours, name, spelling)}** ({number(sift, name, spelling)})"
+
+        return Column(heading, cell)
+
+    columns = [
+        Column(
+            "clip, images",
+            lambda row: f"`{row['clip']}`, {whole[row['clip'], FROM_FILE]['images']}",
+        ),
+        both("`match` and COLMAP's mapper: CPU s", MATCH_PYCOLMAP, "cpu_s", ".0f"),
+        both("points", MATCH_PYCOLMAP, "points", ",.0f"),
+        both("error of centres", MATCH_PYCOLMAP, "ate_of_extent", ".2%"),
+        both("`reconstruct`: CPU s", FROM_FILE, "cpu_s", ".0f"),
+        both("points", FROM_FILE, "points", ",.0f"),
+        both("error of centres", FROM_FILE, "ate_of_extent", ".2%"),
+    ]
+    return markdown(columns, [{"clip": clip} for clip in clips])
 
 
 def phone_to_folder_steps(rows: list[Row]) -> str:
@@ -406,10 +437,10 @@ def jerks(rows: list[Row]) -> str:
         words("sequence, way", "sequence", "way"),
         count("clips", lambda _: True),
         count("whole and straight", lambda row: whole(row) and straight(row)),
-        count("of these doubted", lambda row: whole(row) and straight(row) and bool(row["said"])),
-        count("parts straight, said", lambda row: not whole(row) and straight(row)),
-        count("bent, or none, said", lambda row: not straight(row) and bool(row["said"])),
-        count("bent, not said", lambda row: not straight(row) and not row["said"]),
+        count("of these, warned", lambda row: whole(row) and straight(row) and bool(row["said"])),
+        count("parts straight, warned", lambda row: not whole(row) and straight(row)),
+        count("bent or none, warned", lambda row: not straight(row) and bool(row["said"])),
+        count("bent, not warned", lambda row: not straight(row) and not row["said"]),
         error("median error of centres", 0.5),
         error("largest", 1.0),
     ]
@@ -450,7 +481,7 @@ def dav1d_profile(rows: list[Row]) -> str:
 
 
 def verification(rows: list[Row]) -> str:
-    """Verification of pairs beside COLMAP's."""
+    """Verification of pairs, compared with COLMAP's."""
 
     def ratio(row: Row) -> str:
         return f"{float(row['colmap_cpu_s']) / float(row['cpu_s']):.1f}x"
@@ -493,7 +524,7 @@ def encoders(rows: list[Row]) -> str:
         figure("points", "points", ",.0f"),
         figure("error px", "error", ".3f"),
         figure("ATE", "ate", ".4f"),
-        pair("far views px, median / 90 %", "far_views", "far_views_90", ".2f"),
+        pair("long-range epipolar px", "far_views", "far_views_90", ".2f"),
     ]
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
@@ -543,14 +574,14 @@ def movers(rows: list[Row]) -> str:
         "encodings": [str(len(own)) for own in cases],
         "images": average("registered", ".0f"),
         "ATE": average("ate_mm", ".2f", " mm"),
-        "of that without": [f"{mean(own, 'ate_mm') / without:.2f}" for own in cases],
+        "ATE / ATE without people": [f"{mean(own, 'ate_mm') / without:.2f}" for own in cases],
         "ATE from, to": [spread(own) for own in cases],
         "points": average("points", ",.0f"),
-        "on people": average("points_on_people", ".2%"),
+        "points on people": average("points_on_people", ".2%"),
         "at most": [f"{max(float(row['points_on_people']) for row in own):.2%}" for own in cases],
         "IoU of masks": average("iou", ".2f"),
-        "of people": average("covered", ".1%"),
-        "of what stands still": average("static_lost", ".1%"),
+        "people masked": average("covered", ".1%"),
+        "static masked": average("static_lost", ".1%"),
         "CPU s": average("cpu_s", ".1f"),
     }
     made = [dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True)]
@@ -570,7 +601,7 @@ def loops(rows: list[Row]) -> str:
     columns = [
         words("clip, way", "clip", "way"),
         words("images", "images"),
-        words("with a pose", "registered"),
+        words("registered", "registered"),
         figure("ATE", "ate", ".4f", " m"),
         figure("of the path", "ate_of_path", ".4f", " %"),
         words("verified pairs", "pairs"),
@@ -606,9 +637,9 @@ def one_model(rows: list[Row]) -> str:
     columns = [
         words("case", "case"),
         words("images", "images"),
-        words("with a pose", "registered"),
-        figure("centres off SIFT's, of extent", "centres_off", ".2%"),
-        Column("far views px", far_views),
+        words("registered", "registered"),
+        figure("distance to SIFT's centres / extent", "centres_off", ".2%"),
+        Column("long-range epipolar px", far_views),
         words("revisits", "revisits"),
         words("links between videos", "between"),
         figure("CPU s", "cpu_s", ".0f"),
@@ -689,6 +720,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "tracks": tracks,
     "dense_points": dense_points,
     "phone_to_folder": phone_to_folder,
+    "phone_to_folder.summary": summary,
     "phone_to_folder.steps": phone_to_folder_steps,
     "phone_to_folder.stages": phone_to_folder_stages,
     "jerks": jerks,
