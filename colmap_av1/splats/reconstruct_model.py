@@ -80,8 +80,11 @@ def _tracked_points(
         xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
         return to_model_points(points, view, xy), agreeing
     tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
-    # Those of triangulation are in pixels of a pinhole camera.
-    return replace(tracked, error=reprojection_errors(tracked, views)), agreeing
+    # Triangulation measures errors in pixels of a pinhole camera, and takes rays of pixels that a
+    # fisheye lens sees behind itself for others.
+    tracked = replace(tracked, error=reprojection_errors(tracked, views))
+    fit = tracked.error <= run.options.triangulate.max_reprojection_error
+    return take_points(tracked, np.flatnonzero(fit)), agreeing
 
 
 def _undistortions(
