@@ -210,7 +210,8 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
         converted = kept.result
     keep_stream = None if is_av1 else stream
     match = MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
-    options = ReconstructOptions(match=match)
+    # Renderings are held against the pictures, so these are lossless.
+    options = ReconstructOptions(match=match, image_type="png")
 
     def make() -> dict[str, Any]:
         log = output.parent / "log"

@@ -6,7 +6,7 @@ import dataclasses
 import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -290,3 +290,20 @@ def test_parts_that_are_unused_exist() -> None:
                 part = field.default
                 for name in path.split("."):
                     part = getattr(part, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "image_type", "expected"),
+    [
+        ("frame_%06d", None, "frame_%06d.jpg"),
+        ("frame_%06d", "png", "frame_%06d.png"),
+        ("shot%d.png", None, "shot%d.png"),
+    ],
+)
+def test_formats_of_images_of_reconstruct(
+    name: str, image_type: Literal["png"] | None, expected: str
+) -> None:
+    images = ImageOptions(image_name=name)
+    options = ReconstructOptions(match=MatchOptions(images=images), image_type=image_type)
+    assert options.with_extension.match.images.file_name == expected
+    assert options.with_extension.with_extension == options.with_extension
