@@ -91,17 +91,21 @@ def test_trainers_can_read_the_model(made: ReconstructReport) -> None:
 
 
 def test_colours_are_pixels_of_the_images(made: ReconstructReport) -> None:
+    """Those of one image, up to what JPEG changes."""
     model = read_model(made.output / "sparse" / "0")
     pictures = {
-        i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1]
+        i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1].astype(int)
         for i, image in model.images.items()
     }
+    nearest = []
     for point in list(model.points3D.values())[::50]:
-        shown = set()
+        off = []
         for seen in point.track.elements:
             x, y = model.images[seen.image_id].points2D[seen.point2D_idx].xy.astype(int)
-            shown.add(tuple(pictures[seen.image_id][y, x].tolist()))
-        assert tuple(point.color.tolist()) in shown
+            off.append(np.abs(pictures[seen.image_id][y, x] - point.color).max())
+        nearest.append(min(off))
+    assert np.median(nearest) <= 3
+    assert max(nearest) <= 25
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
