@@ -137,10 +137,11 @@ def reconstruct(
     """Make a dense model of videos, in a folder that trainers of Gaussian splats open.
 
     The poses come from COLMAP's mapper on a spread selection of long, accurate tracks; then every
-    track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one
-    PINHOLE camera, undistorted and of the video's size, and beside them `database.db` and
-    `report.json`. A run that was stopped is resumed after its last finished stage; a changed
-    option redoes what depends on it, and what is damaged or gone is made again.
+    track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one PINHOLE
+    camera, undistorted and of the video's size, or with `undistort` off the original pictures and
+    the estimated camera; beside them `database.db` and `report.json`. A run that was stopped is
+    resumed after its last finished stage; a changed option redoes what depends on it, and what is
+    damaged or gone is made again.
 
     Several videos have a camera each, and their images a folder each in `images/`, named like the
     video; what their pictures show in common connects them, and photos with them.
@@ -163,7 +164,7 @@ def reconstruct(
         OptionError: an option does not fit the video, the folder holds other things, or the file
             for Gaussians cannot be made.
     """
-    options = options if options is not None else ReconstructOptions()
+    options = (options if options is not None else ReconstructOptions()).with_extension
     progress = progress if progress is not None else no_progress
     output = Path(output)
     clock = Clock()

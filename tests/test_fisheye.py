@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shutil
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from benchmarks import room
 from conftest import Encode
 from synthetic_scene import alignment_error
+from trainers import RENDERED, Trainer
 
 from colmap_av1 import (
     CameraOptions,
@@ -20,6 +23,7 @@ from colmap_av1 import (
     MapOptions,
     MapperOptions,
     MatchOptions,
+    PlaceOptions,
     ReconstructOptions,
     TriangulateOptions,
     densify,
@@ -28,11 +32,19 @@ from colmap_av1 import (
     reconstruct,
 )
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images, read_model
+from colmap_av1.reconstruct import ReconstructReport
+from colmap_av1.video.decoding import decode_frames
 
 WIDTH, HEIGHT, FOCAL, NUM_FRAMES = 320, 240, 155.0, 20
 MODEL = "OPENCV_FISHEYE"
 MATCHING = MatchOptions(
     camera=CameraOptions(camera_model=MODEL), density=DensityOptions(preset="sparse")
+)
+OPTIONS = ReconstructOptions(
+    match=MATCHING,
+    mapping=MapperOptions(pose_tracks_per_image=400),
+    triangulate=TriangulateOptions(points="survey"),
+    image_type="png",
 )
 
 
@@ -71,18 +83,95 @@ def error(model: Path, clip: Clip) -> float:
     return alignment_error(found, camera_centres(clip.cam_from_world[frames]))
 
 
-def test_intrinsics_are_found(clip: Clip, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def made(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> ReconstructReport:
+    return reconstruct(clip.video, tmp_path_factory.mktemp("made") / "out", options=OPTIONS)
+
+
+def test_intrinsics_are_found(clip: Clip, made: ReconstructReport) -> None:
     """And the model is undistorted for trainers."""
-    options = ReconstructOptions(
-        match=MATCHING,
-        mapping=MapperOptions(pose_tracks_per_image=400),
-        triangulate=TriangulateOptions(points="survey"),
-    )
-    report = reconstruct(clip.video, tmp_path / "out", options=options)
-    model = read_model(report.output / "sparse" / "0")
+    model = read_model(made.output / "sparse" / "0")
     assert [camera.model_name for camera in model.cameras.values()] == ["PINHOLE"]
-    assert error(report.output / "sparse" / "0", clip) < 0.01
-    assert report.mean_error < 0.5
+    assert error(made.output / "sparse" / "0", clip) < 0.01
+    assert made.mean_error < 0.5
+
+
+@pytest.fixture(scope="module")
+def original(
+    clip: Clip, made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory
+) -> ReconstructReport:
+    """The same with the pictures as they are."""
+    output = tmp_path_factory.mktemp("original") / "out"
+    shutil.copytree(made.output, output)
+    return reconstruct(clip.video, output, options=replace(OPTIONS, undistort=False))
+
+
+def test_pictures_stay_as_they_are(clip: Clip, original: ReconstructReport) -> None:
+    """Only what writes the model is redone."""
+    assert not {"tracks", "matches", "poses", "adjustment"} - {*original.resumed}
+    assert "model" not in original.resumed
+    for frame, picture in decode_frames(clip.video):
+        written = cv2.imread(str(original.output / "images" / f"frame_{frame:06d}.png"))
+        np.testing.assert_array_equal(written, picture)
+
+
+def test_points_project_with_the_distortion(
+    clip: Clip, made: ReconstructReport, original: ReconstructReport
+) -> None:
+    """Those that the undistorted pictures do not show, too."""
+    (pinhole,) = read_model(made.output / "sparse" / "0").cameras.values()
+    model = read_model(original.output / "sparse" / "0")
+    (camera,) = model.cameras.values()
+    assert camera.model_name == MODEL
+    assert original.focal_length == pytest.approx(FOCAL, rel=0.02)
+    assert error(original.output / "sparse" / "0", clip) < 0.01
+    num_cut = 0
+    for point in model.points3D.values():
+        errors = []
+        for seen in point.track.elements:
+            image = model.images[seen.image_id]
+            xy = image.points2D[seen.point2D_idx].xy
+            in_camera = image.cam_from_world() * point.xyz
+            errors.append(np.linalg.norm(camera.img_from_cam(in_camera) - xy))
+            at = pinhole.img_from_cam(in_camera)
+            num_cut += not (0 <= at[0] < WIDTH and 0 <= at[1] < HEIGHT)
+        assert np.mean(errors) == pytest.approx(point.error, abs=1e-6)
+        assert np.mean(errors) <= OPTIONS.triangulate.max_reprojection_error
+    assert num_cut > 0.05 * original.num_observations
+
+
+@pytest.mark.parametrize("trainer", RENDERED)
+def test_trainers_render_the_distortion(trainer: Trainer, original: ReconstructReport) -> None:
+    taken = trainer(original.output)
+    (camera,) = read_model(taken.model).cameras.values()
+    assert camera.model_name in RENDERED[trainer]
+    assert all(picture.is_file() for picture in taken.pictures.values())
+
+
+def test_marks_of_a_scale_are_in_the_original_pictures(
+    clip: Clip, original: ReconstructReport, tmp_path: Path
+) -> None:
+    """The distance of two points, each marked in the first and the last image that sees it."""
+    model = read_model(original.output / "sparse" / "0")
+    by_length = sorted(model.points3D.values(), key=lambda point: -point.track.length())[:50]
+    one = by_length[0]
+    two = max(by_length, key=lambda point: float(np.linalg.norm(point.xyz - one.xyz)))
+
+    def mark(point: pycolmap.Point3D) -> str:
+        seen = {model.images[e.image_id].name: e for e in point.track.elements}
+        marks = []
+        for name in (min(seen), max(seen)):
+            x, y = model.images[seen[name].image_id].points2D[seen[name].point2D_idx].xy
+            marks.append(f"{name}:{x:.3f}:{y:.3f}")
+        return "+".join(marks)
+
+    output = tmp_path / "out"
+    shutil.copytree(original.output, output)
+    place = PlaceOptions(align="none", scale=f"2={mark(one)},{mark(two)}")
+    options = replace(OPTIONS, undistort=False, place=place)
+    placed = reconstruct(clip.video, output, options=options)
+    apart = float(np.linalg.norm(one.xyz - two.xyz))
+    assert apart * placed.place["scale"] == pytest.approx(2, rel=0.05)
 
 
 def test_camera_stays_what_it_is(clip: Clip, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,6 +105,22 @@ def test_trainers_find_a_mask_for_each_image(scene: Scene, made: ReconstructRepo
         black = (bent[:, 0] >= left) & (bent[:, 0] < left + 80)
         black &= (bent[:, 1] >= 60) & (bent[:, 1] < 140)
         assert np.mean((mask.ravel() == 0) == black) > 0.995
+
+
+def test_masks_of_original_pictures_are_those_given(
+    scene: Scene, made: ReconstructReport, tmp_path: Path
+) -> None:
+    output = tmp_path / "out"
+    shutil.copytree(made.output, output)
+    options = ReconstructOptions(match=masked(scene), undistort=False)
+    reconstruct(scene.video, output, options=options)
+    for image in sorted((output / "images").iterdir()):
+        mask = cv2.imread(str(output / "masks" / f"{image.stem}.png"), cv2.IMREAD_UNCHANGED)
+        given = cv2.imread(str(scene.masks / f"{int(image.stem[6:])}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(mask, given)
+    on_black, total = seen_on_black(output / "sparse" / "0", output / "masks")
+    assert total > 5_000
+    assert on_black == 0
 
 
 def test_colmap_reads_the_masks_of_png_images(made: ReconstructReport, tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     centres = camera_centres(truth.cam_from_world)
     metres = float(np.linalg.norm(centres[3] - centres[48]))
     place = PlaceOptions(
-        align="none", upright=True, scale=f"{metres}=frame_000003.png,frame_000048.png"
+        align="none", upright=True, scale=f"{metres}=frame_000003.jpg,frame_000048.jpg"
     )
     options = replace(OPTIONS, place=place)
     again = reconstruct(video, placed.output, options=options)
@@ -124,10 +124,10 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     assert again.place["origin"] is None
     assert again.place["how"][0].startswith("z up by gravity")
     images = posed_images(read_model(again.output / "sparse" / "0"))
-    ends = camera_centres(np.array([images[f"frame_{k:06}.png"].cam_from_world for k in (3, 48)]))
+    ends = camera_centres(np.array([images[f"frame_{k:06}.jpg"].cam_from_world for k in (3, 48)]))
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(metres, rel=1e-6)
-    wrong = replace(OPTIONS, place=PlaceOptions(scale="2=frame_000003.png,frame_000001.png"))
-    with pytest.raises(OptionError, match=r"frame_000001\.png"):
+    wrong = replace(OPTIONS, place=PlaceOptions(scale="2=frame_000003.jpg,frame_000001.jpg"))
+    with pytest.raises(OptionError, match=r"frame_000001\.jpg"):
         reconstruct(video, placed.output, options=wrong)
     assert (again.output / "place.json").exists()
 

@@ -91,17 +91,21 @@ def test_trainers_can_read_the_model(made: ReconstructReport) -> None:
 
 
 def test_colours_are_pixels_of_the_images(made: ReconstructReport) -> None:
+    """Those of one image, up to what JPEG changes."""
     model = read_model(made.output / "sparse" / "0")
     pictures = {
-        i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1]
+        i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1].astype(int)
         for i, image in model.images.items()
     }
+    nearest = []
     for point in list(model.points3D.values())[::50]:
-        shown = set()
+        off = []
         for seen in point.track.elements:
             x, y = model.images[seen.image_id].points2D[seen.point2D_idx].xy.astype(int)
-            shown.add(tuple(pictures[seen.image_id][y, x].tolist()))
-        assert tuple(point.color.tolist()) in shown
+            off.append(np.abs(pictures[seen.image_id][y, x] - point.color).max())
+        nearest.append(min(off))
+    assert np.median(nearest) <= 3
+    assert max(nearest) <= 25
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
@@ -222,7 +226,7 @@ def test_long_videos_have_fewer_images_than_frames(
             chosen.append(file["frames"])
             np.testing.assert_array_equal(np.unique(file["frame"]), chosen[-1])
             assert np.diff(file["offsets"]).min() >= (2 if name != "all" else 3)
-            assert file["names"][1] == f"frame_{chosen[-1][1]:06d}.png"
+            assert file["names"][1] == f"frame_{chosen[-1][1]:06d}.jpg"
     assert 25 <= len(chosen[0]) <= 30
     assert (chosen[0][0], chosen[0][-1], len(chosen[1])) == (0, 59, 60)
     assert 10 <= len(chosen[2]) <= 12
@@ -279,7 +283,7 @@ def contents(output: Path) -> dict[str, bytes]:
         (".stages/poses/0.npz", "poses"),
         (".stages/placed.npz", "resection"),
         (".stages/moving.npz", "moving"),
-        ("images/frame_000006.png", "model"),
+        ("images/frame_000006.jpg", "model"),
         ("sparse/0/points3D.bin", "model"),
     ],
 )
@@ -492,7 +496,7 @@ def test_images_that_are_left_out_are_named(
     found = reconstruct(SCENE, tmp_path / "out", options=OPTIONS)
     written = {path.name for path in (tmp_path / "out" / "images").iterdir()}
     assert found.num_registered == len(written) < NUM_IMAGES
-    every = [f"frame_{EVERY * i:06d}.png" for i in range(NUM_IMAGES)]
+    every = [f"frame_{EVERY * i:06d}.jpg" for i in range(NUM_IMAGES)]
     missing = [name for name in every if name not in written]
     (told,) = [note for note in found.warnings if "have no pose" in note]
     assert told.startswith(f"{len(missing)} of {NUM_IMAGES} images have no pose")
@@ -594,7 +598,7 @@ def test_command_line(
     model = made.output / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
-        "".join(f"{f} frame_{f:06d}.png\n" for f in range(0, 60, EVERY))
+        "".join(f"{f} frame_{f:06d}.jpg\n" for f in range(0, 60, EVERY))
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
     assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2

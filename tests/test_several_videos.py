@@ -367,7 +367,7 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
     assert model.num_points3D() == further.num_points > 500
     taken = brush(made.output)  # either of the two, as they are of one size, with its own pictures
     folder = taken.model.parents[1]
-    assert set(taken.pictures.values()) == {*(folder / "images").rglob("*.png")}
+    assert set(taken.pictures.values()) == {*(folder / "images").rglob("*.jpg")}
     assert brush(further.output).model == further.output / "sparse" / "0"
 
     again = reconstruct(halves, tmp_path / "out", options=apart)

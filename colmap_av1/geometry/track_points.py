@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
@@ -186,6 +187,26 @@ class Colours:
 def mean_error(cloud: ModelPoints) -> float:
     """Mean reprojection error in pixels of the points whose error is known."""
     return float(cloud.error[cloud.error >= 0].mean())
+
+
+def reprojection_errors(points: ModelPoints, views: Sequence[PosedCamera]) -> NDArray[np.float64]:
+    """Mean reprojection errors [num_points] in pixels of the images, with their distortion.
+
+    Args:
+        points: the points.
+        views: the images, by the index that observations have.
+    """
+    lengths = np.diff(points.offsets)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    order = np.argsort(points.image, kind="stable")
+    bounds = np.searchsorted(points.image[order], np.arange(len(views) + 1))
+    apart = np.empty(len(points.image))
+    for image, view in enumerate(views):
+        own = order[bounds[image] : bounds[image + 1]]
+        seen = points.xyz[owner[own]] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+        at = np.asarray(view.camera.img_from_cam(seen)).reshape(-1, 2)
+        apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
+    return np.bincount(owner, apart, len(lengths)) / lengths
 
 
 def to_model_points(

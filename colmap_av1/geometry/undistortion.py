@@ -59,7 +59,8 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
         if not is_filled(high):
             raise ModelError(
                 f"camera {camera.model_name} {list(camera.params)} cannot be undistorted: give "
-                "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE"
+                "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE, or keep the "
+                "distortion by --undistort 0"
             )
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
@@ -68,6 +69,17 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
     params = [*(focal * zoom), *centre]
     camera_id = int(camera.camera_id)
     return pycolmap.Camera(camera_id=camera_id, model="PINHOLE", params=params, **size)
+
+
+def output_cameras(
+    cameras: Mapping[int, pycolmap.Camera], *, undistort: bool
+) -> dict[int, pycolmap.Camera]:
+    """The cameras of the written images by their ids: `pinhole_camera`, or those given.
+
+    Raises:
+        ModelError: see `pinhole_camera`.
+    """
+    return {i: pinhole_camera(c) if undistort else c for i, c in cameras.items()}
 
 
 def _project(camera: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -163,8 +175,12 @@ class Undistortion:
 def undistortion(
     camera: pycolmap.Camera, pinhole: pycolmap.Camera, interpolation: int = cv2.INTER_CUBIC
 ) -> Undistortion | None:
-    """The undistortion of a camera's pictures; None without distortion."""
-    if is_undistorted(camera):
+    """What undistorts the pictures of a camera.
+
+    Returns:
+        None where they stay: the camera has no distortion, or is given as its own `pinhole`.
+    """
+    if is_undistorted(camera) or not is_undistorted(pinhole):
         return None
     fx, fy, cx, cy = pinhole.params
     width, height = int(pinhole.width), int(pinhole.height)

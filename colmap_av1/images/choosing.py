@@ -107,7 +107,7 @@ def choose_images(
         frames = choose_frames(tracks, options, at)
         if folder is not None and options.skip_blurred and (options.fps or options.num_images):
             frames = skip_blurred(frames, tracks, lambda asked: _sharpness(asked, decode()))
-        chosen = ChosenImages(image_names(options.image_name, frames.tolist()), frames)
+        chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
     if len(chosen.frames) < 2:
         raise ImageError(
             f"{len(chosen.frames)} of {tracks.num_frames} frames become images: matches need two "
@@ -287,7 +287,7 @@ def _read_entries(
             continue
         if words[0].isdecimal():
             frame = last_number(words[0]) or 0
-            name = words[1].strip() if len(words) == 2 else options.image_name % frame
+            name = words[1].strip() if len(words) == 2 else options.file_name % frame
         else:
             name = line.strip()
             found = last_number(name)

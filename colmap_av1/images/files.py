@@ -27,7 +27,6 @@ from colmap_av1.images.names import (
     natural_key,
     pattern_regex,
 )
-from colmap_av1.images.png import png_bytes
 from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
@@ -324,7 +323,7 @@ def _write_frames(
     queue: list[Future[None]] = []
     num_taken = 0
     last = max(wanted)
-    # OpenCV and ISA-L release the interpreter lock while they compress.
+    # OpenCV releases the interpreter lock while it compresses.
     with ThreadPoolExecutor(max_workers=num_threads) as executor:
         try:
             for index, picture in decoded:
@@ -461,10 +460,7 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """
     check_extension(path.name)
     suffix = path.suffix.lower()
-    if suffix == ".png" and image.ndim == 3:
-        encoded = png_bytes(image)
-    else:
-        encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])[1].tobytes()
+    encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])[1].tobytes()
     try:
         with whole_file(path) as partial:
             partial.write_bytes(encoded)

@@ -77,13 +77,13 @@ class VideoMasks:
         if names is not None:
             self._named(names)
         elif options.frame_list is None:
-            stem = PurePosixPath(options.image_name).stem
+            stem = PurePosixPath(options.file_name).stem
             named = pattern_regex(stem + _SUFFIX)
             found = (str(PurePosixPath(n).with_suffix(_SUFFIX)) for n in self.of_images)
             if not any(named.fullmatch(name) for name in found):
                 raise ImageError(
                     f"{self.place}: none of its {len(self.of_images)} masks is named like an image "
-                    f"({options.image_name}{_SUFFIX}), and the video has another number of frames: "
+                    f"({options.file_name}{_SUFFIX}), and the video has another number of frames: "
                     f"{_LAYOUTS}"
                 )
 

@@ -15,10 +15,10 @@ from colmap_av1.options.images import ImageOptions, check_extension, check_image
 from colmap_av1.util.texts import check_name
 
 _MOST_DIGITS = 255
-WRITE_PARAMETERS = {
+WRITE_PARAMETERS: dict[str, list[int]] = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+    ".png": [],  # OpenCV's defaults are for speed
 }
 
 
@@ -38,7 +38,7 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
 
 def names_of_all(options: ImageOptions, num_frames: int) -> list[str] | None:
     """Names of new images where every frame becomes one; None where an option chooses."""
-    return None if options.ways else image_names(options.image_name, range(num_frames))
+    return None if options.ways else image_names(options.file_name, range(num_frames))
 
 
 def frames_of_images(

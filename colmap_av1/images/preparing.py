@@ -140,7 +140,7 @@ def prepare_images(
     display, size, existing = fit.display, fit.size, list(fit.existing)
     check_fit(options.camera, options.images, size, fit.pixel_aspect)
     if folder is not None:
-        check_image_folder(folder, existing or options.images.image_name, size)
+        check_image_folder(folder, existing or options.images.file_name, size)
         if size != fit.video_size:
             check_images_there(folder, existing)
     if masks is not None:
@@ -200,7 +200,7 @@ def _fit(
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
-        names = existing_images(folder, options.image_name)
+        names = existing_images(folder, options.file_name)
         existing = {name: image_size(folder / name) for name in names}
     back = _way_back(video, existing, folder)
     if back is not None:

@@ -109,6 +109,17 @@ class ReconstructOptions(Options):
     mapping: MapperOptions = part(MapperOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
     place: PlaceOptions = part(PlaceOptions())
+    undistort: bool = option(
+        True,
+        "write undistorted images with PINHOLE cameras; 0: write the pictures as they are, nothing "
+        "cut at the edges, with the estimated camera model, for trainers that render distortion",
+        common=True,
+    )
+    image_type: Literal["jpg", "png"] | None = option(
+        None,
+        "format of the images of videos; None: that of image_name, else jpg; photos keep theirs",
+        common=True,
+    )
     moving: Literal["keep", "drop", "mask"] = option(
         "drop",
         "what moves by itself, such as people and cars: drop: it gets no points; mask: nor does it "
@@ -131,10 +142,24 @@ class ReconstructOptions(Options):
                 "it out, or give 1"
             )
         name = self.match.images.image_name
-        if name.count(".") != 1:
+        if name.count(".") > 1:
             raise OptionError(
                 f"image_name '{name}': give one without a dot but that of the extension"
             )
+        if self.image_type is not None and "." in name:
+            raise OptionError(
+                f"image_name '{name}' has an extension, which is the format: leave out image_type "
+                "or the extension"
+            )
+
+    @property
+    def with_extension(self) -> ReconstructOptions:
+        """The same with the extension of the images in `image_name`, in place of `image_type`."""
+        images = self.match.images
+        if "." in images.image_name:
+            return self
+        named = replace(images, image_name=f"{images.image_name}.{self.image_type or 'jpg'}")
+        return replace(self, match=replace(self.match, images=named), image_type=None)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,9 @@ class ImageOptions(Options):
     title: ClassVar[str] = "images"
 
     image_name: str = option(
-        "frame_%06d.png", "file name of new images; the number is the frame's display index, from 0"
+        "frame_%06d",
+        "file name of new images; the number is the frame's display index, from 0; .png or .jpg "
+        "at its end is their format, which is PNG without one, JPEG in reconstruct",
     )
     num_images: int | None = option(
         None, "number of images, spread over the video", least=2, common=True
@@ -60,6 +62,11 @@ class ImageOptions(Options):
     )
 
     @property
+    def file_name(self) -> str:
+        """`image_name` with its extension."""
+        return self.image_name if "." in self.image_name else f"{self.image_name}.png"
+
+    @property
     def ways(self) -> list[str]:
         """The options that say which frames are images, of those that are given."""
         names = ("num_images", "every", "fps", "frame_list")
@@ -74,7 +81,7 @@ class ImageOptions(Options):
             )
         if self.select == "parallax" and self.num_images is None:
             raise OptionError("select 'parallax' spreads a number of images: give num_images, too")
-        check_image_pattern(self.image_name)
+        check_image_pattern(self.file_name)
 
 
 @dataclass(frozen=True)

@@ -266,7 +266,7 @@ def _spread_in(
     """As many images as a trainer wants among some frames of a video, its key images with them."""
     tracks = tracked.tracks
     candidates = candidates[candidates < tracks.num_frames]
-    names = image_names(run.options.match.images.image_name, candidates.tolist())
+    names = image_names(run.options.match.images.file_name, candidates.tolist())
     every = ChosenImages(names, candidates)
     key = key_images_of_video(run, tracks, every, tracked.inter_share)
     most = min(run.options.max_images, len(candidates))

@@ -19,13 +19,14 @@ from colmap_av1.geometry.track_points import (
     Colours,
     mean_error,
     rays_of,
+    reprojection_errors,
     seen_in,
     to_model_points,
 )
 from colmap_av1.geometry.undistortion import (
     Undistortion,
     on_pinholes,
-    pinhole_camera,
+    output_cameras,
     undistorted_masks,
     undistortion,
 )
@@ -55,39 +56,42 @@ _MASKS = "masks"
 def _tracked_points(
     run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
 ) -> tuple[ModelPoints, float]:
-    """Points of all tracks in a model of the undistorted images, in black.
+    """Points of all tracks, as a model of the written images has them, in black.
 
     Returns:
         The points, and the share of the tracks that agree with the poses.
     """
     seen, view = seen_in(tracks, placed.frames)
     rays = rays_of(seen, view, placed.camera_of_image)
-    pinholes = [own.camera for own in views]
+    cameras = [own.camera for own in views]
     points = triangulate_in(
         run,
         placed,
         seen,
         view,
         options=run.options.triangulate,
-        pinholes=pinholes,
+        pinholes=cameras,
         rays=rays,
         progress=run.progress,
     )
     check_agreement(len(points.xyz), points.num_tracks)
-    xy = on_pinholes(rays[points.observation], view[points.observation], pinholes)
     agreeing = points.num_agreeing / max(points.num_tracks, 1)
-    return to_model_points(points, view, xy), agreeing
+    if run.options.undistort:
+        xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
+        return to_model_points(points, view, xy), agreeing
+    tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
+    # Triangulation measures errors in pixels of a pinhole camera, and takes rays of pixels that a
+    # fisheye lens sees behind itself for others.
+    tracked = replace(tracked, error=reprojection_errors(tracked, views))
+    fit = tracked.error <= run.options.triangulate.max_reprojection_error
+    return take_points(tracked, np.flatnonzero(fit)), agreeing
 
 
-def _pinholes(views: Sequence[PosedCamera]) -> dict[int, pycolmap.Camera]:
-    """The undistorted cameras by id."""
-    return {int(view.camera.camera_id): view.camera for view in views}
-
-
-def _undistortions(placed: PosedImages, views: Sequence[PosedCamera]) -> list[Undistortion | None]:
-    """The undistortion of each image; None for images without distortion."""
-    pinholes = _pinholes(views)
-    of_camera = {i: undistortion(camera, pinholes[i]) for i, camera in placed.cameras.items()}
+def _undistortions(
+    placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]
+) -> list[Undistortion | None]:
+    """What undistorts the picture of each image; None: it is written as it is."""
+    of_camera = {i: undistortion(camera, cameras[i]) for i, camera in placed.cameras.items()}
     return [of_camera[image.camera_id] for image in placed.images]
 
 
@@ -102,7 +106,7 @@ def _written_images(
     undistort: Sequence[Undistortion | None],
     look: Look,
 ) -> None:
-    """Write the undistorted images, and pass those of videos to `look`."""
+    """Write the images and look at those of videos on the way."""
     options, progress = run.options, run.progress
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
@@ -258,7 +262,7 @@ def model_stage(
 
     def make(partial: Path) -> ModelResult:
         placed = read_posed_images(run, posed, image_set)
-        cameras = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
+        cameras = output_cameras(placed.cameras, undistort=options.undistort)
         images = placed.images
         given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
         joined = placed.masks_with(moving)
@@ -269,7 +273,7 @@ def model_stage(
             shows_moving = np.array([image.name in moving for image in images])
             tracked = take_points(tracked, surely_still(tracked, shows_moving))
         with clock.measure("images"):
-            undistort = _undistortions(placed, views)
+            undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)
         with clock.measure("coverage"):
@@ -291,7 +295,7 @@ def model_stage(
             agreeing=agreeing,
         )
 
-    how = (options.triangulate, options.match.images.image_name, options.moving)
+    how = (options.triangulate, options.match.images.file_name, options.moving, options.undistort)
     kept = run_stage(
         run.stages,
         "model",

@@ -282,8 +282,10 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
         kept = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True)
         converted = kept.result
     keep_stream = None if is_av1 else stream
+    # Trained renderings are compared with the pictures, so these are lossless.
     options = ReconstructOptions(
-        match=MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream)
+        match=MatchOptions(images=clip.images, camera=clip.camera, keep_stream=keep_stream),
+        image_type="png",
     )
 
     def make() -> dict[str, Any]:

@@ -6,7 +6,7 @@ import dataclasses
 import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -67,6 +67,7 @@ REFUSED: list[tuple[type, dict[str, Any], str]] = [
     (ImageOptions, {"select": "parallax"}, "give num_images"),
     (ImageOptions, {"image_name": "x.png"}, "'x.png' needs exactly one number field"),
     (ImageOptions, {"image_name": "%d_%d.png"}, "needs exactly one number field"),
+    (ImageOptions, {"image_name": "a.b_%d"}, "ends in .png"),
     (ImageOptions, {"image_name": "%d.gif"}, r"ends in \.png, \.jpg or \.jpeg"),
     (ImageOptions, {"image_name": "a/%d.png"}, "give a plain file name"),
     (MatchOptions, {"on_existing": "keep"}, "on_existing is 'keep': give error, append, replace"),
@@ -155,6 +156,12 @@ REFUSED: list[tuple[type, dict[str, Any], str]] = [
         {"match": MatchOptions(images=ImageOptions(image_name="a.b_%d.png"))},
         "image_name 'a.b_%d.png'",
     ),
+    (
+        ReconstructOptions,
+        {"match": MatchOptions(images=ImageOptions(image_name="a_%d.png")), "image_type": "jpg"},
+        "leave out image_type or the extension",
+    ),
+    (ReconstructOptions, {"image_type": "bmp"}, "image_type is 'bmp': give jpg, png"),
     (ExportOptions, {"format": "xml"}, "format is 'xml': give hloc"),
     (LearnedOptions, {"max_keypoints": 15}, "max_keypoints is 15"),
     (LearnedOptions, {"max_image_size": 63}, "max_image_size is 63"),
@@ -283,3 +290,20 @@ def test_parts_that_are_unused_exist() -> None:
                 part = field.default
                 for name in path.split("."):
                     part = getattr(part, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "image_type", "expected"),
+    [
+        ("frame_%06d", None, "frame_%06d.jpg"),
+        ("frame_%06d", "png", "frame_%06d.png"),
+        ("shot%d.png", None, "shot%d.png"),
+    ],
+)
+def test_formats_of_images_of_reconstruct(
+    name: str, image_type: Literal["png"] | None, expected: str
+) -> None:
+    images = ImageOptions(image_name=name)
+    options = ReconstructOptions(match=MatchOptions(images=images), image_type=image_type)
+    assert options.with_extension.match.images.file_name == expected
+    assert options.with_extension.with_extension == options.with_extension

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,4 +115,23 @@ def reference_implementation(folder: Path) -> Taken:
     return Taken(model, pictures, {}, points)
 
 
-TRAINERS = (brush, lichtfeld_studio, gsplat, nerfstudio, reference_implementation)
+Trainer = Callable[[Path], Taken]
+TRAINERS: tuple[Trainer, ...] = (
+    brush,
+    lichtfeld_studio,
+    gsplat,
+    nerfstudio,
+    reference_implementation,
+)
+
+# COLMAP's camera models whose distortion trainers take: Brush's `build_camera_model`
+# (crates/brush-dataset/src/formats/colmap.rs), LichtFeld Studio's 3DGUT
+# (docs/docs/features/gut.md) and gsplat's `_camera_distortion` (examples/datasets/colmap.py), whose
+# example undistorts the pictures of its models when it loads them.
+_RADIAL = {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
+_MORE = {"FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+RENDERED: dict[Trainer, set[str]] = {
+    brush: {*_RADIAL, *_MORE, "THIN_PRISM_FISHEYE"},
+    lichtfeld_studio: {*_RADIAL, *_MORE},
+    gsplat: _RADIAL,
+}

@@ -82,7 +82,7 @@ def prepare_footage(
     footage = Footage(
         video=video,
         image_path=folder / "images",
-        names=image_names(ImageOptions().image_name, frames),
+        names=image_names(ImageOptions().file_name, frames),
         frames=frames,
         num_frames=num_frames,
         size=opened.picture_size,
@@ -124,7 +124,7 @@ def choose_footage(
 
     def make() -> dict[str, Any]:
         context = RunContext.of(options.run, progress=progress)
-        existed = bool(existing_images(images, options.images.image_name))
+        existed = bool(existing_images(images, options.images.file_name))
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
                 video,
@@ -154,7 +154,7 @@ def choose_footage(
         given,
         images,
         digest_if_there(options.images.frame_list),
-        [file_digest(images / n) for n in existing_images(images, options.images.image_name)],
+        [file_digest(images / n) for n in existing_images(images, options.images.file_name)],
     ]
     facts = run_stage_in(folder, depends_on, make, products=[images]).result
     for name in ("frames", "size", "warnings"):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
-from colmap_av1.geometry.undistortion import pinhole_camera
+from colmap_av1.geometry.undistortion import output_cameras
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.poses.placing.placement import (
@@ -53,15 +53,16 @@ def place_stage(
         positions: what is known of where the images of `image_set` were taken.
     """
     options, seed = run.options.place, run.options.match.run.seed
+    undistort = run.options.undistort
     file = f"{run.stages.name}/in_place.npz"
 
     def make(partial: Path) -> PlaceResult:
         placed = read_posed_images(run, posed, image_set)
         with run.clock.measure("place"):
             # Marks are in pictures as the model's folder holds them.
-            pinholes = {i: pinhole_camera(camera) for i, camera in placed.cameras.items()}
+            cameras = output_cameras(placed.cameras, undistort=undistort)
             known = _surroundings(run, image_set, placed, positions)
-            found = find_placement(placed.images, pinholes, known, options, seed)
+            found = find_placement(placed.images, cameras, known, options, seed)
         write_place(partial, found)
         images = placed.images
         if found.is_moved:
@@ -79,7 +80,7 @@ def place_stage(
     return run_stage(
         run.stages,
         "place",
-        [posed.digest, options, positions.digest, seed],
+        [posed.digest, options, positions.digest, seed, undistort],
         PlaceResult,
         into=run.output,
         products=[PLACE_FILE, file],
