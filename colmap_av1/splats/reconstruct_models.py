@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_av1.errors import ModelError, cannot_write
-from colmap_av1.geometry.posed_model import read_posed_model
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
 from colmap_av1.poses.reconstruct_posed import (
@@ -88,7 +87,7 @@ def further_models(
         if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
             continue
         own = _run_of_model(run, len(found) + 1)
-        own_poses = _poses_of_model(run, own, mapped, poses)
+        own_poses = _poses_of_model(run, own, first, poses)
         free = left.difference(*names[number + 1 :])
         some, key = _named(image_set, known | free), _named(keyed, known)
         videos = [read_tracks(run, video) for video in range(len(run.sources))]
@@ -144,27 +143,29 @@ def _run_of_model(run: Run, number: int) -> Run:
     return own
 
 
-def _poses_of_model(
-    run: Run, own: Run, posed: Kept[MappedResult], poses: str
-) -> Kept[MappedResult]:
-    """Copy the mapped poses of a further model to its own stages.
+def _poses_of_model(run: Run, own: Run, first: Posed, poses: str) -> Kept[MappedResult]:
+    """Hand the poses of a further model of the mapper to that model's own stages.
+
+    Few images determine a camera badly: the camera is that of the first model, if it has it.
 
     Args:
-        run: the run of the first model, which includes the mapping.
-        own: the run of the further model, see `_run_of_model`.
-        posed: the mapping stage.
-        poses: file of the further model among the products of that stage.
+        run: the run that mapped.
+        own: that of the further model, see `_run_of_model`.
+        first: the first model.
+        poses: file of the further model, in the folder of the stages.
     """
 
     def make(partial: Path) -> MappedResult:
-        shutil.copyfile(run.stages / poses, partial / "mapped.npz")
-        count = len(read_posed_model(partial / "mapped.npz").images)
-        return MappedResult("mapped.npz", count, {}, posed.result.mapper, ())
+        known = read_posed_model(run.stages / first.last.result.poses).cameras
+        model = read_posed_model(run.stages / poses)
+        cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
+        write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
+        return MappedResult("mapped.npz", len(model.images), {}, first.mapped.result.mapper, ())
 
     return run_stage(
         own.stages,
         "poses",
-        [posed.digest, poses],
+        [first.mapped.digest, first.last.digest, poses],
         MappedResult,
         into=own.stages,
         products=["mapped.npz"],
