@@ -184,13 +184,13 @@ def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(OptionError, match="keep_stream"):
         run_batch(clips, out, MatchOptions(keep_stream="x.mp4"))
-    with pytest.raises(OptionError, match="models is missing"):
+    with pytest.raises(OptionError, match="models"):
         run_batch(clips, out, DensifyOptions())
-    with pytest.raises(OptionError, match="models is for"):
+    with pytest.raises(OptionError, match="models"):
         run_batch(clips, out, ReconstructOptions(), models=tmp_path)
-    with pytest.raises(OptionError, match="no options of a batch"):
+    with pytest.raises(OptionError, match="RunOptions"):
         run_batch(clips, out, RunOptions())
-    with pytest.raises(OptionError, match="give engine ray"):
+    with pytest.raises(OptionError, match="engine"):
         BatchOptions(address="auto")
     assert not out.exists()
 
@@ -217,7 +217,7 @@ def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
 
     def try_another(counts: Counts, _: object) -> None:
         if counts.ended == 1:
-            with pytest.raises(OptionError, match="another batch is at work"):
+            with pytest.raises(OptionError, match="another batch"):
                 run_batch(clips, out, ReadOptions())
             tried.append(True)
 

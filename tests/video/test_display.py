@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import AV1, PROJECT, Encode, Ffmpeg, make_frames
+from databases import keypoints_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -48,9 +49,7 @@ TURNS = [
 
 
 def keypoints(database: Path) -> list[np.ndarray]:
-    with sqlite3.connect(database) as connection:
-        rows = connection.execute("SELECT data FROM keypoints ORDER BY image_id").fetchall()
-    return [np.frombuffer(data, "<f4").reshape(-1, 2) for (data,) in rows]
+    return list(keypoints_of(database).values())
 
 
 def cut_by_ffmpeg(ffmpeg: Ffmpeg, video: Path, folder: Path, *how: str) -> list[np.ndarray]:
