@@ -279,4 +279,4 @@ def test_terminal_sees_progress_and_a_table(clip: Path, tmp_path: Path) -> None:
     assert "verification" in text
     assert "16/16" in text
     assert "│ frames" in text
-    assert "mkdir -p a_model && colmap mapper --database_path a.db" in text
+    assert "colmap mapper --database_path a.db" in text

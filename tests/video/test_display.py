@@ -318,7 +318,7 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
 
     options = MatchOptions(camera=CameraOptions("SIMPLE_RADIAL"))
     (warning,) = match(tmp_path / "b.db", turned, options=options).warnings
-    assert "times as wide as high, but SIMPLE_RADIAL has one focal length" in warning
+    assert "SIMPLE_RADIAL" in warning
 
 
 def info_rows(video: Path) -> list[tuple[str, str]]:
