@@ -95,8 +95,7 @@ def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) ->
     report = map_database(apart, images, tmp_path / "model", options=options)
     sizes = [read_model(tmp_path / "model" / str(i)).num_reg_images() for i in range(2)]
     assert report.num_registered == tuple(sizes) == (NUM_IMAGES - num_first, num_first)
-    (warning,) = report.warnings
-    assert "coordinates" in warning
+    assert any("coordinates" in warning for warning in report.warnings)
 
 
 def test_a_model_of_images_that_the_first_one_has_is_said(
@@ -116,8 +115,7 @@ def test_a_model_of_images_that_the_first_one_has_is_said(
 
     monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
     report = map_database(database, images, tmp_path / "model")
-    (warning,) = report.warnings
-    assert "again" in warning
+    assert any("again" in warning for warning in report.warnings)
 
 
 def test_intrinsics_are_kept_in_forward_motion(

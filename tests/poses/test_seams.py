@@ -122,7 +122,7 @@ def test_parts_that_are_joined_wrongly(
     first, second = by_name[middle - 1].name, by_name[middle].name
     assert (first, second) in [bent.pairs[i] for i in bent.wrong]
     assert bent.warning is not None
-    named = re.search("'(.*)' and '(.*)'", bent.warning)
+    named = re.search("'([^']*)' and '([^']*)'", bent.warning)
     assert named is not None
     assert named[1] <= first < second <= named[2]
 
