@@ -157,14 +157,16 @@ def test_what_was_stopped_while_it_was_written(clips: Path, tmp_path: Path) -> N
 
 def test_a_place_that_cannot_be_written(clips: Path, tmp_path: Path) -> None:
     """One folder of the output cannot be made: the others are."""
-    out = tmp_path / "out"
+    videos, out = tmp_path / "videos", tmp_path / "out"
+    for folder in ("a", "b"):
+        (videos / folder).mkdir(parents=True)
+        shutil.copyfile(clips / "a" / "clip0.mp4", videos / folder / "clip.mp4")
     out.mkdir()
     (out / "a").write_text("a file")
-    report = run_batch(clips, out, ReadOptions(), options=ONCE)
-    assert report.failed == {"damaged": 1, "reading or writing": 3, "unreadable": 1}
-    assert report.num_done == 3
+    report = run_batch(videos, out, ReadOptions(), options=ONCE)
+    assert (report.num_done, report.failed) == (1, {"reading or writing": 1})
     with pytest.raises(OptionError, match="cannot be written"):
-        run_batch(clips, out / "a", ReadOptions())
+        run_batch(videos, out / "a", ReadOptions())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")

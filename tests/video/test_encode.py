@@ -373,15 +373,22 @@ def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None
     assert not list(tmp_path.glob("*out*"))
 
 
+@pytest.fixture(scope="module")
+def long(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip whose conversion takes a while."""
+    return ffmpeg(
+        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
+        *("-c:v", "libx264", "-preset", "ultrafast"),
+        tmp_path_factory.mktemp("long") / "long.mp4",
+    )
+
+
 @contextmanager
 def long_conversion(
-    ffmpeg: Ffmpeg, folder: Path, words: Sequence[str] = TO_A_FILE
+    clip: Path, folder: Path, words: Sequence[str] = TO_A_FILE
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A process that is converting long.mp4 of a folder to `words`, for some time yet."""
-    long = ffmpeg(
-        *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
-        *("-c:v", "libx264", "-preset", "ultrafast", folder / "long.mp4"),
-    )
+    long = shutil.copyfile(clip, folder / "long.mp4")
     words = [*words, "--video", str(long), "--encoder", "libaom", "--speed", "2"]
     command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
     with subprocess.Popen(command, cwd=folder) as process:
@@ -403,9 +410,9 @@ def is_converted(video: Path) -> bool:
 @pytest.mark.parametrize("words", [TO_A_FILE, TO_A_DATABASE], ids=["encode", "match"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_conversion_leaves_nothing(
-    ffmpeg: Ffmpeg, tmp_path: Path, number: int, status: int, words: Sequence[str]
+    long: Path, tmp_path: Path, number: int, status: int, words: Sequence[str]
 ) -> None:
-    with long_conversion(ffmpeg, tmp_path, words) as process:
+    with long_conversion(long, tmp_path, words) as process:
         process.send_signal(number)
         assert process.wait(30) == status
     assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
@@ -414,9 +421,9 @@ def test_interrupted_conversion_leaves_nothing(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
 def test_killed_conversion_ends_and_is_cleaned_up_after(
-    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+    phone: Path, long: Path, tmp_path: Path
 ) -> None:
-    with long_conversion(ffmpeg, tmp_path) as process:
+    with long_conversion(long, tmp_path) as process:
         process.kill()
         process.wait(30)
     deadline = time.monotonic() + 10
@@ -434,11 +441,11 @@ def test_killed_conversion_ends_and_is_cleaned_up_after(
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
 @pytest.mark.parametrize("next_video", ["phone", "clip"])
 def test_killed_match_is_cleaned_up_after(
-    next_video: str, ffmpeg: Ffmpeg, tmp_path: Path, request: pytest.FixtureRequest
+    next_video: str, long: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     """By the next run on that database, whether it converts its video or not."""
     video = request.getfixturevalue(next_video)
-    with long_conversion(ffmpeg, tmp_path, TO_A_DATABASE) as process:
+    with long_conversion(long, tmp_path, TO_A_DATABASE) as process:
         process.kill()
         process.wait(30)
     left = [p.name for p in tmp_path.iterdir() if p.name != "long.mp4"]
