@@ -36,6 +36,11 @@ Ffmpeg = Callable[..., Path]
 Encode = Callable[..., Path]
 
 
+def pytest_configure() -> None:
+    # For the workers, which fill the cores: BLAS's further threads would wait for one in a loop.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("shared") and not SHARED.is_dir():
         pytest.skip("needs the test data in ../shared")

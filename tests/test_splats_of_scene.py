@@ -100,10 +100,7 @@ def test_colours_and_observations_are_those_of_the_pictures(dense: Path) -> None
     assert min(p.track.length() for p in model.points3D.values()) >= 1
 
 
-def test_a_bound_and_the_same_bytes(true_model: Path, dense: Path, tmp_path: Path) -> None:
-    densify(true_model, SCENE, tmp_path / "again", options=SPLATS)
-    for file in ("cameras.bin", "images.bin", "points3D.bin"):
-        assert (tmp_path / "again" / file).read_bytes() == (dense / file).read_bytes()
+def test_a_bound_on_the_number_of_points(true_model: Path, tmp_path: Path) -> None:
     bounded = replace(SPLATS, triangulate=TriangulateOptions(max_points=3000))
     report = densify(true_model, SCENE, tmp_path / "few", options=bounded)
     assert 2900 < report.num_points <= 3000
