@@ -12,6 +12,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from dense_scene import made, truth  # noqa: F401 - fixtures
+from hypothesis import settings
 from numpy.typing import NDArray
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -31,6 +32,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from colmap_av1.cli import main
 sys.exit(main())
 """
+
+# A busy machine may take long for an example.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
 
 Ffmpeg = Callable[..., Path]
 Encode = Callable[..., Path]
