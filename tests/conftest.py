@@ -12,6 +12,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from dense_scene import made, truth  # noqa: F401 - fixtures
+from hypothesis import settings
 from numpy.typing import NDArray
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -32,8 +33,17 @@ from colmap_av1.cli import main
 sys.exit(main())
 """
 
+# A busy machine may take long for an example.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
+
 Ffmpeg = Callable[..., Path]
 Encode = Callable[..., Path]
+
+
+def pytest_configure() -> None:
+    # For the workers, which fill the cores: BLAS's further threads would wait for one in a loop.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

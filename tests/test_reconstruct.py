@@ -21,7 +21,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import Encode, make_frames
-from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, STAGES, Truth
+from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
 from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
@@ -45,6 +45,17 @@ from colmap_av1.util.spread import evenly_spread
 from colmap_av1.video.unchanged import file_state
 
 OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
+
+
+@pytest.fixture
+def copy(made: ReconstructReport, tmp_path: Path) -> Path:
+    """A copy of the finished output, which another run resumes."""
+    return Path(shutil.copytree(made.output, tmp_path / "out"))
+
+
+def products(output: Path) -> dict[Path, bytes]:
+    """The images and models of an output."""
+    return {p: p.read_bytes() for p in output.glob("[is]*/**/*.*")}
 
 
 def test_files_agree(made: ReconstructReport) -> None:
@@ -136,21 +147,17 @@ def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: Reconstr
     assert found == {"images", "sparse"}
 
 
-def test_models_among_the_stages_of_an_earlier_version_go(
-    made: ReconstructReport, tmp_path: Path
-) -> None:
+def test_models_among_the_stages_of_an_earlier_version_go(copy: Path) -> None:
     """Such folders had a model with as many images as the finished one, and a smaller path."""
-    output = tmp_path / "out"
-    shutil.copytree(made.output, output)
     for name in ("poses/0", "placed", "adjusted"):
-        shutil.copytree(output / "sparse" / "0", output / ".stages" / name)
-    assert brush(output).model == output / ".stages" / "adjusted"
-    reconstruct(SCENE, output, options=OPTIONS)
-    check_taken(brush(output), output)
+        shutil.copytree(copy / "sparse" / "0", copy / ".stages" / name)
+    assert brush(copy).model == copy / ".stages" / "adjusted"
+    reconstruct(SCENE, copy, options=OPTIONS)
+    check_taken(brush(copy), copy)
 
 
-def test_masks_are_those_of_the_model(made: ReconstructReport, tmp_path: Path) -> None:
-    masked = reconstruct(SCENE, tmp_path / "out", options=replace(OPTIONS, moving="mask"))
+def test_masks_are_those_of_the_model(copy: Path) -> None:
+    masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():
         assert masks == {masked.output / "masks" / Path(name).with_suffix(".png").name}
 
@@ -197,17 +204,11 @@ def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
     assert written[0][1].read_bytes() == written[1][1].read_bytes()
 
 
-@pytest.mark.parametrize("at_once", [True, False])
-def test_long_videos_have_fewer_images_than_frames(
-    at_once: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
     """Of 60 frames about as many as asked for become images, unless an option says which.
 
-    Of many more frames twice as many are looked at. Where their tracks are too many to be held,
-    the motion is read twice.
+    Of many more frames twice as many are looked at.
     """
-    if not at_once:
-        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._MOST_HELD", 0)
 
     def stop(stage: str, *_: object) -> None:
         if stage == "pairs":
@@ -259,13 +260,17 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
         np.testing.assert_array_equal(values, tracks[1][part])
 
 
-def test_goes_on_after_finished_stages(made: ReconstructReport) -> None:
+def test_goes_on_after_finished_stages(made: ReconstructReport, tmp_path: Path) -> None:
+    """Whatever the number of threads and wherever the video lies."""
     files = {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")}
-    again = reconstruct(SCENE, made.output, options=OPTIONS)
-    assert again.resumed == STAGES
+    video = tmp_path / "elsewhere.mp4"
+    shutil.copyfile(SCENE, video)
+    match = replace(OPTIONS.match, read=ReadOptions(num_threads=1), run=RunOptions(num_threads=1))
+    again = reconstruct(video, made.output, options=replace(OPTIONS, match=match))
+    assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
     assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
-    timed = {"seconds": made.seconds, "cpu_seconds": made.cpu_seconds}
-    assert replace(again, resumed=(), **timed) == made
+    assert (again.num_points, again.mean_error) == (made.num_points, made.mean_error)
+    assert again.warnings == made.warnings
 
 
 def contents(output: Path) -> dict[str, bytes]:
@@ -275,101 +280,39 @@ def contents(output: Path) -> dict[str, bytes]:
     return {str(p.relative_to(output)): p.read_bytes() for p in kept}
 
 
-@pytest.mark.parametrize(
-    ("name", "redone"),
-    [
-        (".stages/tracks.npz", "tracks"),
-        ("database.db", "matches"),
-        (".stages/poses/0.npz", "poses"),
-        (".stages/placed.npz", "resection"),
-        (".stages/moving.npz", "moving"),
-        ("images/frame_000006.jpg", "model"),
-        ("sparse/0/points3D.bin", "model"),
-    ],
-)
-def test_damaged_products_are_made_again(
-    made: ReconstructReport, tmp_path: Path, name: str, redone: str
-) -> None:
+def test_damaged_products_are_made_again(copy: Path) -> None:
     """Deleted, cut short, or overwritten by as many bytes."""
-    output = tmp_path / "out"
-    shutil.copytree(made.output, output)
-    before = contents(output)
-    all_but = tuple(s for s in STAGES if s != redone)
-    product = output / name
-    size = product.stat().st_size
-    for damage in (
-        product.unlink,
-        lambda: os.truncate(product, size - 1),
-        lambda: product.write_bytes(bytes(size)),
-    ):
-        damage()
-        assert reconstruct(SCENE, output, options=OPTIONS).resumed == all_but
-        assert contents(output) == before
+    before = contents(copy)
+    for name in (".stages/tracks.npz", ".stages/moving.npz", "images/frame_000006.jpg"):
+        (copy / name).unlink()
+    for name in ("database.db", ".stages/placed.npz"):
+        os.truncate(copy / name, (copy / name).stat().st_size - 1)
+    for name in (".stages/poses/0.npz", "sparse/0/points3D.bin"):
+        (copy / name).write_bytes(bytes((copy / name).stat().st_size))
+    resumed = reconstruct(SCENE, copy, options=OPTIONS).resumed
+    assert not {"tracks", "matches", "poses", "resection", "moving", "model"} & set(resumed)
+    assert contents(copy) == before
 
 
-def test_damaged_records_are_made_again(made: ReconstructReport, tmp_path: Path) -> None:
-    output = tmp_path / "out"
-    shutil.copytree(made.output, output)
-    before = contents(output)
-    records = sorted((output / ".stages").glob("*.json"))
-    assert {record.stem for record in records} == {*STAGES, "seams"}
-    part = records[5].read_text()[:-40]
-    texts = ["", "[]", "7", "{", "null", '{"key": 3, "facts": null}', part]
-    texts += ['{"key": "", "facts": {}}', "[1]", '"seams"']
-    for record, text in zip(records, texts, strict=True):
-        record.write_text(text)
-    assert reconstruct(SCENE, output, options=OPTIONS).resumed == ()
-    assert contents(output) == before
-    assert len(reconstruct(SCENE, output, options=OPTIONS).resumed) == len(STAGES)
-
-
-def test_only_what_changes_the_result_redoes(
-    made: ReconstructReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_changed_option_redoes_what_depends_on_it(
+    made: ReconstructReport, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not the number of threads nor where the video lies; the code does."""
-    output = tmp_path / "out"
-    shutil.copytree(made.output, output)
-    before = contents(output)
-    video = tmp_path / "elsewhere.mp4"
-    shutil.copyfile(SCENE, video)
-    match = replace(OPTIONS.match, read=ReadOptions(num_threads=1), run=RunOptions(num_threads=1))
-    one = reconstruct(video, output, options=replace(OPTIONS, match=match))
-    assert one.resumed == STAGES
-    monkeypatch.setattr("colmap_av1.util.stages.code_digest", lambda *_: "of an upgrade")
-    assert reconstruct(SCENE, output, options=replace(OPTIONS, match=match)).resumed == ()
-    assert contents(output) == before
-
-
-def test_changed_option_redoes_what_depends_on_it(made: ReconstructReport) -> None:
-    before = (made.output / "sparse" / "0" / "points3D.bin").read_bytes()
-    mine = [made.output / n for n in ("images/mine.png", "sparse/0/points3D.ply", "sparse/1/mine")]
+    """Files of others stay, and so does the old output until the new one is whole."""
+    before = products(copy)
+    mine = [copy / n for n in ("images/mine.png", "sparse/0/points3D.ply", "sparse/1/mine.txt")]
     mine[-1].parent.mkdir()
     for file in mine:
         file.write_text("of a user or a trainer")
+    others = {file: file.read_bytes() for file in mine}
     strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
-    fewer = reconstruct(SCENE, made.output, options=strict)
-    assert fewer.resumed == STAGES[:-1]
-    assert fewer.num_points < made.num_points
-    assert reconstruct(SCENE, made.output, options=OPTIONS).num_points == made.num_points
-    assert (made.output / "sparse" / "0" / "points3D.bin").read_bytes() == before
-    for file in mine:
-        assert file.read_text() == "of a user or a trainer"
-        file.unlink()
-    mine[-1].parent.rmdir()
-
-
-def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An interrupt and a full disk leave the old output whole, and the run is resumed."""
-    before = {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")}
-    other = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=4))
 
     def interrupt(stage: str, done: int, total: int | None) -> None:
         if stage == "images" and done > 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(SCENE, made.output, options=other, progress=interrupt)
-    assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before
+        reconstruct(SCENE, copy, options=strict, progress=interrupt)
+    assert products(copy) == before | others
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -378,20 +321,26 @@ def test_stopped_run(made: ReconstructReport, monkeypatch: pytest.MonkeyPatch) -
         patch.setattr(
             importlib.import_module("colmap_av1.splats.reconstruct_model"), "write_model", full
         )
-        with pytest.raises(ModelError, match="No space left on device"):
-            reconstruct(SCENE, made.output, options=other)
-    assert {p: p.read_bytes() for p in made.output.glob("[is]*/**/*.*")} == before
-    assert not list((made.output / ".stages").glob("*.partial"))
-    assert reconstruct(SCENE, made.output, options=OPTIONS).resumed[-1] == "model"
+        with pytest.raises(ModelError, match="No space left"):
+            reconstruct(SCENE, copy, options=strict)
+    assert products(copy) == before | others
+    assert not list((copy / ".stages").glob("*.partial"))
+
+    fewer = reconstruct(SCENE, copy, options=strict)
+    assert "adjustment" in fewer.resumed
+    assert "model" not in fewer.resumed
+    assert fewer.num_points < made.num_points
+    assert reconstruct(SCENE, copy, options=OPTIONS).num_points == made.num_points
+    assert products(copy) == before | others
 
 
 def test_short_videos(encode: Encode, tmp_path: Path) -> None:
     one, two, three = (encode(make_frames(n), tmp_path / f"{n}.mp4") for n in (1, 2, 3))
-    with pytest.raises(ImageError, match="matches need two or more: give a longer video"):
+    with pytest.raises(ImageError, match="longer video"):
         reconstruct(one, tmp_path / "out")
-    with pytest.raises(ImageError, match="2 of 2 frames become images: a model needs 3"):
+    with pytest.raises(ImageError, match="2 of 2 frames"):
         reconstruct(two, tmp_path / "out")
-    with pytest.raises(VideoError, match="of 4 frames or more, the video has 3: give a"):
+    with pytest.raises(VideoError, match="has 3"):
         reconstruct(three, tmp_path / "out")
 
 
@@ -410,36 +359,31 @@ def test_converted_stream_is_kept_in_the_folder(encode: Encode, tmp_path: Path) 
     assert [p.name for p in tmp_path.iterdir()] == ["videos", "out"]
 
 
-def test_model_of_two_images_is_none(
-    made: ReconstructReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_model_of_two_images_is_none(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def map_two(*_: object, **__: object) -> tuple[int, ...]:
         return (2,)
 
-    shutil.copytree(made.output, tmp_path / "out")
     stages = importlib.import_module("colmap_av1.poses.reconstruct_poses")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
-    with pytest.raises(
-        ModelError, match=r"incremental mapper finds no initial pair: .* try --mapper"
-    ):
-        reconstruct(SCENE, tmp_path / "out", options=other)
+    with pytest.raises(ModelError, match="--mapper"):
+        reconstruct(SCENE, copy, options=other)
 
 
-def test_video_that_changes(tmp_path: Path) -> None:
+def test_video_that_changes(copy: Path, tmp_path: Path) -> None:
     """Tracks of one video and images of another do not come together."""
     video = tmp_path / "v.mp4"
     shutil.copyfile(SCENE, video)
-    changed = replace(OPTIONS, mapping=replace(OPTIONS.mapping, adjust=False))
+    shutil.rmtree(copy / "sparse")
 
     def change(stage: str, done: int, total: int | None) -> None:
         if stage == "images" and done == 2:
             video.touch()
 
     with pytest.raises(VideoError, match="changed"):
-        reconstruct(video, tmp_path / "out", options=changed, progress=change)
-    assert not (tmp_path / "out" / "sparse").exists()
-    assert not list((tmp_path / "out" / ".stages").glob("*.partial"))
+        reconstruct(video, copy, options=OPTIONS, progress=change)
+    assert not (copy / "sparse").exists()
+    assert not list((copy / ".stages").glob("*.partial"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
@@ -459,7 +403,8 @@ def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     again = reconstruct(SCENE, output, options=OPTIONS)
-    assert again.resumed == ("tracks", "matches")
+    assert {"tracks", "matches"} <= set(again.resumed)
+    assert "poses" not in again.resumed
     for path in made.output.glob("[is]*/**/*.*"):
         assert (output / path.relative_to(made.output)).read_bytes() == path.read_bytes()
     assert not list(output.glob("**/*.partial"))
@@ -474,45 +419,37 @@ def words_of(process: Path) -> bytes:
 
 @pytest.mark.parametrize("links", ["auto", "none"])
 def test_pictures_that_contradict_the_poses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
+    copy: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
 ) -> None:
     """Places seen again are linked then, unless there must be no links."""
     monkeypatch.setattr("colmap_av1.poses.long_range._FAR_APART", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
-    found = reconstruct(SCENE, tmp_path / "out", options=options)
+    (copy / ".stages" / "far_views.json").unlink()
+    found = reconstruct(SCENE, copy, options=options)
     assert found.links.looked_again == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
-    told = next(note for note in found.warnings if "surfaces may be doubled there" in note)
-    assert ("--links sift" in told) == (links == "none")
-    assert reconstruct(SCENE, tmp_path / "out", options=options).resumed == STAGES
+    assert any("--links sift" in note for note in found.warnings) == (links == "none")
+    assert "far_views" in reconstruct(SCENE, copy, options=options).resumed
 
 
-def test_images_that_are_left_out_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_are_left_out_are_named(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # As if those with less than the usual number of points were hidden.
     monkeypatch.setattr("colmap_av1.poses.mapper.FEW_SEEN", (10_000, 0.95))
-    found = reconstruct(SCENE, tmp_path / "out", options=OPTIONS)
-    written = {path.name for path in (tmp_path / "out" / "images").iterdir()}
+    (copy / ".stages" / "adjustment.json").unlink()
+    found = reconstruct(SCENE, copy, options=OPTIONS)
+    written = {path.name for path in (copy / "images").iterdir()}
     assert found.num_registered == len(written) < NUM_IMAGES
     every = [f"frame_{EVERY * i:06d}.jpg" for i in range(NUM_IMAGES)]
     missing = [name for name in every if name not in written]
-    (told,) = [note for note in found.warnings if "have no pose" in note]
-    assert told.startswith(f"{len(missing)} of {NUM_IMAGES} images have no pose")
-    assert [name in told for name in missing] == [i < 4 for i in range(len(missing))]
+    (told,) = [note for note in found.warnings if f"{len(missing)} of {NUM_IMAGES}" in note]
+    assert missing[0] in told
 
 
-def test_without_adjustment(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
-    shutil.copytree(made.output, tmp_path / "plain")
-    mapping = replace(OPTIONS.mapping, adjust=False)
-    placed = reconstruct(SCENE, tmp_path / "plain", options=replace(OPTIONS, mapping=mapping))
-    # The mapper takes more steps where no adjustment follows.
-    assert placed.resumed == STAGES[:2]
-    # All images by the mapper, none by resection.
-    options = replace(OPTIONS, mapping=replace(mapping, key_images=False))
-    plain = reconstruct(SCENE, tmp_path / "plain", options=options)
-    assert plain.resumed == STAGES[:1]
+def test_without_adjustment(made: ReconstructReport, truth: Truth, copy: Path) -> None:
+    """All images are mapped, none is resected."""
+    mapping = replace(OPTIONS.mapping, adjust=False, key_images=False)
+    plain = reconstruct(SCENE, copy, options=replace(OPTIONS, mapping=mapping))
     assert plain.num_key_images == plain.num_registered == NUM_IMAGES
     # The lens is estimated from all images all the same.
     assert cameras_of(plain.database) == cameras_of(made.database)
@@ -534,7 +471,7 @@ def cameras_of(database: Path) -> list[tuple[int, bytes]]:
 
 def test_folder_of_others(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("chapter 1")
-    with pytest.raises(OptionError, match="not empty and not the output of an earlier run"):
+    with pytest.raises(OptionError, match="not empty"):
         reconstruct(SCENE, tmp_path, options=OPTIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -557,14 +494,13 @@ def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:
     frames = np.stack(frames)
     video = encode(frames, tmp_path / "flat.mp4")
     # From a focal length that is far off the turn looks like motion, and a model can be made of it.
-    told = "the camera only rotates or the scene is flat"
-    with pytest.raises(ModelError, match=rf"too little parallax, in \d+ of \d+ pairs {told}"):
+    with pytest.raises(ModelError, match="parallax"):
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     far_off = CameraOptions(camera_model="SIMPLE_RADIAL", camera_params="384,160,120,0")
     options = replace(OPTIONS_OF_ALL_FRAMES, match=MatchOptions(camera=far_off))
     options = replace(options, mapping=replace(options.mapping, mapper="incremental"))
     report = reconstruct(video, tmp_path / "far_off", options=options)
-    assert any(told in warning for warning in report.warnings)
+    assert any("rotates" in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize("walker", [False, True])
@@ -578,7 +514,7 @@ def test_camera_that_stands_still(encode: Encode, tmp_path: Path, walker: bool) 
         for i, frame in enumerate(frames):
             frame[60:180, 40 + 9 * i : 100 + 9 * i] = coat
     video = encode(frames, tmp_path / "still.mp4")
-    with pytest.raises(ModelError, match=r"finds no initial pair: too little parallax, in \d+ of"):
+    with pytest.raises(ModelError, match="parallax"):
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()
     assert not (tmp_path / "out" / "sparse").exists()
@@ -594,7 +530,7 @@ def test_command_line(
     assert f"element vertex {made.num_points}\n".encode() in (tmp_path / "init.ply").read_bytes()
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
-    assert f"finished before\t{', '.join(STAGES)}" in told.out
+    assert "finished before\ttracks, " in told.out
     model = made.output / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
@@ -602,7 +538,7 @@ def test_command_line(
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
     assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2
-    assert "give a name that ends in .ply" in capsys.readouterr().err
+    assert ".ply" in capsys.readouterr().err
     # Brush takes the last .ply of a folder, or init.ply: there is one only where it is wanted.
     assert main([*words, "--gaussians", str(tmp_path / "dense" / "init.ply")]) == 0
     assert [p.name for p in tmp_path.glob("dense/*.ply")] == ["init.ply"]
@@ -612,6 +548,6 @@ def test_command_line(
     assert covered is not None
     assert float(covered[1]) > 99 > float(covered[2]) > 80
     assert main([*words, "--max_points", "7"]) == 2
-    assert "max_points is 7: give 100 or more" in capsys.readouterr().err
+    assert "max_points" in capsys.readouterr().err
     assert main(words) == 2
     assert "error: " in capsys.readouterr().err

@@ -55,12 +55,12 @@ def test_list_without_an_end(tmp_path: Path) -> None:
     refused(
         lambda: check_frame_list(ImageOptions(frame_list="/dev/zero")),
         ImageError,
-        "not a regular file",
+        "regular",
     )
     large = tmp_path / "large.txt"
     with large.open("wb") as file:
         file.truncate(1 << 40)
-    refused(lambda: check_frame_list(ImageOptions(frame_list=large)), ImageError, "is too large")
+    refused(lambda: check_frame_list(ImageOptions(frame_list=large)), ImageError, "large")
 
 
 def test_numbers_longer_than_python_reads(tmp_path: Path) -> None:
@@ -104,44 +104,44 @@ def linked(features: h5py.File, name: str, target: object) -> None:
 HDF5 = {
     "keypoints": (
         lambda f, m: declared(f, "a/keypoints", (3_000_000_000, 2), "f4"),
-        "declares 24000000000 bytes, which the file does not hold",
+        "24000000000 bytes",
     ),
     "size": (
         lambda f, m: declared(f, "a/image_size", (3_000_000_000,), "i8"),
-        "declares 24000000000 bytes",
+        "24000000000 bytes",
     ),
     "matches": (
         lambda f, m: declared(m, "a/b/matches0", (3_000_000_000,), "i4"),
-        "declares 12000000000 bytes",
+        "12000000000 bytes",
     ),
     "scores": (
         lambda f, m: declared(m, "a/b/matching_scores0", (3_000_000_000,), "f4"),
-        "declares 12000000000 bytes",
+        "12000000000 bytes",
     ),
     "scores of others": (
         lambda f, m: linked(m, "a/b/matching_scores0", np.ones(5, np.float32)),
-        r"\[5\] scores for 9 matches",
+        "scores",
     ),
     "size of three": (
         lambda f, m: linked(f, "a/image_size", np.array([1, 2, 3])),
-        "is no width and height",
+        "width",
     ),
-    "size in words": (lambda f, m: linked(f, "a/image_size", "64x48"), "holds no numbers"),
+    "size in words": (lambda f, m: linked(f, "a/image_size", "64x48"), "numbers"),
     "size not a number": (
         lambda f, m: linked(f, "a/image_size", np.array([np.nan, 3])),
-        "is no width and height",
+        "width",
     ),
     "size that is a group": (
         lambda f, m: linked(f, "a/image_size", h5py.SoftLink("/b")),
-        "holds no numbers",
+        "numbers",
     ),
     "size that is nowhere": (
         lambda f, m: linked(f, "a/image_size", h5py.ExternalLink("none.h5", "/x")),
-        "or damaged",
+        "damaged",
     ),
     "no numbers": (
         lambda f, m: linked(f, "a/keypoints", np.full((9, 2), np.nan, np.float32)),
-        "keypoints that are not numbers",
+        "keypoints",
     ),
 }
 
@@ -210,7 +210,7 @@ def test_model_that_declares_more_than_it_holds(tmp_path: Path, field: str, numb
     counts = {field: number & 0xFFFFFFFF or 1 << 31} if short else {field: number}
     for name, data in model_files(counts).items():
         (tmp_path / name).write_bytes(data)
-    refused(lambda: read_model(tmp_path), ModelError, "the model cannot be read")
+    refused(lambda: read_model(tmp_path), ModelError, "cannot be read")
 
 
 def test_model_that_is_cut_off(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_model_that_is_cut_off(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [(b"\xff.png", "not in UTF-8"), (b"../a.png", "outside"), (b"", "no file can have")],
+    [(b"\xff.png", "UTF-8"), (b"../a.png", "outside"), (b"", "name")],
 )
 def test_model_with_a_name_of_no_file(tmp_path: Path, name: bytes, text: str) -> None:
     for file, data in model_files({}).items():
@@ -237,8 +237,8 @@ def test_model_with_a_name_of_no_file(tmp_path: Path, name: bytes, text: str) ->
 def test_model_whose_numbers_are_none(tmp_path: Path) -> None:
     # Places of the first parameter, and of the pose in both files that have it.
     for places, text in (
-        ({"cameras.bin": 32}, "parameters that are not numbers"),
-        ({"images.bin": 44, "frames.bin": 48}, "a pose that is not finite"),
+        ({"cameras.bin": 32}, "parameters"),
+        ({"images.bin": 44, "frames.bin": 48}, "pose"),
     ):
         for name, data in model_files({}).items():
             changed = bytearray(data)

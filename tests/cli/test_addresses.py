@@ -55,7 +55,7 @@ def test_a_url_is_as_good_as_its_file(
     url = f"{server}/a%20clip.mp4"
     for video, name in ((url, "a.db"), (str(clip), "b.db"), (clip.as_uri(), "c.db")):
         assert main(["match", "--database", str(tmp_path / name), "--video", video]) == 0
-    assert f"colmap-av1: fetching {url}\n" in capsys.readouterr().err
+    assert url in capsys.readouterr().err
     fetched = (tmp_path / "a.db").read_bytes()
     assert fetched == (tmp_path / "b.db").read_bytes() == (tmp_path / "c.db").read_bytes()
 
@@ -73,12 +73,13 @@ def test_urls_that_cannot_be_read(
 ) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     for address, said in (
-        (f"{server}/none.mp4", "no such file: give the path of a video"),
-        ("nothing://x/v.mp4", "Protocol not known: nothing: give a path, or a URL that fsspec"),
+        (f"{server}/none.mp4", "no such file"),
+        ("nothing://x/v.mp4", "fsspec"),
     ):
         assert main(["info", "--quiet", "--video", address]) == 2
         error = capsys.readouterr().err
-        assert error.startswith(f"colmap-av1: error: {address}: {said}")
+        assert error.startswith(f"colmap-av1: error: {address}: ")
+        assert said in error
         assert error.count("\n") == 1
     assert os.listdir(scratch) == []
 
@@ -89,16 +90,15 @@ def test_without_fsspec(
     monkeypatch.setitem(sys.modules, "fsspec", None)
     address = "s3://bucket/v.mp4"
     assert main(["info", "--quiet", "--video", address]) == 2
-    assert capsys.readouterr().err == (
-        f"colmap-av1: error: {address}: needs the package fsspec: pip install "
-        "'colmap-av1[remote]'; or fetch it first, and give its path\n"
-    )
+    error = capsys.readouterr().err
+    assert error.startswith(f"colmap-av1: error: {address}: ")
+    assert "pip install 'colmap-av1[remote]'" in error
 
 
 def test_python_takes_files() -> None:
     for address in ("http://example.org/a b.mp4", "https://x:8/y?z#1"):
         with (
-            pytest.raises(VideoError, match="is a URL"),
+            pytest.raises(VideoError, match="URL"),
             open_container(Path(address)),
         ):
             pass

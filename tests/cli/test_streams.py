@@ -14,16 +14,15 @@ from colmap_av1.motion.motion_file import export_motion
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other shells and devices there")
 
-FULL = "colmap-av1: error: standard output: cannot be written: No space left on device\n"
-CLOSED = "colmap-av1: error: standard output: cannot be written: Bad file descriptor\n"
+# Exit status and number of lines of errors.
 CASES = {
-    "--version >&-": (2, CLOSED),
-    "--version >/dev/full": (2, FULL),
-    "--version 2>&- >&- <&-": (2, ""),
-    "match --help-all | true": (141, ""),
-    "info --video none.mp4 2>/dev/full": (2, ""),
-    "info --vdeo none.mp4 2>/dev/full": (2, ""),
-    "motion --video v.mp4 --output m.npz --quiet <&- >&- 2>&-": (0, ""),
+    "--version >&-": (2, 1),
+    "--version >/dev/full": (2, 1),
+    "--version 2>&- >&- <&-": (2, 0),
+    "match --help-all | true": (141, 0),
+    "info --video none.mp4 2>/dev/full": (2, 0),
+    "info --vdeo none.mp4 2>/dev/full": (2, 0),
+    "motion --video v.mp4 --output m.npz --quiet <&- >&- 2>&-": (0, 0),
 }
 
 
@@ -44,7 +43,8 @@ def test_broken_streams(clip: Path, tmp_path: Path) -> None:
     found = {}
     for case, process in started.items():
         _, said = process.communicate(timeout=120)
-        found[case] = (process.returncode, said)
+        assert "Traceback" not in said
+        found[case] = (process.returncode, said.count("\n"))
     assert found == CASES
     # What a library printed would have ended in a file that got a closed stream's number.
     export_motion(clip, tmp_path / "again.npz")

@@ -207,7 +207,7 @@ class Databases(RuleBasedStateMachine):
 
 
 Databases.TestCase.settings = settings(
-    max_examples=int(EXAMPLES or "80"),
+    max_examples=int(EXAMPLES or "40"),
     derandomize=EXAMPLES is None,
     stateful_step_count=8,
     deadline=None,

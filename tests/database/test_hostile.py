@@ -87,6 +87,7 @@ ENDLESS = (
     "CREATE VIEW {0} AS WITH RECURSIVE n({1}) AS (SELECT 1, 1, 2, X'0000000000000000' UNION ALL "
     "SELECT {2} + 1, rows, cols, data FROM n) SELECT * FROM n"
 )
+# Changes, a word of what `check` says, and whether everything refuses the database.
 SQL = {
     "layout not in UTF-8": (
         [
@@ -94,7 +95,8 @@ SQL = {
             "UPDATE sqlite_master SET sql = CAST(REPLACE(CAST(sql AS BLOB), 'params', X'FF6172') "
             "AS TEXT) WHERE name = 'cameras'",
         ],
-        "not UTF-8|layout is damaged|not a COLMAP database",
+        "UTF-8|layout|COLMAP",
+        False,
     ),
     "layout no SQL": (
         [
@@ -102,14 +104,17 @@ SQL = {
             "UPDATE sqlite_master SET sql = CAST(X'FFFEFD' AS TEXT) WHERE name = 'cameras'",
         ],
         "damaged",
+        False,
     ),
     "name not in UTF-8": (
         ["UPDATE images SET name = CAST(X'FF2E706E67' AS TEXT) WHERE image_id = 1"],
-        "not UTF-8",
+        "UTF-8",
+        False,
     ),
     "name a blob": (
         ["UPDATE images SET name = X'612E706E67' WHERE image_id = 1"],
-        "'images' is damaged ('name' of row '1'",
+        "'name'",
+        True,
     ),
     "name a number": (
         [
@@ -118,7 +123,8 @@ SQL = {
             "CREATE TABLE images (image_id INTEGER PRIMARY KEY, name, camera_id INTEGER)",
             "INSERT INTO images SELECT image_id, image_id, camera_id FROM other",
         ],
-        "'images' is damaged ('name'",
+        "'name'",
+        True,
     ),
     "no key": (
         [
@@ -126,7 +132,8 @@ SQL = {
             "DROP TABLE matches",
             "ALTER TABLE other RENAME TO matches",
         ],
-        "'pair_id' is not the key of table 'matches'",
+        "'pair_id'",
+        False,
     ),
     "two images of a name": (
         [
@@ -135,55 +142,64 @@ SQL = {
             "CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)",
             "INSERT INTO images SELECT image_id, 'a.png', camera_id FROM other",
         ],
-        "lists two images 'a.png'",
+        "'a.png'",
+        False,
     ),
-    "parameters of 1 byte": (["UPDATE cameras SET params = X'00'"], "parameters of 1 bytes"),
-    "parameters as text": (["UPDATE cameras SET params = '1,2,3'"], "'cameras' is damaged"),
-    "unknown model": (["UPDATE cameras SET model = 99"], "has model 99"),
-    "size below 0": (["UPDATE cameras SET width = -5"], "'cameras' is damaged ('width'"),
-    "rows below 0": (["UPDATE keypoints SET rows = -1"], "'keypoints' is damaged ('rows'"),
+    "parameters of 1 byte": (["UPDATE cameras SET params = X'00'"], "parameters", False),
+    "parameters as text": (["UPDATE cameras SET params = '1,2,3'"], "'cameras'", True),
+    "unknown model": (["UPDATE cameras SET model = 99"], "99", False),
+    "size below 0": (["UPDATE cameras SET width = -5"], "'width'", True),
+    "rows below 0": (["UPDATE keypoints SET rows = -1"], "'rows'", True),
     "rows beyond any": (
         ["UPDATE matches SET rows = 4000000000"],
-        "'matches' is damaged ('rows'",
+        "'rows'",
+        True,
     ),
-    "rows in words": (["UPDATE matches SET rows = 'many'"], "'matches' is damaged ('rows'"),
+    "rows in words": (["UPDATE matches SET rows = 'many'"], "'rows'", True),
     "rows that the data do not have": (
         [f"UPDATE {t} SET rows = rows + 1" for t in ("keypoints", "matches")]
         + ["UPDATE two_view_geometries SET rows = rows + 1"],
-        "are damaged",
+        "damaged",
+        False,
     ),
     "camera id below 0": (
         ["UPDATE images SET camera_id = -1"],
-        "'images' is damaged ('camera_id'",
+        "'camera_id'",
+        True,
     ),
     "kind of a pair in words": (
         ["UPDATE two_view_geometries SET config = 'calibrated'"],
-        "'two_view_geometries' is damaged ('config'",
+        "'config'",
+        True,
     ),
     "view that never ends": (
         [
             "DROP TABLE keypoints",
             ENDLESS.format("keypoints", "image_id, rows, cols, data", "image_id"),
         ],
-        "'keypoints' is not a table",
+        "'keypoints'",
+        True,
     ),
     "matches that never end": (
         ["DROP TABLE matches", ENDLESS.format("Matches", "pair_id, rows, cols, data", "pair_id")],
-        "'matches' is not a table",
+        "'matches'",
+        True,
     ),
     "virtual table": (
         [
             "DROP TABLE descriptors",
             "CREATE VIRTUAL TABLE descriptors USING fts5(image_id, rows, cols, data)",
         ],
-        "'descriptors' is not a table|no such module",
+        "'descriptors'|no such module",
+        True,
     ),
     "trigger": (
         [
             "CREATE TRIGGER t AFTER UPDATE ON images BEGIN DELETE FROM images; END",
             "CREATE TRIGGER u AFTER INSERT ON keypoints BEGIN DELETE FROM images; END",
         ],
-        "has triggers",
+        "triggers",
+        True,
     ),
 }
 
@@ -222,9 +238,9 @@ def messages(path: Path, folder: Path) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize(("changes", "message"), SQL.values(), ids=SQL.keys())
+@pytest.mark.parametrize(("changes", "word", "by_all"), SQL.values(), ids=SQL.keys())
 def test_refused_in_one_line(
-    tmp_path: Path, sound: bytes, changes: list[str], message: str
+    tmp_path: Path, sound: bytes, changes: list[str], word: str, by_all: bool
 ) -> None:
     path = tmp_path / "a.db"
     path.write_bytes(sound)
@@ -233,9 +249,9 @@ def test_refused_in_one_line(
             connection.execute(sql)
     found = messages(path, tmp_path)
     assert "check" in found
-    assert any(part in found["check"] for part in message.split("|")), found
+    assert any(part in found["check"] for part in word.split("|")), found
     # Who reads nothing of what is damaged may do without it.
-    if any(part in message for part in ("' is damaged", "triggers", "no table", "not a table")):
+    if by_all:
         assert len(found) == len(opened_by_all(path, tmp_path)), found.keys()
 
 
@@ -245,7 +261,7 @@ def test_pages_that_refer_to_each_other(tmp_path: Path, sound: bytes) -> None:
     never_ending_pages(path)
     found = messages(path, tmp_path)
     assert len(found) == len(opened_by_all(path, tmp_path)), found.keys()
-    assert all("never ends" in text for text in found.values()), found
+    assert all("end" in text for text in found.values()), found
 
 
 def test_nothing_of_the_layout_is_run(tmp_path: Path, sound: bytes) -> None:
@@ -277,15 +293,15 @@ def params(change: Callable[[float], float]) -> tuple[str, bytes]:
 
 # What stops mappers is an error, what they work around a warning.
 FOUND = {
-    "keypoints not numbers": (not_numbers(3, 5), "error", "keypoints that are not numbers"),
-    "parameters not numbers": (params(lambda _: np.nan), "error", "parameters that are not"),
-    "focal length below 0": (params(lambda p: -p), "error", "a focal length of 0 or less"),
-    "size 0": (("UPDATE cameras SET width = 0",), "error", "a size of 0x"),
-    "absurd size": (("UPDATE cameras SET width = 1 << 40",), "error", "a size of 1099511627776x"),
+    "keypoints not numbers": (not_numbers(3, 5), "error", "keypoints"),
+    "parameters not numbers": (params(lambda _: np.nan), "error", "parameters"),
+    "focal length below 0": (params(lambda p: -p), "error", "focal length"),
+    "size 0": (("UPDATE cameras SET width = 0",), "error", "size"),
+    "absurd size": (("UPDATE cameras SET width = 1 << 40",), "error", "size"),
     "size of other images": (
         ("UPDATE cameras SET width = 100, height = 100",),
         "warning",
-        "keypoints outside",
+        "outside",
     ),
     "matches past the keypoints": (
         (
@@ -294,28 +310,28 @@ FOUND = {
             PAIR,
         ),
         "warning",
-        "1 pairs match keypoints that are not there",
+        "keypoints",
     ),
-    "no name": (("UPDATE images SET name = '' WHERE image_id = 2",), "error", "has no name"),
+    "no name": (("UPDATE images SET name = '' WHERE image_id = 2",), "error", "name"),
     "name with a zero": (
         ("UPDATE images SET name = 'a' || CHAR(0) || 'b.png' WHERE image_id = 2",),
         "error",
-        "a name outside the image folder, or none that a file",
+        "name",
     ),
     "name above": (
         ("UPDATE images SET name = '../a.png' WHERE image_id = 2",),
         "error",
-        "1 image (../a.png) with a name outside",
+        "../a.png",
     ),
     "name from the root": (
         ("UPDATE images SET name = '/etc/a.png' WHERE image_id = 2",),
         "error",
-        "1 image (/etc/a.png) with a name outside",
+        "/etc/a.png",
     ),
     "pair with itself": (
         ("UPDATE two_view_geometries SET pair_id = ? WHERE pair_id = ?", PAIR - 1, PAIR),
         "warning",
-        "1 pairs are of an image with itself",
+        "itself",
     ),
     "pair turned round": (
         (
@@ -324,14 +340,14 @@ FOUND = {
             PAIR,
         ),
         "warning",
-        "1 pairs are stored under the larger image id first",
+        "larger",
     ),
     "images deleted under their keypoints": (
         ("DELETE FROM images WHERE image_id < 7",),
         "error",
-        "pairs are of images that are not listed",
+        "not listed",
     ),
-    "no cameras": (("DELETE FROM cameras",), "error", "8 images (frame_007.png, ...) without a"),
+    "no cameras": (("DELETE FROM cameras",), "error", "8 images"),
 }
 
 

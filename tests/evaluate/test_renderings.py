@@ -72,9 +72,9 @@ def test_images_of_several_sizes_and_odd_ones(photograph: np.ndarray, tmp_path: 
 def test_what_does_not_fit_is_refused(photograph: np.ndarray, tmp_path: Path) -> None:
     large = write(tmp_path / "large.png", photograph)
     small = write(tmp_path / "small.png", photograph[:100])
-    with pytest.raises(ImageError, match="render at the size"):
+    with pytest.raises(ImageError, match="size"):
         rendering_metrics([small], [large])
-    with pytest.raises(ImageError, match="is missing or not an image"):
+    with pytest.raises(ImageError, match="missing"):
         rendering_metrics([tmp_path / "none.png"], [large])
-    with pytest.raises(ImageError, match="0 rendered images for 1 references"):
+    with pytest.raises(ImageError, match="0 rendered"):
         rendering_metrics([], [large])

@@ -126,7 +126,7 @@ def test_distortion_is_refused(scene: tuple[Path, Path], tmp_path: Path) -> None
     camera = model.cameras[1]
     camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [24, 16, 12, 0.1]
     model.write(tmp_path)
-    with pytest.raises(ModelError, match="SIMPLE_RADIAL: undistort"):
+    with pytest.raises(ModelError, match="undistort"):
         write_scene(tmp_path, scene[1], tmp_path / "scene.npz")
 
 
@@ -137,10 +137,10 @@ def test_bad_options(scene: tuple[Path, Path], tmp_path: Path) -> None:
 
 def test_what_is_missing_is_said(scene: tuple[Path, Path], tmp_path: Path) -> None:
     if TORCH_PYTHON is None:
-        with pytest.raises(EvaluationError, match="3D Gaussians need the package torch: pip"):
+        with pytest.raises(EvaluationError, match="torch"):
             train_gaussians(*scene, tmp_path, iterations=1)
     else:
-        with pytest.raises(EvaluationError, match="NVIDIA GPU with CUDA, and there is none"):
+        with pytest.raises(EvaluationError, match="CUDA"):
             train_gaussians(*scene, tmp_path, iterations=1, python=TORCH_PYTHON)
 
 

@@ -86,9 +86,9 @@ def test_a_command_renders_at_milestones(split: Split) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("str(stop)", "str(stop + 1)", r"renders/2: has 0 renderings for 2 test images"),
-        ("iterations,seconds", "steps,seconds", r"times.csv: cannot be read: let the trainer's"),
-        ("{2 * stop}", "nan", r"times.csv: cannot be read: let the trainer's"),
+        ("str(stop)", "str(stop + 1)", "0 renderings"),
+        ("iterations,seconds", "steps,seconds", r"times\.csv"),
+        ("{2 * stop}", "nan", r"times\.csv"),
     ],
 )
 def test_what_a_command_did_not_write(split: Split, old: str, new: str, told: str) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def test_points_without_a_position_are_left_out(
     for point_id, value in zip(some, (np.nan, np.inf, -np.inf), strict=True):
         reconstruction.points3D[point_id].xyz = np.array([0.0, value, 1.0])
     reconstruction.write_binary(tmp_path)
-    with pytest.warns(UserWarning, match="ignored 3 points"):
+    with pytest.warns(UserWarning, match="3 points"):
         read = read_model(tmp_path)
     assert set(read.points3D) == set(reconstruction.points3D) - set(some)
     with warnings.catch_warnings():
@@ -53,7 +54,7 @@ def test_what_is_no_model_is_refused(
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     reconstruction.write_binary(model)
-    with pytest.raises(ModelError, match=f"did you mean {model}"):
+    with pytest.raises(ModelError, match=re.escape(str(model))):
         read_model(tmp_path)
     whole = (model / "images.bin").read_bytes()
     (model / "images.bin").write_bytes(whole[: len(whole) // 2])

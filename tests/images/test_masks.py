@@ -9,9 +9,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 from conftest import Encode, make_frames
+from databases import keypoints_of
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -43,11 +43,7 @@ def write(path: Path, mask: NDArray[np.uint8]) -> Path:
 
 def positions(database: Path) -> dict[str, NDArray[np.int64]]:
     """The pixels of the keypoints of each image."""
-    with pycolmap.Database.open(database) as opened:
-        return {
-            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.int64)
-            for image in opened.read_all_images()
-        }
+    return {name: xy.astype(np.int64) for name, xy in keypoints_of(database).items()}
 
 
 def num_on_black(xy: NDArray[np.int64], mask: NDArray[np.uint8]) -> int:

@@ -35,8 +35,8 @@ def test_a_focal_length_of_no_lens_is_told(
     how = ["-i", clip, "-c", "copy", "-movflags", "use_metadata_tags", *tags]
     report = match(tmp_path / "a.db", ffmpeg(*how, tmp_path / "phone.mp4"))
     place, lens = report.warnings
-    assert "position '+95.0000+018.0686/' is not a place on Earth" in place
-    assert f"focal length of '{said[:4]}" in lens
+    assert "+95.0000+018.0686/" in place
+    assert said[:4] in lens
     assert lens.isprintable()
     (camera,) = read_cameras(tmp_path / "a.db").values()
     assert not camera.has_prior_focal_length
@@ -47,7 +47,7 @@ def test_tracks_go_before_the_container() -> None:
     assert _initial_focal_length(1400.0, shape, None) == (1400.0, [])
     used, (warning,) = _initial_focal_length(1800.0, shape, None)
     assert used == 1800.0
-    assert "1300 px by the container" in warning
+    assert "1300 px" in warning
     used, (warning,) = _initial_focal_length(None, shape, "RADIAL")
     assert used == 1300.0
     assert "1300 px" in warning

@@ -23,7 +23,7 @@ from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.evaluate import model_poses
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.match import match
+from colmap_av1.match import MatchReport, match
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import Features, extract_features, match_features
 from colmap_av1.matching.links import Links, links_as_tracks
@@ -134,8 +134,13 @@ def test_tracks_of_links_see_no_frame_twice(edges: list[tuple[int, int, int, int
     assert len(tracks.xy) == tracks.offsets[-1]
 
 
-def test_jerk_is_linked(jerk: Path, tmp_path: Path) -> None:
-    report = match(tmp_path / "a.db", jerk)
+@pytest.fixture(scope="module")
+def linked(jerk: Path, tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
+    return match(tmp_path_factory.mktemp("linked") / "a.db", jerk)
+
+
+def test_jerk_is_linked(jerk: Path, linked: MatchReport, tmp_path: Path) -> None:
+    report = linked
     before = LEFT_OUT.start - 1
     assert report.links.frames_of_gaps() == [(before, before + 1)]
     assert report.links.frames_of_gaps("no overlap") == []
@@ -144,16 +149,15 @@ def test_jerk_is_linked(jerk: Path, tmp_path: Path) -> None:
     named = re.search("'frame_(.*).png' and 'frame_(.*).png'", warning)
     assert named is not None
     assert before - 2 < int(named[1]) <= before < int(named[2]) < before + 3
-    assert ("warning", warning) in [(f.severity, f.text) for f in check(tmp_path / "a.db").findings]
+    assert ("warning", warning) in [(f.severity, f.text) for f in check(linked.database).findings]
     alone = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
     assert alone.links.num_images == 0
     assert report.num_pairs > alone.num_pairs
 
 
-def test_links_are_the_same_each_time(jerk: Path, tmp_path: Path) -> None:
-    match(tmp_path / "a.db", jerk)
+def test_links_are_the_same_each_time(jerk: Path, linked: MatchReport, tmp_path: Path) -> None:
     match(tmp_path / "b.db", jerk)
-    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
+    assert linked.database.read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
 def test_nothing_is_decoded_where_motion_connects_all(
@@ -344,8 +348,6 @@ def test_camera_too_fast_for_motion_is_linked(shared: Path, tmp_path: Path) -> N
     assert len(report.links.frames_of_gaps("contradicted")) > 12
     assert check(tmp_path / "a.db").num_connected_images == 37
     # No focal length is known, and what the camera flies over is flat.
-    for seed in range(2):
-        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, extract_colors=False)
-        (tmp_path / f"{seed}").mkdir()
-        where = tmp_path / "a.db", tmp_path, tmp_path / f"{seed}"
-        assert pycolmap.incremental_mapping(*where, options)[0].num_reg_images() == 37
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
+    models = pycolmap.incremental_mapping(tmp_path / "a.db", tmp_path, tmp_path / "model", options)
+    assert models[0].num_reg_images() == 37

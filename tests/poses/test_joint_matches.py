@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from databases import keypoints_of
 from dense_scene import SCENE, Truth
 from scipy.spatial import cKDTree
 
@@ -53,10 +54,7 @@ def mapped(database: Path, images: Path) -> pycolmap.Reconstruction:
 
 
 def num_keypoints(database: Path) -> dict[str, int]:
-    with sqlite3.connect(database) as connection:
-        return dict(
-            connection.execute("SELECT name, rows FROM images JOIN keypoints USING (image_id)")
-        )
+    return {name: len(xy) for name, xy in keypoints_of(database).items()}
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> Non
 
 def test_mapper_that_fails(tmp_path: Path) -> None:
     (tmp_path / "no.db").write_bytes(b"no database")
-    with pytest.raises(ModelError, match=r"status 1 \(.*\): .*log says where"):
+    with pytest.raises(ModelError, match="log"):
         run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
     assert (tmp_path / "log").stat().st_size > 0
 
@@ -168,7 +168,7 @@ def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        with pytest.raises(ModelError, match="was not written to its end: see that the disk has"):
+        with pytest.raises(ModelError, match="disk"):
             mapper_module.adjust_model(
                 tmp_path / "model",
                 refine_intrinsics=False,

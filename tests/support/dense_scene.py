@@ -27,11 +27,6 @@ OPTIONS = ReconstructOptions(
     mapping=MapperOptions(pose_tracks_per_image=300, pose_spacing=24.0),
     triangulate=TriangulateOptions(points="survey"),
 )
-# Of `reconstruct` on the clip, as they are resumed.
-STAGES = (
-    *("tracks", "matches", "poses", "resection", "moving", "adjustment", "far_views"),
-    *("place", "model"),
-)
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def test_one_run_at_a_time(tmp_path: Path) -> None:
             pass
         with open_stages(tmp_path / "other", "a"):
             pass
-    with pytest.raises(OptionError, match="is the output of a:"), open_stages(output, "b"):
+    with pytest.raises(OptionError, match="output of a"), open_stages(output, "b"):
         pass
     kill_while_writing("whole_file", output / "report.json")
     with open_stages(output, "a"):

@@ -106,7 +106,7 @@ def test_ignored_signal_during_the_imports(tmp_path: Path) -> None:
     words = [IGNORING, "-m", "colmap_av1", "info", "--video", "none.mp4"]
     status, said = end_while_importing(words, signal.SIGINT, tmp_path, "numpy.version")
     assert status == 2
-    assert "none.mp4: no such file" in said
+    assert "none.mp4" in said
 
 
 def test_handlers_within_and_after() -> None:

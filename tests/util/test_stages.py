@@ -257,7 +257,7 @@ def test_code_counts_compiled_or_not_whatever_its_room(
         report = digest("evaluate/report")
         (tmp_path / "motion" / "reading.py").write_bytes(b"3")
         assert digest("evaluate/report") == report
-        with pytest.raises(ValueError, match="nowhere: no folder of"):
+        with pytest.raises(ValueError, match="nowhere"):
             digest("nowhere")
     finally:
         code_digest.cache_clear()
@@ -278,9 +278,9 @@ def test_values_are_told_apart() -> None:
     assert len({digest_of([value]) for value in values}) == len(values)
     assert digest_of([{"a": 1, "b": 2}]) == digest_of([{"b": 2, "a": 1}])
     assert digest_of([Path("a") / "b"]) == digest_of([str(Path("a/b"))])
-    with pytest.raises(TypeError, match="give a plain value"):
+    with pytest.raises(TypeError, match="plain"):
         digest_of([object()])
-    with pytest.raises(TypeError, match="give a plain value"):
+    with pytest.raises(TypeError, match="plain"):
         digest_of([np.arange(3)])
 
 
@@ -337,7 +337,7 @@ def test_a_file_of_a_user_in_the_way_is_refused(tmp_path: Path) -> None:
     run_with(output, 1, ["images/0.png"])
     (output / "images" / "1.png").write_text("mine")
     before = texts(output)
-    with pytest.raises(OptionError, match=r"images/1.png: is in the way"):
+    with pytest.raises(OptionError, match=r"images/1\.png"):
         run_with(output, 2, ["images/0.png", "images/1.png"])
     assert texts(output) == before
     (output / "images" / "1.png").unlink()

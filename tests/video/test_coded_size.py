@@ -137,7 +137,8 @@ def test_folder_of_a_downscaled_video_has_its_size(courtyard: Path, tmp_path: Pa
     options = ReconstructOptions(match=match_options)
     report = reconstruct(courtyard, tmp_path / "out", options=options)
     assert report.num_registered == NUM_FRAMES
-    assert report.conversion == "h264 at 640x360 to AV1 at 320x180 by libaom-av1"
+    assert report.conversion is not None
+    assert "320x180" in report.conversion
     assert report.seconds["refinement"] > 0
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     (pinhole,) = model.cameras.values()

@@ -60,7 +60,7 @@ def test_line_cuts_views(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None
 def test_shape_alone_is_a_hint() -> None:
     video = Path("a.mp4")
     (told,) = hint(video, None, (3840, 1920))
-    assert "if they are equirectangular, cut views from it: for yaw in 0 90 180 -90; do" in told
+    assert "equirectangular" in told
     assert hint(video, None, (3840, 2160)) == []
     assert hint(video, None, (256, 128)) == []
     assert hint(video, 0, (3840, 1920)) == []

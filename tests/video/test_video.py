@@ -347,7 +347,7 @@ def test_audio_with_a_cover_picture(
         *("-c:v", "copy", "-disposition:v:0", "attached_pic", tmp_path / f"tone.{ending}"),
     )
     for read in (open_stream, read_video):
-        with pytest.raises(VideoError, match="cover picture, no video"):
+        with pytest.raises(VideoError, match="cover"):
             read(tone)
 
 

@@ -1,0 +1,21 @@
+"""What COLMAP's own reader finds in a database."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+
+def keypoints_of(database: Path) -> dict[str, NDArray[np.float32]]:
+    """Keypoints [n, 2] in pixels by the names of the images, in order of their ids."""
+    with tempfile.TemporaryDirectory() as folder:
+        # pycolmap brings a database to its own layout.
+        copy = shutil.copyfile(database, Path(folder) / "copy.db")
+        with pycolmap.Database.open(copy) as opened:
+            images = sorted(opened.read_all_images(), key=lambda image: int(image.image_id))
+            return {i.name: opened.read_keypoints(i.image_id)[:, :2] for i in images}
