@@ -424,7 +424,8 @@ def test_pictures_that_contradict_the_poses(
     """Places seen again are linked then, unless there must be no links."""
     monkeypatch.setattr("colmap_av1.poses.long_range._FAR_APART", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
-    (copy / ".stages" / "far_views.json").unlink()
+    for name in ("far_views", "seams"):
+        (copy / ".stages" / f"{name}.json").unlink()
     found = reconstruct(SCENE, copy, options=options)
     assert found.links.looked_again == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")

@@ -111,14 +111,12 @@ class ReconstructOptions(Options):
     place: PlaceOptions = part(PlaceOptions())
     undistort: bool = option(
         True,
-        "write undistorted images with PINHOLE cameras; 0: write the pictures as they are, nothing "
-        "cut at the edges, with the estimated camera model, for trainers that render distortion",
-        common=True,
+        "write undistorted images with PINHOLE cameras; 0: write the original pictures with the "
+        "estimated camera model, for trainers that render distortion",
     )
     image_type: Literal["jpg", "png"] | None = option(
         None,
         "format of the images of videos; None: that of image_name, else jpg; photos keep theirs",
-        common=True,
     )
     moving: Literal["keep", "drop", "mask"] = option(
         "drop",

@@ -155,5 +155,5 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
 def test_files_that_must_not_be_read(
     name: str, read: Callable[[Path], object], others: Path
 ) -> None:
-    with pytest.raises(ColmapAv1Error, match=f"{name}: no permission"):
+    with pytest.raises(ColmapAv1Error, match=f"{name}: .*permission"):
         read(others)
