@@ -394,11 +394,10 @@ def _view_page(namespace: argparse.Namespace) -> None:
             report = read_report(folder)
         except ModelError as error:
             print_warning(f"{error}; the page shows the model alone")
-    rows = (
-        reports.reconstruct_rows(report)
-        if report
-        else reports.model_rows(check_model(read_model(model)))
-    )
+    if report is not None:
+        rows = reports.reconstruct_rows(report)
+    else:
+        rows = reports.model_rows(check_model(read_model(model)))
     write_model_page(
         model,
         namespace.output,
@@ -593,8 +592,8 @@ COMMANDS = {
         (
             _path(
                 "output",
-                "an .mp4 file or a folder for PNG files (video), a .html file (model), else a .png or "
-                ".jpg file",
+                "an .mp4 file or a folder for PNG files (video), an .html page (model), else a "
+                ".png or .jpg file",
                 required=False,
             ),
             _OVERWRITE,

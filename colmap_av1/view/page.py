@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -19,13 +19,15 @@ from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.gaps import Gap
-from colmap_av1.reconstruct import ReconstructReport, VideoTimeline
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import check_new_file, whole_file
 from colmap_av1.util.pages import render_page
 from colmap_av1.util.spread import evenly_spread
-from colmap_av1.view.scene import Scene, read_scene
+from colmap_av1.view.scene import Scene, normalised, read_scene
+
+if TYPE_CHECKING:  # slow to import
+    from colmap_av1.matching.gaps import Gap
+    from colmap_av1.reconstruct import ReconstructReport, VideoTimeline
 
 _Floats = NDArray[np.float64]
 Figures = Sequence[tuple[str, str]]
@@ -41,8 +43,12 @@ _PICTURE_QUALITY = 80
 _FARTHEST = 3.0
 # Longer side of a drawn camera's picture, in half diagonals of the scene.
 _CAMERA_SIZE = 0.045
-# Where a page looks from, in half diagonals from the middle: right, forward, up.
-_EYE = (-0.35, -1.35, 0.75)
+# Where a page looks from, as seen from the middle: right, forward, up.
+_EYE = (-0.3, -1.2, 0.6)
+# Half of the angle that plotly's cameras see vertically, as a tangent, and width by height.
+_HALF_VIEW, _ASPECT = 0.414, 1.9
+# Share of the points that are seen from there; a few stray ones would move it far away.
+_SEEN = 0.97
 # How far before its camera a view looks, in half diagonals.
 _AHEAD = 0.5
 # The corners of a drawn camera's picture and its centre, the fifth, as lines; a NaN ends a line.
@@ -219,6 +225,24 @@ class _View:
         far = np.linalg.norm(at, axis=1, keepdims=True)
         return np.asarray(at * np.minimum(1.0, _FARTHEST / np.maximum(far, 1e-9)), np.float32)
 
+    def eye(self) -> list[float]:
+        """Where all cameras and nearly all points of observable depth are seen from."""
+        back = normalised(np.array(_EYE))
+        right = normalised(np.cross([0.0, 0.0, 1.0], back))
+        axes = np.stack([right, np.cross(back, right), back])
+        scene = self.scene
+        points, cameras = (
+            np.abs(at[:, :2]) / (_HALF_VIEW * np.array([_ASPECT, 1.0])) + at[:, 2:]
+            for at in (
+                self.place(scene.points[scene.observable]) @ axes.T,
+                self.place(scene.centres) @ axes.T,
+            )
+        )
+        distance = cameras.max()
+        if len(points):
+            distance = max(distance, np.quantile(points.max(axis=1), _SEEN))
+        return (back * distance).tolist()
+
     def camera(self, image: ModelImage) -> dict[str, Any]:
         """Where plotly looks at the scene from the camera of an image."""
         centre = -image.cam_from_world[:, :3].T @ image.cam_from_world[:, 3]
@@ -243,8 +267,8 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
         "key images": [image for image in images if image.name in keys],
     }
     traces = [
-        _points(view, "points", shown[observable], {"size": 1.8}),
-        _points(view, "sky and assumed depth", shown[~observable], {"size": 1.3, "opacity": 0.3}),
+        *_points(view, "points", shown[observable], {"size": 1.2}),
+        *_points(view, "sky and assumed depth", shown[~observable], {"size": 1, "opacity": 0.3}),
         {
             **_columns(view.place(scene.centres)),
             "type": "scatter3d",
@@ -255,8 +279,8 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
             "text": [image.name for image in scene.images],
             "hovertemplate": "%{text}<extra></extra>",
         },
-        _cameras(view, "cameras", groups["cameras"], "#7fb2e8"),
-        _cameras(view, "key images", groups["key images"], "#f59e0b"),
+        *_cameras(view, "cameras", groups["cameras"], "#7fb2e8"),
+        *_cameras(view, "key images", groups["key images"], "#f59e0b"),
     ]
     axis = {"visible": False, "range": [-_FARTHEST, _FARTHEST]}
     # One unit of plotly's cameras is one half diagonal.
@@ -266,7 +290,7 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
             **{f"{name}axis": axis for name in "xyz"},
             "aspectmode": "manual",
             "aspectratio": _xyz((ratio, ratio, ratio)),
-            "camera": {"eye": _xyz(_EYE), "center": _xyz((0, 0, 0)), "up": _xyz((0, 0, 1))},
+            "camera": {"eye": _xyz(view.eye()), "center": _xyz((0, 0, 0)), "up": _xyz((0, 0, 1))},
             "dragmode": "turntable",
         },
         "paper_bgcolor": "#121417",
@@ -274,7 +298,7 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "legend": {"x": 0.01, "y": 0.99, "itemsizing": "constant", "bgcolor": "rgba(0,0,0,0.4)"},
     }
-    figure = plotly.graph_objects.Figure([t for t in traces if t], layout)
+    figure = plotly.graph_objects.Figure(traces, layout)
     figure.layout.template = None  # two kilobytes for other kinds of plots
     return str(
         plotly.io.to_html(
@@ -294,33 +318,44 @@ def _columns(at: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
 
 def _points(
     view: _View, name: str, rows: NDArray[np.int64], marker: dict[str, float]
-) -> dict[str, Any] | None:
+) -> list[dict[str, Any]]:
     if len(rows) == 0:
-        return None
+        return []
     red, green, blue = view.scene.colours[rows].astype(np.int64).T
     colours = [f"#{colour:06x}" for colour in (red << 16 | green << 8 | blue).tolist()]
-    return {
+    trace = {
         **_columns(view.place(view.scene.points[rows])),
         "type": "scatter3d",
         "mode": "markers",
-        "name": name,
+        "legendgroup": name,
+        "showlegend": False,
         "marker": {"color": colours, **marker},
         "hoverinfo": "skip",
     }
+    # The legend would show the colour of the first point.
+    in_legend = {
+        **_columns(np.full((1, 3), np.nan, np.float32)),
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": name,
+        "legendgroup": name,
+        "marker": {"color": "#e5e7eb", "opacity": marker.get("opacity", 1)},
+    }
+    return [trace, in_legend]
 
 
 def _cameras(
     view: _View, name: str, images: Sequence[ModelImage], colour: str
-) -> dict[str, Any] | None:
+) -> list[dict[str, Any]]:
     if not images:
-        return None
+        return []
     parts = []
     for image in images:
         corners = view.scene.corners(image, _CAMERA_SIZE * view.radius)
         centre = -image.cam_from_world[:, :3].T @ image.cam_from_world[:, 3]
         at = view.place(np.vstack([corners, centre]))
         parts.append(np.vstack([at, np.full(3, np.nan, np.float32)])[list(_LINES)])
-    return {
+    trace = {
         **_columns(np.concatenate(parts)),
         "type": "scatter3d",
         "mode": "lines",
@@ -328,6 +363,7 @@ def _cameras(
         "line": {"color": colour, "width": 2},
         "hoverinfo": "skip",
     }
+    return [trace]
 
 
 def _picture(view: _View, image: ModelImage, folder: Path) -> _Picture:
@@ -396,7 +432,7 @@ def _commands(model: Path, report: ReconstructReport | None) -> list[tuple[str, 
         return [("Add dense points from the video", shlex.join([*command, "--output", "OUTPUT"]))]
     folder = shlex.quote(str(model.parent.parent))
     return [
-        ("Train with Brush", f"brush_app {folder} --with-viewer"),
+        ("Train with Brush", f"brush {folder} --with-viewer"),
         (
             "Train with nerfstudio",
             f"ns-train splatfacto --data {folder} colmap --colmap-path sparse/0",
