@@ -49,6 +49,7 @@ _EYE = (-0.3, -1.2, 0.6)
 _HALF_VIEW, _ASPECT = 0.414, 1.9
 # Share of the points that are seen from there; a few stray ones would move it far away.
 _SEEN = 0.97
+_MARGIN = 1.06
 # How far before its camera a view looks, in half diagonals.
 _AHEAD = 0.5
 # The corners of a drawn camera's picture and its centre, the fifth, as lines; a NaN ends a line.
@@ -241,7 +242,7 @@ class _View:
         distance = cameras.max()
         if len(points):
             distance = max(distance, np.quantile(points.max(axis=1), _SEEN))
-        return (back * distance).tolist()
+        return [float(x) for x in back * distance * _MARGIN]
 
     def camera(self, image: ModelImage) -> dict[str, Any]:
         """Where plotly looks at the scene from the camera of an image."""

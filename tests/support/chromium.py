@@ -22,12 +22,10 @@ class Shown:
 
     Attributes:
         picture: uint8 [height, width, 3] BGR screenshot.
-        dom: the document after its scripts ran.
         errors: lines of the console that report an error.
     """
 
     picture: NDArray[np.uint8]
-    dom: str
     errors: list[str]
 
 
@@ -46,10 +44,10 @@ def show(page: Path, folder: Path) -> Shown:
         *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"),
         # No name leads anywhere: there is no network.
         *("--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr"),
-        *(f"--window-size={_SIZE[0]},{_SIZE[1]}", "--virtual-time-budget=10000"),
+        *(f"--window-size={_SIZE[0]},{_SIZE[1]}", "--virtual-time-budget=3000"),
     ]
     done = subprocess.run(
-        [*words, "--dump-dom", f"--screenshot={screenshot}", page.as_uri()],
+        [*words, f"--screenshot={screenshot}", page.as_uri()],
         capture_output=True,
         text=True,
         check=True,
@@ -59,6 +57,5 @@ def show(page: Path, folder: Path) -> Shown:
     harmless = "willReadFrequently"  # advice of Chromium's on the speed of reading a canvas
     return Shown(
         picture=np.asarray(cv2.imread(str(screenshot)), np.uint8),
-        dom=done.stdout,
         errors=[line for line in console if harmless not in line],
     )
