@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import shutil
@@ -114,7 +113,9 @@ def test_large_clouds_are_shown_in_part(
 
 def test_a_report_is_read_as_it_was_written(made: ReconstructReport) -> None:
     report = read_report(made.output)
-    assert dataclasses.asdict(report) == dataclasses.asdict(replace(made, resumed=report.resumed))
+    # A later run that finds all stages finished has times of its own.
+    own_run = {name: getattr(report, name) for name in ("resumed", "seconds", "cpu_seconds")}
+    assert report == replace(made, **own_run)
     (own,) = report.timelines
     assert len(own.images) == len(own.frames) == made.num_images
     assert len(own.key_images) == made.num_key_images
@@ -166,7 +167,7 @@ def test_points_of_little_parallax_and_without_an_error_have_no_observable_depth
     assert has_observable_depth(model).all()
     first, second = sorted(model.points3D)[:2]
     model.points3D[first].error = -1.0
-    model.points3D[second].xyz = 1000 * model.points3D[second].xyz
+    model.points3D[second].xyz = 1e5 * model.points3D[second].xyz
     np.testing.assert_array_equal(np.flatnonzero(~has_observable_depth(model)), [0, 1])
     for point in model.points3D.values():
         point.error = -1.0
