@@ -21,8 +21,9 @@ _FRAMED = (0.02, 0.98)
 def has_observable_depth(model: pycolmap.Reconstruction) -> NDArray[np.bool_]:
     """Whether the images of a pycolmap.Reconstruction determine the distance of each point.
 
-    The angle between the rays of its first, middle and last observation says so. The depth of a
-    point without a reprojection error is assumed, unless no point of the model has one.
+    The angle between the rays of its first, middle and last observation determines that. The depth
+    of a point without a reprojection error or without observations is assumed, unless no point of
+    the model has any.
 
     Returns:
         bool [num_points], in the order of the points' ids.
@@ -30,25 +31,30 @@ def has_observable_depth(model: pycolmap.Reconstruction) -> NDArray[np.bool_]:
     images = list(posed_images(model).values())
     index = {image.image_id: i for i, image in enumerate(images)}
     points = [model.points3D[i] for i in sorted(model.points3D)]
-    view = np.array(
-        [
-            index[p.track.element(k).image_id]
-            for p in points
-            for k in (0, p.track.length() // 2, p.track.length() - 1)
-        ],
-        np.int64,
-    )
-    error = np.array([p.error for p in points], np.float64)
+    views = [[index[i] for i in _three_images(p.track) if i in index] for p in points]
+    lengths = np.array([len(own) for own in views], np.int64)
+    rows = np.flatnonzero(lengths)
+    if len(rows) == 0:
+        return np.ones(len(points), np.bool_)
+    error = np.array([points[i].error for i in rows], np.float64)
     is_known = error >= 0
     unsure = distance_uncertainty(
-        np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        np.array([points[i].xyz for i in rows], np.float64),
         np.maximum(error, 0.0),
-        3 * np.arange(len(points) + 1, dtype=np.int64),
+        np.concatenate([[0], np.cumsum(lengths[rows])]).astype(np.int64),
         centres=camera_centres(np.array([image.cam_from_world for image in images])),
-        view=view,
+        view=np.array([view for own in views for view in own], np.int64),
         focal=np.array([model.cameras[i.camera_id].mean_focal_length() for i in images]),
     )
-    return np.asarray((unsure < _OBSERVABLE) & (is_known | ~is_known.any()))
+    observable = np.zeros(len(points), np.bool_)
+    observable[rows] = (unsure < _OBSERVABLE) & (is_known | ~is_known.any())
+    return observable
+
+
+def _three_images(track: pycolmap.Track) -> list[int]:
+    """The images of the first, the middle and the last observation; none of an empty track."""
+    length = track.length()
+    return [int(track.element(k).image_id) for k in (0, length // 2, length - 1) if 0 <= k < length]
 
 
 def framed_box(
