@@ -26,6 +26,7 @@ from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.observable import has_observable_depth
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
 from colmap_av1.util.files import check_apart
@@ -381,7 +382,12 @@ def _measure(
             column = replace(column, poses=pose_errors(poses, reference.poses))
         poses = similarity.apply_to_poses(poses)
     cloud = Cloud(
-        points, _colours(model), poses, _focal_length(model), is_aligned=similarity is not None
+        points=points,
+        colours=_colours(model),
+        observable=has_observable_depth(model),
+        cam_from_world=poses,
+        focal_length=_focal_length(model),
+        is_aligned=similarity is not None,
     )
     return column, cloud
 

@@ -11,9 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cattrs
+import numpy as np
+
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
 from colmap_av1.geometry.track_points import LEAST_AGREEING
-from colmap_av1.images.image_set import ShownVideo
+from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
@@ -41,10 +44,34 @@ from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
+_REPORT = "report.json"
 # Share of pairs that a homography explains from which on depth is doubtful.
 _MANY_FLAT = 0.9
 # Images without a pose that a warning names.
 _NUM_NAMED = 4
+
+
+@dataclass(frozen=True)
+class VideoTimeline:
+    """The images of a video along its frames.
+
+    Attributes:
+        name: the folder of its images; '' of a lone video.
+        num_frames: its shown frames.
+        frame_rate: frames per second; None where unknown.
+        images: names of its images, in the order of their frames.
+        frames: the frame of each image, counted in the video from 0.
+        key_images: names of those that were mapped.
+        not_registered: names of those that have a pose in no model.
+    """
+
+    name: str
+    num_frames: int
+    frame_rate: float | None
+    images: tuple[str, ...]
+    frames: tuple[int, ...]
+    key_images: tuple[str, ...]
+    not_registered: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -88,6 +115,7 @@ class ReconstructReport:
         seconds: wall time of each stage of this run.
         cpu_seconds: processor time of each, of all threads and processes.
         warnings: what the user should know.
+        timelines: the images of each video.
     """
 
     output: Path
@@ -121,6 +149,7 @@ class ReconstructReport:
     seconds: dict[str, float]
     cpu_seconds: dict[str, float]
     warnings: tuple[str, ...]
+    timelines: tuple[VideoTimeline, ...]
 
 
 @one_blas_thread()
@@ -295,7 +324,29 @@ def _run_stages(run: Run) -> ReconstructReport:
             *placed.result.place_warnings,
             *_warnings(posed, model, len(image_set.sequence), further, unplaced),
         ),
+        timelines=_timelines(run, image_set, matches.key_images, unplaced),
     )
+
+
+def _timelines(
+    run: Run, image_set: ImageSet, key_images: Sequence[int], unplaced: Sequence[str]
+) -> tuple[VideoTimeline, ...]:
+    keys, left = {image_set.images.names[i] for i in key_images}, set(unplaced)
+    timelines = []
+    for number, video in enumerate(run.inputs.videos):
+        own = image_set.of_video(number)
+        timelines.append(
+            VideoTimeline(
+                name=image_set.videos[number],
+                num_frames=int(np.diff(image_set.first_frame)[number]),
+                frame_rate=video.frame_rate,
+                images=tuple(own.names),
+                frames=tuple(own.frames.tolist()),
+                key_images=tuple(name for name in own.names if name in keys),
+                not_registered=tuple(name for name in own.names if name in left),
+            )
+        )
+    return tuple(timelines)
 
 
 def _warnings(
@@ -344,9 +395,24 @@ def _warnings(
     return warnings
 
 
+def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
+    """Read the report of an earlier run from its folder.
+
+    Raises:
+        ModelError: there is none, or it is damaged or of another version.
+    """
+    path = Path(output) / _REPORT
+    try:
+        return cattrs.structure(json.loads(path.read_text()), ReconstructReport)
+    except (OSError, ValueError, TypeError, KeyError, cattrs.BaseValidationError) as error:
+        raise ModelError(
+            f"{path}: missing, damaged or of another version: run reconstruct again"
+        ) from error
+
+
 def _write_report(report: ReconstructReport) -> None:
     text = json.dumps(dataclasses.asdict(report), indent=1, default=str)
-    path = report.output / "report.json"
+    path = report.output / _REPORT
     try:
         with whole_file(path) as partial:
             partial.write_text(text + "\n")

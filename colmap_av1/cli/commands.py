@@ -25,7 +25,7 @@ from colmap_av1.cli.terminal import (
     print_warning,
     progress_bars,
 )
-from colmap_av1.errors import EvaluationError, OptionError
+from colmap_av1.errors import EvaluationError, ModelError, OptionError
 from colmap_av1.options import (
     CompareOptions,
     DensifyOptions,
@@ -169,6 +169,13 @@ def _map(namespace: argparse.Namespace) -> None:
 
 
 def _reconstruct(namespace: argparse.Namespace) -> None:
+    page = None
+    if namespace.report:
+        from colmap_av1.view.page import check_page
+
+        output = Path(namespace.output)
+        page = output.with_name(f"{output.resolve().name}.html")
+        check_page(page, overwrite=namespace.overwrite)
     with progress_bars(namespace.quiet) as report:
         result = colmap_av1.reconstruct(
             namespace.video,
@@ -179,8 +186,20 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
             options=given(namespace, ReconstructOptions),
             progress=report,
         )
+    rows = reports.reconstruct_rows(result)
+    if page is not None:
+        from colmap_av1.view.page import write_model_page
+
+        write_model_page(
+            result.output / "sparse" / "0",
+            page,
+            figures=reports.without_seconds(rows),
+            report=result,
+            overwrite=namespace.overwrite,
+        )
+        rows.append(("page", str(page)))
     write_report_json(namespace, result)
-    print_result(namespace, reports.reconstruct_rows(result), result.warnings)
+    print_result(namespace, rows, result.warnings)
 
 
 def _densify(namespace: argparse.Namespace) -> None:
@@ -333,6 +352,9 @@ def _view(namespace: argparse.Namespace) -> None:
     if namespace.output is None:
         raise OptionError("nowhere to draw: give --output")
     output, overwrite = namespace.output, namespace.overwrite
+    if namespace.model is not None and Path(output).suffix.lower() == ".html":
+        _view_page(namespace)
+        return
     if namespace.model is not None:
         check_picture(output, [namespace.model], overwrite=overwrite)
         write_picture(view_model(namespace.model), output, overwrite=overwrite)
@@ -356,6 +378,34 @@ def _view(namespace: argparse.Namespace) -> None:
             overwrite=overwrite,
         )
     print_result(namespace, [("frames", str(count)), ("output", output)])
+
+
+def _view_page(namespace: argparse.Namespace) -> None:
+    from colmap_av1.check.model import check_model
+    from colmap_av1.geometry.colmap_model import read_model
+    from colmap_av1.reconstruct import read_report
+    from colmap_av1.view.page import check_page, write_model_page
+
+    model, report = Path(namespace.model), None
+    check_page(namespace.output, [model], overwrite=namespace.overwrite)
+    folder = model.resolve().parents[1]
+    if model.resolve() == folder / "sparse" / "0" and (folder / "report.json").exists():
+        try:
+            report = read_report(folder)
+        except ModelError as error:
+            print_warning(f"{error}; the page shows the model alone")
+    if report is not None:
+        rows = reports.reconstruct_rows(report)
+    else:
+        rows = reports.model_rows(check_model(read_model(model)))
+    write_model_page(
+        model,
+        namespace.output,
+        figures=reports.without_seconds(rows),
+        report=report,
+        image_path=namespace.image_path,
+        overwrite=namespace.overwrite,
+    )
 
 
 def _serve(namespace: argparse.Namespace) -> None:
@@ -409,7 +459,12 @@ COMMANDS = {
             *_videos(_ANY_VIDEO),
             _path("output", "folder for images/ and sparse/0/; that of an earlier run is resumed"),
             _GAUSSIANS,
-            _flag("overwrite", "replace a file of --gaussians that exists"),
+            _flag(
+                "report",
+                "also write a page to look at, OUTPUT.html, beside the folder (needs the viewer "
+                "extra)",
+            ),
+            _flag("overwrite", "replace a file of --gaussians or --report that exists"),
             _REPORT_JSON,
         ),
         (ReconstructOptions,),
@@ -537,11 +592,12 @@ COMMANDS = {
         (
             _path(
                 "output",
-                "an .mp4 file or a folder for PNG files (video), else a .png or .jpg file",
+                "an .mp4 file or a folder for PNG files (video), an .html page (model), else a "
+                ".png or .jpg file",
                 required=False,
             ),
             _OVERWRITE,
-            _optional_path("image_path", "folder of the database's images"),
+            _optional_path("image_path", "folder of the images of the database, or of the model"),
             Argument(
                 ("--pair",),
                 {

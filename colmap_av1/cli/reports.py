@@ -351,3 +351,8 @@ def _gaussians_rows(path: Path | None) -> Rows:
 def _seconds_rows(seconds: dict[str, float]) -> Rows:
     rows = [(f"seconds, {stage}", f"{s:.2f}") for stage, s in seconds.items()]
     return [*rows, ("seconds, total", f"{sum(seconds.values()):.2f}")]
+
+
+def without_seconds(rows: Rows) -> Rows:
+    """The rows that describe a result, without the time it took."""
+    return [row for row in rows if not row[0].startswith("seconds")]

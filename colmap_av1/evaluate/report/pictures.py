@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.observable import framed_box
 
 _Image = NDArray[np.uint8]
 
@@ -32,8 +33,8 @@ _OVERSAMPLING = 2
 # Distance of the viewpoint behind and above the camera, in median depths of the points, and its
 # tilt in degrees.
 _BEHIND, _ABOVE, _TILT = 0.25, 0.15, 5.0
-# Quantiles of the points that a plan shows.
-_SHOWN = (0.03, 0.97)
+# Brightness that points of assumed depth keep.
+_FAINT = 0.35
 _WIDTH = 640
 _STYLE = {
     "font.size": 9,
@@ -271,7 +272,7 @@ def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
 
     picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
     pixel, depth = project(cloud.points)
-    _splat(picture, pixel, depth, cloud.colours, depth > 0.02 * view.depth)
+    _splat(picture, pixel, depth, cloud, depth > 0.02 * view.depth)
     centres = camera_centres(cloud.cam_from_world)
     centres = centres[np.isfinite(centres).all(1)]
     pixel, depth = project(centres)
@@ -281,6 +282,8 @@ def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
 
 def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
     """Points and camera path from above: uint8 BGR.
+
+    It frames the cameras and the points of observable depth; the others are dark.
 
     Args:
         cloud: the cloud.
@@ -295,14 +298,12 @@ def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
     forward /= np.linalg.norm(forward)
     plane = np.stack([np.cross(down, forward), -forward])
     width, height = size[0] * _OVERSAMPLING, size[1] * _OVERSAMPLING
-    seen, path = like.points @ plane.T, camera_centres(poses) @ plane.T
-    low, high = np.quantile(seen, _SHOWN, axis=0) if len(seen) else (path[0], path[0])
-    low, high = np.minimum(low, path.min(0)), np.maximum(high, path.max(0))
+    low, high = framed_box(like.points @ plane.T, like.observable, camera_centres(poses) @ plane.T)
     scale = 0.94 * float(np.min((width, height) / np.maximum(high - low, 1e-9)))
     origin = np.array([width, height]) / 2 - scale * (low + high) / 2
     picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
     pixel = np.floor(cloud.points @ plane.T * scale + origin).astype(np.int64)
-    _splat(picture, pixel, cloud.points @ down, cloud.colours, np.ones(len(pixel), dtype=bool))
+    _splat(picture, pixel, cloud.points @ down, cloud, np.ones(len(pixel), dtype=bool))
     centres = camera_centres(cloud.cam_from_world)
     centres = centres[np.isfinite(centres).all(1)]
     _draw_path(picture, np.floor(centres @ plane.T * scale + origin).astype(np.int64))
@@ -313,18 +314,20 @@ def _splat(
     picture: _Image,
     pixel: NDArray[np.int64],
     depth: NDArray[np.float64],
-    colours: _Image,
+    cloud: Cloud,
     shown: NDArray[np.bool_],
 ) -> None:
-    """Draw points as squares, near ones over far ones."""
+    """Draw points as squares, near ones over far ones; those of assumed depth under the others."""
     height, width = picture.shape[:2]
     side = _OVERSAMPLING + 2
     shown = shown & (pixel >= 0).all(1) & (pixel < (width - side, height - side)).all(1)
-    order = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
+    order = np.flatnonzero(shown)[np.lexsort((-depth[shown], cloud.observable[shown]))]
+    brightness = np.where(cloud.observable[order], 1.0, _FAINT)[:, None]
+    colours = (cloud.colours[order, ::-1] * brightness).astype(np.uint8)
     offsets = np.mgrid[:side, :side].reshape(2, -1).T
     # NumPy assigns in order, so the last and nearest point of a pixel remains.
     x, y = (pixel[order][:, None] + offsets).reshape(-1, 2).T
-    picture[y, x] = colours[order, ::-1].repeat(len(offsets), axis=0)
+    picture[y, x] = colours.repeat(len(offsets), axis=0)
 
 
 def _draw_path(picture: _Image, pixel: NDArray[np.int64]) -> None:

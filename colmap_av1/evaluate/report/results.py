@@ -58,6 +58,7 @@ class Cloud:
     Attributes:
         points: float64 [n, 3].
         colours: uint8 [n, 3], red first.
+        observable: bool [n] points of observable depth, see `has_observable_depth`.
         cam_from_world: float64 [num_images, 3, 4], NaN for images without a pose.
         focal_length: focal length of the first camera in pixels.
         is_aligned: whether the coordinates are those of the reference, not the model's own.
@@ -65,6 +66,7 @@ class Cloud:
 
     points: NDArray[np.float64]
     colours: NDArray[np.uint8]
+    observable: NDArray[np.bool_]
     cam_from_world: NDArray[np.float64]
     focal_length: float
     is_aligned: bool
