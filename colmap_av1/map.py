@@ -15,7 +15,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import CheckReport, check
 from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
@@ -24,7 +24,7 @@ from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_writ
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.gaps import Gap, few_matches_warning
+from colmap_av1.matching.gaps import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import FarViews
 from colmap_av1.poses.mapper import map_poses
@@ -111,7 +111,7 @@ def map_database(
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
     check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)
-    num_images, thin_gaps = _check_input(database, image_path)
+    checked = _check_input(database, image_path)
 
     try:
         with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
@@ -124,7 +124,7 @@ def map_database(
                     options,
                     image_path=image_path,
                     log=log,
-                    num_images=num_images,
+                    num_images=checked.num_images,
                     progress=progress,
                 )
                 copy.unlink()
@@ -149,16 +149,17 @@ def map_database(
             found = check_model(model, database=database)
     warnings = (
         *placement.warnings,
-        _missing(num_images, num_registered),
+        _missing(checked.num_images, num_registered),
+        checked.depth.warning,
         # What the model itself shows says more than the matches it is made of.
-        *(found.joint_warnings or (few_matches_warning(thin_gaps),)),
+        *(found.joint_warnings or (few_matches_warning(checked.thin_gaps),)),
         found.far_views.warning() if found.far_views else unreadable,
     )
     return MapReport(
         output=output,
         database=database,
         mapper=options.mapper,
-        num_images=num_images,
+        num_images=checked.num_images,
         num_registered=num_registered,
         place=placement.facts,
         figures=found.figures,
@@ -228,9 +229,11 @@ def _place(
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]]:
-    """Refuse what a mapper would stop at; returns the number of images, and thin gaps."""
+def _check_input(database: Path, image_path: Path) -> CheckReport:
+    """Refuse what a mapper would stop at, or make no model of."""
     checked = check(database)
+    if not checked.depth.is_observable:
+        raise DatabaseError(f"{database}: {checked.depth.warning}")
     stops = [f.text for f in checked.findings if f.severity == "error"]
     if stops:
         raise DatabaseError(
@@ -251,4 +254,4 @@ def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]
             f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database "
             f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
         )
-    return len(images), checked.thin_gaps
+    return checked

@@ -266,6 +266,8 @@ def match(
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
+    if found.depth.warning is not None:
+        notes += (found.depth.warning,)
     # What a database holds already may join the images, too, and joint matches are fewer where all
     # others are the same tracks in more images.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
@@ -442,6 +444,8 @@ def _match_images(
             reason = str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
+    if not found.depth.is_observable:
+        return found
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
 

@@ -41,8 +41,6 @@ from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
-# Share of pairs that a homography explains from which on depth is doubtful.
-_MANY_FLAT = 0.9
 # Images without a pose that a warning names.
 _NUM_NAMED = 4
 
@@ -325,12 +323,8 @@ def _warnings(
         warnings.append(
             f"the model holds no image of {names}: reconstruct what shows another scene apart"
         )
-    if matches.num_flat_pairs > _MANY_FLAT * matches.num_verified_pairs:
-        warnings.append(
-            f"in {matches.num_flat_pairs} of {matches.num_verified_pairs} pairs the camera only "
-            "rotates or the scene is flat: the depth of the points may be unreliable; film while "
-            "moving sideways"
-        )
+    if matches.depth.warning is not None:
+        warnings.append(matches.depth.warning)
     if posed.far_views is not None and posed.far_views.result.far_views_warning is not None:
         warnings.append(posed.far_views.result.far_views_warning)
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
