@@ -21,6 +21,7 @@ from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
+from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
@@ -151,6 +152,7 @@ def map_database(
         *placement.warnings,
         _missing(checked.num_images, num_registered),
         checked.depth.warning,
+        focal_length_warning(model.cameras.values()),
         # What the model itself shows says more than the matches it is made of.
         *(found.joint_warnings or (few_matches_warning(checked.thin_gaps),)),
         found.far_views.warning() if found.far_views else unreadable,

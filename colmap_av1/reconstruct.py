@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.geometry.cameras import focal_length_warning
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
 from colmap_av1.images.image_set import ShownVideo
 from colmap_av1.images.inputs import paths_of, read_inputs
@@ -247,6 +249,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     further, unplaced = further_models(run, posed, image_set)
     assert posed.far_views is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
+    implausible = focal_length_warning(read_posed_model(run.stages / poses.poses).cameras.values())
     long_range = posed.far_views.result
     return ReconstructReport(
         output=run.output,
@@ -290,6 +293,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *run.inputs.with_names([stage.result.warnings for stage in tracked]),
             *matches.link_warnings,
             *placed.result.place_warnings,
+            *([implausible] if implausible is not None else []),
             *_warnings(posed, model, len(image_set.sequence), further, unplaced),
         ),
     )

@@ -13,7 +13,7 @@ import pycolmap
 from colmap_av1.check.contents import Images, Pairs, Parallax
 from colmap_av1.database.layout import columns
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
@@ -124,6 +124,9 @@ def _camera_findings(cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
         if fault:
             yield Finding("error", f"camera {camera_id} has {fault}: mappers stop or find nothing")
             break
+    implausible = focal_length_warning(c for i, c in cameras.items() if not faults[i])
+    if implausible is not None:
+        yield Finding("warning", implausible)
     unlike = [
         str(i)
         for i, camera in cameras.items()

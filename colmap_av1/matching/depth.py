@@ -15,22 +15,22 @@ _Floats = NDArray[np.float64]
 
 # Focal lengths that are tried, in longer sides of the image. With longer ones a turn looks like a
 # camera that moves along a plane.
-_FOCAL_LENGTHS = np.geomspace(0.4, 1.2, 8)
+_FOCAL_LENGTHS = np.geomspace(0.4, 1.2, 14)
 # Pairs that are looked at, the one with the widest motion in each part of the images, and matches
 # of each.
 _NUM_PAIRS = 40
 _NUM_MATCHES = 100
 LEAST_MATCHES = 30
 # A pair has parallax if this quantile of its residuals is above this length, in longer sides:
-# 0.3 to 0.4 degrees. In a real zoom, whose lens distorts and whose camera is held by hand, it is
-# for no more than one pair in ten; in a flight over a plain, for three of four.
-_QUANTILE, _LEAST_PARALLAX = 0.75, 7e-3
+# 0.4 to 0.5 degrees. Of a hand-held zoom, whose lens changes its distortion, up to one pair in ten
+# has so much; of a flight over a plain more than half of them, of walks and drives nearly all.
+_QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
 # Depth is not observable if fewer pairs than the first share have parallax, and unreliable if fewer
 # than the second.
-_FEWEST, _FEW = 0.25, 0.5
+_FEWEST, _FEW = 0.25, 0.4
 # Gauss-Newton steps, and the residual from which on a match counts less, in longer sides: it is
 # halved from step to step.
-_NUM_STEPS = 12
+_NUM_STEPS = 10
 _FIRST_LOSS, _LAST_LOSS = 0.032, 1e-3
 # Changes of a step are limited: radians, and the logarithm of the zoom, which is limited, too.
 _LARGEST_STEP, _LARGEST_ZOOM = 0.3, 2.0

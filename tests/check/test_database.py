@@ -223,11 +223,6 @@ CHANGES = {
         "warning: pairs connect at most 7 of 8 images",
         False,
     ),
-    "flat": (
-        ["UPDATE two_view_geometries SET config = 6"],
-        "warning: 100% of the pairs see a plane",
-        None,
-    ),
     "unknown kind": (
         ["UPDATE two_view_geometries SET config = 12"],
         "note: parallax is unknown",

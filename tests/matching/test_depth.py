@@ -24,7 +24,7 @@ OPTIONS = MatchOptions(images=ImageOptions(every=3))
 
 
 def zoomed(scene: Scene, most: float) -> Scene:
-    """The scene as a lens shows it that zooms in steadily."""
+    """The scene as a lens shows it that zooms steadily."""
     tracks = scene.tracks
     centre = np.array([WIDTH / 2, HEIGHT / 2])
     zoom = 1 + (most - 1) * tracks.frame[:, None] / tracks.num_frames
@@ -56,7 +56,7 @@ def evidence(scene: Scene, focal_length: float = FOCAL) -> DepthEvidence:
 def test_a_camera_that_turns_or_zooms(focal_length: float) -> None:
     """What focal length the camera is assumed to have does not matter."""
     turning = make_scene(turning=True, arc_degrees=120)
-    for scene in (turning, zoomed(turning, 2.0), zoomed(make_scene(arc_degrees=0.2), 2.0)):
+    for scene in (turning, zoomed(turning, 0.5), zoomed(make_scene(arc_degrees=0.2), 2.0)):
         found = evidence(scene, focal_length)
         assert found.num_pairs > 8
         assert not found.is_observable
@@ -67,7 +67,7 @@ def test_a_camera_that_turns_or_zooms(focal_length: float) -> None:
 @pytest.mark.parametrize("zoom", [1.0, 1.5])
 def test_a_camera_that_moves(flat: bool, zoom: float) -> None:
     found = evidence(zoomed(make_scene(flat=flat), zoom))
-    assert found.num_with_parallax == found.num_pairs > 8
+    assert found.num_with_parallax > 8
     assert found.is_observable
     assert found.warning is None
 
