@@ -102,16 +102,18 @@ def depth_evidence(
     parallax = []
     part = pairs[:, 0] * _NUM_PAIRS // max(len(keypoints), 1)
     for own in (np.flatnonzero(part == number) for number in np.unique(part)):
-        pair = int(own[np.argmax(spread[own])])
+        pair = int(own[np.argmax(np.nan_to_num(spread[own]))])
         rows = rng.permutation(matches(pair))[:_NUM_MATCHES]
         ends = [
             _centred(keypoints[image][rows[:, end]], camera)
             for end, image in enumerate(pairs[pair].tolist())
             if (camera := cameras[image]) is not None
         ]
-        if len(rows) < LEAST_MATCHES or len(ends) < 2:
+        if len(ends) < 2:
             continue
         is_known = np.isfinite(np.hstack(ends)).all(axis=1)
+        if np.count_nonzero(is_known) < LEAST_MATCHES:
+            continue
         residuals = _turn_and_zoom_residuals(*(end[is_known] for end in ends))
         parallax.append(float(np.quantile(residuals, _QUANTILE, axis=1).min()))
     return DepthEvidence(len(parallax), int(np.sum(np.array(parallax) > _LEAST_PARALLAX)))
