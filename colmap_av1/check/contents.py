@@ -273,7 +273,8 @@ def depth_of(
                 (int(pairs.ids[used[pair]]),),
             ).fetchone(),
         )
-        return rows[(rows < counts[pairs.index[used[pair]]]).all(axis=1)]
+        there = (rows < counts[pairs.index[used[pair]]]).all(axis=1)
+        return np.asarray(rows[there])
 
     return depth_evidence(
         images.keypoints,

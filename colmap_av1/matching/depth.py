@@ -138,7 +138,8 @@ def depth_of_images(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) 
 def _centred(xy: NDArray[np.float32], camera: pycolmap.Camera) -> _Floats:
     """Undistorted positions from the principal point, in longer sides of the image."""
     focal_length = camera.mean_focal_length() / max(camera.width, camera.height)
-    return np.asarray(camera.cam_from_img(xy.astype(np.float64))[:, :2] * focal_length)
+    rays = np.asarray(camera.cam_from_img(xy.astype(np.float64)), np.float64)
+    return np.asarray(rays[:, :2] * focal_length)
 
 
 def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
