@@ -9,7 +9,9 @@ from colmap_av1.geometry.cameras import focal_length_warning
 
 
 def camera(focal_length: float, model: str = "SIMPLE_RADIAL") -> pycolmap.Camera:
-    return pycolmap.Camera.create(1, getattr(pycolmap.CameraModelId, model), focal_length, 500, 375)
+    return pycolmap.Camera.create_from_model_id(
+        1, getattr(pycolmap.CameraModelId, model), focal_length, 500, 375
+    )
 
 
 @pytest.mark.parametrize("focal_length", [140.0, 5853.0])
