@@ -15,16 +15,17 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import CheckReport, check
 from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
+from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.gaps import Gap, few_matches_warning
+from colmap_av1.matching.gaps import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import FarViews
 from colmap_av1.poses.mapper import map_poses
@@ -111,7 +112,7 @@ def map_database(
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
     check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)
-    num_images, thin_gaps = _check_input(database, image_path)
+    checked = _check_input(database, image_path)
 
     try:
         with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
@@ -124,7 +125,7 @@ def map_database(
                     options,
                     image_path=image_path,
                     log=log,
-                    num_images=num_images,
+                    num_images=checked.num_images,
                     progress=progress,
                 )
                 copy.unlink()
@@ -149,16 +150,18 @@ def map_database(
             found = check_model(model, database=database)
     warnings = (
         *placement.warnings,
-        _missing(num_images, num_registered),
+        _missing(checked.num_images, num_registered),
+        checked.depth.warning,
+        focal_length_warning(model.cameras.values()),
         # Seams of the model are more specific than gaps of the matches.
-        *(found.seam_warnings or (few_matches_warning(thin_gaps),)),
+        *(found.seam_warnings or (few_matches_warning(checked.thin_gaps),)),
         found.far_views.warning() if found.far_views else unreadable,
     )
     return MapReport(
         output=output,
         database=database,
         mapper=options.mapper,
-        num_images=num_images,
+        num_images=checked.num_images,
         num_registered=num_registered,
         place=placement.facts,
         figures=found.figures,
@@ -228,9 +231,11 @@ def _place(
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]]:
-    """Refuse inputs that make a mapper fail; returns the number of images, and thin gaps."""
+def _check_input(database: Path, image_path: Path) -> CheckReport:
+    """Refuse inputs that make a mapper fail."""
     checked = check(database)
+    if not checked.depth.is_observable:
+        raise DatabaseError(f"{database}: {checked.depth.warning}")
     stops = [f.text for f in checked.findings if f.severity == "error"]
     if stops:
         raise DatabaseError(
@@ -251,4 +256,4 @@ def _check_input(database: Path, image_path: Path) -> tuple[int, tuple[Gap, ...]
             f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database is "
             f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
         )
-    return len(images), checked.thin_gaps
+    return checked

@@ -17,7 +17,7 @@ from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_o
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import write_matched_images, write_matches
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
-from colmap_av1.geometry.cameras import check_pixel_aspect
+from colmap_av1.geometry.cameras import check_pixel_aspect, focal_length_warning
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
@@ -267,6 +267,8 @@ def match(
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
+    doubts = (found.depth.warning, focal_length_warning(found.cameras))
+    notes += tuple(doubt for doubt in doubts if doubt is not None)
     # What a database holds already may join the images, too, and joint matches are fewer where all
     # others are the same tracks in more images.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
@@ -454,6 +456,8 @@ def _match_images(
         reason = str(error).rpartition(": ")[0] or str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
+    if not found.depth.is_observable:
+        return found
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
 

@@ -15,6 +15,8 @@ import cattrs
 import numpy as np
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.geometry.cameras import focal_length_warning
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
 from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.inputs import paths_of, read_inputs
@@ -45,8 +47,6 @@ from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
 _REPORT = "report.json"
-# Share of pairs that a homography explains from which on depth is doubtful.
-_MANY_FLAT = 0.9
 # Images without a pose that a warning names.
 _NUM_NAMED = 4
 
@@ -279,6 +279,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     further, unplaced = further_models(run, posed, image_set)
     assert posed.far_views is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
+    implausible = focal_length_warning(read_posed_model(run.stages / poses.poses).cameras.values())
     long_range = posed.far_views.result
     return ReconstructReport(
         output=run.output,
@@ -322,6 +323,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *run.inputs.with_names([stage.result.warnings for stage in tracked]),
             *matches.link_warnings,
             *placed.result.place_warnings,
+            *([implausible] if implausible is not None else []),
             *_warnings(posed, model, len(image_set.sequence), further, unplaced),
         ),
         timelines=_timelines(run, image_set, matches.key_images, unplaced),
@@ -377,12 +379,8 @@ def _warnings(
         warnings.append(
             f"the model holds no image of {names}: reconstruct what shows another scene apart"
         )
-    if matches.num_flat_pairs > _MANY_FLAT * matches.num_verified_pairs:
-        warnings.append(
-            f"in {matches.num_flat_pairs} of {matches.num_verified_pairs} pairs the camera only "
-            "rotates or the scene is flat: the depth of the points may be unreliable; film while "
-            "moving sideways"
-        )
+    if matches.depth.warning is not None:
+        warnings.append(matches.depth.warning)
     if posed.far_views is not None and posed.far_views.result.far_views_warning is not None:
         warnings.append(posed.far_views.result.far_views_warning)
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.layout import columns
 from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row, stored_keypoints
+from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.matching.depth import LEAST_MATCHES, DepthEvidence, depth_evidence, motion_spread
 from colmap_av1.matching.mapper_limits import (
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
@@ -178,9 +180,9 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
             astray.add(pair_id)
         a, b = inliers[there].T
         if len(a):
-            step = images.keypoints[j][b].astype(np.float64) - images.keypoints[i][a]
-            spread = np.hypot(*np.subtract(*np.quantile(step, (0.9, 0.1), axis=0)))
-            rows[pair_id] = (num_rows, config, np.median(np.hypot(*step.T)), spread)
+            xa, xb = images.keypoints[i][a], images.keypoints[j][b]
+            length = float(np.median(np.hypot(*(xb.astype(np.float64) - xa).T)))
+            rows[pair_id] = (num_rows, config, length, motion_spread(xa, xb))
         if num_rows >= MIN_INLIERS and config not in UNUSED_CONFIGS:
             matched[i][a] = matched[j][b] = True
     pair_ids = np.array(sorted(rows.keys() | num_matches.keys()), dtype=np.int64)
@@ -248,6 +250,41 @@ def parallax_of(
         angle=float(np.quantile(angles, _LARGEST)) if angles else None,
         focal_known=known and bool(angles),
         forward_share=float(np.mean(forward)) if forward else 0.0,
+    )
+
+
+def depth_of(
+    connection: sqlite3.Connection,
+    path: Path,
+    images: Images,
+    pairs: Pairs,
+    cameras: dict[int, pycolmap.Camera],
+) -> DepthEvidence:
+    """Whether the pairs that mappers use determine depth, see `depth_evidence`."""
+    used = np.flatnonzero(pairs.used & (pairs.num_inliers >= LEAST_MATCHES))
+    counts = np.array([len(xy) for xy in images.keypoints])
+
+    def inliers(pair: int) -> NDArray[np.integer]:
+        rows = matches_from_row(
+            path,
+            int(pairs.ids[used[pair]]),
+            *connection.execute(
+                "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?",
+                (int(pairs.ids[used[pair]]),),
+            ).fetchone(),
+        )
+        there = (rows < counts[pairs.index[used[pair]]]).all(axis=1)
+        return np.asarray(rows[there])
+
+    return depth_evidence(
+        images.keypoints,
+        pairs.index[used],
+        pairs.spread[used],
+        inliers,
+        [
+            camera if (camera := cameras.get(own)) and camera_fault(camera) is None else None
+            for own in images.camera_ids
+        ],
     )
 
 

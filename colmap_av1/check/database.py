@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_av1.check.contents import (
     Parallax,
+    depth_of,
     images_with_rows,
     layout_of,
     pairs_with_rows,
@@ -31,6 +32,7 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.names import video_of
+from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_match_gaps
 from colmap_av1.matching.two_view_geometry import config_name
 from colmap_av1.util.graphs import connected_components
@@ -61,6 +63,7 @@ class CheckReport:
         configs: number of pairs with inliers by COLMAP's name of their geometry.
         num_connected_images: images of the largest group that used pairs connect.
         parallax: of the widest pairs; None where no pair is used.
+        depth: whether the pairs determine depth.
         thin_gaps: gaps between images of a video that few matches cross.
         findings: what stands out, most severe first.
     """
@@ -84,6 +87,7 @@ class CheckReport:
     configs: dict[str, int]
     num_connected_images: int
     parallax: Parallax | None
+    depth: DepthEvidence
     thin_gaps: tuple[Gap, ...]
     findings: tuple[Finding, ...]
 
@@ -129,6 +133,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         connected = connected_components(len(images.ids), pairs.index[used])
         group = int(np.bincount(connected).max())
     parallax = parallax_of(connection, path, images, pairs, cameras)
+    depth = depth_of(connection, path, images, pairs, cameras)
     configs = [config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
@@ -141,7 +146,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         *frame_findings(connection, images),
         *keypoint_findings(images, pairs),
         *pair_findings(pairs, images),
-        *motion_findings(pairs, parallax, group, len(images.ids)),
+        *motion_findings(pairs, parallax, depth, group, len(images.ids)),
         *gap_findings(thin),
         *orphan_findings(connection, pairs),
     ]
@@ -166,6 +171,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         configs={name: configs.count(name) for name in sorted(set(configs))},
         num_connected_images=group,
         parallax=parallax,
+        depth=depth,
         thin_gaps=thin,
         findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
     )

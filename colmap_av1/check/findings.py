@@ -13,7 +13,8 @@ import pycolmap
 from colmap_av1.check.contents import Images, Pairs, Parallax
 from colmap_av1.database.layout import columns
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
+from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
     INITIAL_LEAST_ANGLE,
@@ -21,7 +22,7 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_INLIERS,
     MIN_INLIERS,
 )
-from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig
+from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.util.texts import check_name
 
 Severity = Literal["error", "warning", "note"]
@@ -123,6 +124,9 @@ def _camera_findings(cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
         if fault:
             yield Finding("error", f"camera {camera_id} has {fault}: mappers stop or find nothing")
             break
+    implausible = focal_length_warning(c for i, c in cameras.items() if not faults[i])
+    if implausible is not None:
+        yield Finding("warning", implausible)
     unlike = [
         str(i)
         for i, camera in cameras.items()
@@ -272,7 +276,7 @@ def pair_findings(pairs: Pairs, images: Images) -> Iterator[Finding]:
 
 
 def motion_findings(
-    pairs: Pairs, parallax: Parallax | None, group: int, num_images: int
+    pairs: Pairs, parallax: Parallax | None, depth: DepthEvidence, group: int, num_images: int
 ) -> Iterator[Finding]:
     """Connection, parallax and forward motion: whether a mapper finds an initial pair."""
     used = pairs.used
@@ -290,13 +294,8 @@ def motion_findings(
             f"no pair has {INITIAL_MIN_INLIERS} inliers: the incremental mapper starts with "
             "none unless --Mapper.init_min_num_inliers is lower",
         )
-    flat = np.isin(pairs.config[used], FLAT_CONFIGS)
-    if np.mean(flat) > 0.5:
-        yield Finding(
-            "warning",
-            f"{np.mean(flat):.0%} of the pairs see a plane or a camera that only rotates: there is "
-            "little depth to find",
-        )
+    if depth.warning is not None:
+        yield Finding("warning" if depth.is_observable else "error", depth.warning)
     if parallax.angle is None:
         yield Finding("note", "parallax is unknown: the widest pairs have no model stored")
     elif parallax.angle < INITIAL_LEAST_ANGLE:

@@ -24,6 +24,7 @@ class ModelFigures:
         mean_error: mean of the points' reprojection errors in pixels, as COLMAP states it.
         median_error: their median.
         focal_length: in pixels, on average over the cameras.
+        focal_lengths: the shortest and the longest of the cameras, in pixels.
     """
 
     num_registered: int
@@ -33,6 +34,7 @@ class ModelFigures:
     mean_error: float
     median_error: float
     focal_length: float
+    focal_lengths: tuple[float, float]
 
 
 def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
@@ -54,4 +56,5 @@ def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
         mean_error=float(known.mean()) if len(known) else float("nan"),
         median_error=float(np.median(known)) if len(known) else float("nan"),
         focal_length=float(np.mean(focal_lengths)),
+        focal_lengths=(min(focal_lengths), max(focal_lengths)),
     )

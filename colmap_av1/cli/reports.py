@@ -11,6 +11,7 @@ if TYPE_CHECKING:  # each is slow to import
     from colmap_av1.batch.run import BatchReport
     from colmap_av1.check.database import CheckReport
     from colmap_av1.check.model import ModelCheck
+    from colmap_av1.check.model_figures import ModelFigures
     from colmap_av1.densify import DensifyReport
     from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.map import MapReport
@@ -26,6 +27,8 @@ Rows = list[tuple[str, str]]
 # Rarer reference distances are summed up.
 _LEAST_LISTED_SHARE = 0.005
 _NUM_LISTED_GAPS = 4
+# Focal lengths that differ by a smaller share are stated as one.
+_SAME_FOCAL_LENGTH = 1e-4
 
 
 def match_rows(report: MatchReport) -> Rows:
@@ -83,7 +86,7 @@ def map_rows(report: MapReport) -> Rows:
         ("points", str(figures.num_points)),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         ("mean track length", f"{figures.mean_track_length:.2f}"),
-        ("focal length", f"{figures.focal_length:.2f} px"),
+        _focal_length_row(figures),
     ]
     if report.far_views is not None:
         rows += _far_view_rows(report.far_views.median, report.far_views.largest)
@@ -92,6 +95,14 @@ def map_rows(report: MapReport) -> Rows:
         others = ", ".join(map(str, report.num_registered[1:]))
         rows.append(("further models", f"of {others} images, beside it"))
     return [*rows, ("model written to", str(report.model))]
+
+
+def _focal_length_row(figures: ModelFigures) -> tuple[str, str]:
+    """The focal length of a model, or the range where its cameras differ."""
+    shortest, longest = figures.focal_lengths
+    if longest - shortest < _SAME_FOCAL_LENGTH * longest:
+        return ("focal length", f"{figures.focal_length:.2f} px")
+    return ("focal lengths", f"{shortest:.2f} to {longest:.2f} px")
 
 
 def reconstruct_rows(report: ReconstructReport) -> Rows:
@@ -163,7 +174,7 @@ def model_rows(found: ModelCheck) -> Rows:
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         *(_far_view_rows(far_views.median, far_views.largest) if far_views else ()),
-        ("focal length", f"{figures.focal_length:.2f} px"),
+        _focal_length_row(figures),
     ]
 
 

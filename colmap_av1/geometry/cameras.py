@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import pycolmap
 
@@ -21,6 +23,8 @@ _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV
 # 60 degrees field of view, and 0.5 for fisheye lenses with about 115 degrees. COLMAP's default of
 # 1.2 (45 degrees) often makes its mapper fail on videos of phones.
 _GUESS, _FISHEYE_GUESS = 0.9, 0.5
+# Focal lengths of lenses in longer sides of an image: fields of view from 118 to 11 degrees.
+_SHORTEST, _LONGEST = 0.3, 5.0
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
 # Encoders round the display size of scaled pictures, by a few tenths of a percent.
@@ -79,6 +83,22 @@ def camera_fault(camera: pycolmap.Camera) -> str | None:
         return "parameters that are not numbers"
     if any(camera.params[i] <= 0 for i in camera.focal_length_idxs()):
         return "a focal length of 0 or less"
+    return None
+
+
+def focal_length_warning(cameras: Iterable[pycolmap.Camera]) -> str | None:
+    """Warn of a focal length that hardly any lens has: its estimate went astray.
+
+    Args:
+        cameras: pycolmap.Cameras. Fisheye lenses may have shorter focal lengths than others.
+    """
+    for camera in cameras:
+        ratio = camera.mean_focal_length() / max(camera.width, camera.height)
+        if ratio > _LONGEST or (ratio < _SHORTEST and not is_fisheye(camera.model_name)):
+            return (
+                f"the focal length is implausible, {camera.mean_focal_length():.0f} px at a size "
+                f"of {camera.width}x{camera.height}: give --camera_model and --camera_params"
+            )
     return None
 
 

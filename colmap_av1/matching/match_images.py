@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.cameras import ImageCameras
+from colmap_av1.matching.depth import DepthEvidence, depth_of_images
 from colmap_av1.matching.gaps import may_link
 from colmap_av1.matching.image_matches import (
     MatchedImages,
@@ -72,6 +73,7 @@ class ImageMatches:
         link_tracks: the links as tracks.
         track_lengths: int64 [num_tracks] images that see each of the tracks that images are matched
             along.
+        depth: whether the matches determine depth.
         warnings: warnings about the cameras and the links.
     """
 
@@ -81,6 +83,7 @@ class ImageMatches:
     links: LinkReport
     link_tracks: Tracks
     track_lengths: NDArray[np.int64]
+    depth: DepthEvidence
     warnings: tuple[str, ...]
 
 
@@ -134,6 +137,8 @@ def match_images(
         name=name,
         images_apart=images_apart,
     )
+    with context.clock.measure("verification"):
+        depth = depth_of_images(linked.matched, made.of_images)
     return ImageMatches(
         cameras=made.of_images,
         focal_length=made.focal_length,
@@ -141,6 +146,7 @@ def match_images(
         links=linked.report,
         link_tracks=linked.tracks,
         track_lengths=paired.track_lengths,
+        depth=depth,
         warnings=(*made.warnings, *linked.report.warnings),
     )
 

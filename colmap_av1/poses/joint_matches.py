@@ -138,6 +138,7 @@ def match_jointly(
         links=matches.links,
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
+        depth=matches.depth,
         warnings=(*matches.link_warnings, *_warnings(posed, left, len(image_set.sequence))),
         estimate=JointEstimate(
             num_registered=len(known.images),

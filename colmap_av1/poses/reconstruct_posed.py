@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.corners.in_images import corners_in_images
@@ -216,6 +217,9 @@ def _pose_stages(
 ) -> Posed:
     """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
     matched = match_stage(run, videos, image_set, tracked, doubted)
+    depth = matched.result.depth
+    if not depth.is_observable:
+        raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
     # Where no read-out is found nothing has been moved, whether one was looked for or not.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
+from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.links import LinkReport
@@ -54,6 +55,7 @@ class MatchesResult:
         num_pose_tracks: tracks that the poses come from.
         guessed: the focal length of some video is a guess.
         forward_motion: the camera moves along its axis, see `MatchReport`.
+        depth: whether the matches determine depth.
         num_pairs: image pairs.
         num_flat_pairs: pairs that a homography explains.
         num_verified_pairs: pairs with a two-view geometry.
@@ -66,6 +68,7 @@ class MatchesResult:
     num_pose_tracks: int
     guessed: bool
     forward_motion: bool
+    depth: DepthEvidence
     num_pairs: int
     num_flat_pairs: int
     num_verified_pairs: int
@@ -135,6 +138,7 @@ def match_stage(
             num_pose_tracks=len(found.track_lengths),
             guessed=not all(camera.has_prior_focal_length for camera in of_videos),
             forward_motion=matched.forward_motion,
+            depth=found.depth,
             num_pairs=len(configs),
             num_flat_pairs=configs.count(TwoViewConfig.PLANAR_OR_PANORAMIC),
             num_verified_pairs=len(configs) - configs.count(TwoViewConfig.DEGENERATE),

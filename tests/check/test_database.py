@@ -240,12 +240,6 @@ CHANGES = {
         "7 of 8",
         False,
     ),
-    "flat": (
-        ["UPDATE two_view_geometries SET config = 6"],
-        "warning",
-        "plane",
-        None,
-    ),
     "unknown kind": (
         ["UPDATE two_view_geometries SET config = 12"],
         "note",
