@@ -23,6 +23,7 @@ from colmap_av1 import (
     MatchOptions,
     ModelError,
     OptionError,
+    VerifyOptions,
     map_database,
     match,
 )
@@ -33,19 +34,23 @@ from colmap_av1.options import Mapper
 from colmap_av1.reconstruct import ReconstructReport
 
 # Few tracks are mapped quickly.
-MATCHING = MatchOptions(images=ImageOptions(every=EVERY), density=DensityOptions(preset="sparse"))
+MATCHING = MatchOptions(
+    images=ImageOptions(every=EVERY),
+    density=DensityOptions(preset="sparse"),
+    verify=VerifyOptions(verify="pairs"),
+)
 
 
 @pytest.fixture(scope="module")
-def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("mapped_images")
+
+
+@pytest.fixture(scope="module")
+def database(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("mapped") / "a.db"
-    match(path, SCENE, options=MATCHING)
+    match(path, SCENE, image_path=images, options=MATCHING)
     return path
-
-
-@pytest.fixture(scope="module")
-def images(made: ReconstructReport) -> Path:
-    return made.output / "images"
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])

@@ -7,7 +7,7 @@ import numpy as np
 from colmap_av1.check.model import ModelCheck
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.cli.reports import model_rows
-from colmap_av1.poses.seams import Joints
+from colmap_av1.poses.seams import Seams
 
 NONE = np.empty(0, np.int64)
 
@@ -23,7 +23,7 @@ def rows(shortest: float, longest: float) -> dict[str, str]:
         focal_length=(shortest + longest) / 2,
         focal_lengths=(shortest, longest),
     )
-    return dict(model_rows(ModelCheck(figures, Joints((), NONE, NONE, NONE, NONE), None, None)))
+    return dict(model_rows(ModelCheck(figures, Seams((), NONE, NONE, NONE, NONE), None, None)))
 
 
 def test_focal_lengths_of_several_cameras() -> None:

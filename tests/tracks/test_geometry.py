@@ -264,7 +264,7 @@ def test_bad_sequences_say_what_is_wrong(tmp_path):
     with pytest.raises(ImageError, match=r"000003\.png"):
         read_sequence(tmp_path)
     (tmp_path / "frames").rmdir()
-    with pytest.raises(VideoError, match="not there"):
+    with pytest.raises(VideoError, match="exist"):
         read_sequence(tmp_path)
 
 
