@@ -27,7 +27,7 @@ LEAST_MATCHES = 30
 _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
 # Depth is not observable if fewer pairs than the first share have parallax, and unreliable if fewer
 # than the second.
-_FEWEST, _FEW = 0.2, 0.4
+_FEWEST, _FEW = 0.25, 0.4
 # Gauss-Newton steps, and the residual from which on a match counts less, in longer sides: it is
 # halved from step to step.
 _NUM_STEPS = 10
