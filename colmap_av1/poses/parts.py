@@ -18,6 +18,7 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.reconstruct_poses import AdjustedResult, MappedResult, registered_by_video
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run
+from colmap_av1.poses.seams import REACH
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -89,8 +90,8 @@ def parts_of(
     """The names of the images of each part of a model, the largest part first.
 
     The images between two seams of a video form a stretch. Stretches that see enough points in
-    common belong to the same part, but not for what they see of each other across a turn. Parts of
-    fewer than three images are left out, if there is a larger one.
+    common belong to the same part. Points that are seen all through a turn do not count: they do
+    not carry the scale. Parts of fewer than three images are left out, if there is a larger one.
 
     Args:
         model: the model with its points.
@@ -114,9 +115,19 @@ def parts_of(
         if name in registered:
             stretch[name] = len(sequence_of) - 1
     of_image = np.array([stretch[image.name] for image in model.images])
-    common = _common_points(model, of_image, len(sequence_of))
-    common[after_turn, np.array(after_turn, np.int64) - 1] = 0
-    common[np.array(after_turn, np.int64) - 1, after_turn] = 0
+    points = model.points
+    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    place_of = {image: place for place, image in enumerate(image_set.images.names)}
+    place = np.array([place_of[image.name] for image in model.images])
+    view = np.argsort(np.argsort(place))[points.image]
+    order = np.lexsort((view, point))
+    point, view, at = point[order], view[order], of_image[points.image][order]
+    common = _common(point, at, len(sequence_of))
+    is_new = (np.diff(point, prepend=-1) != 0) | (np.diff(view, prepend=0) > REACH)
+    in_one_visit = _common(np.cumsum(is_new), at, len(sequence_of))
+    for stretch_after in after_turn:
+        pair = np.array([stretch_after - 1, stretch_after])
+        common[pair, pair[::-1]] -= in_one_visit[pair, pair[::-1]]
     is_same = np.equal.outer(sequence_of, sequence_of)
     edges = np.argwhere(common >= np.where(is_same, _WITHIN_VIDEO, _BETWEEN_VIDEOS))
     component = connected_components(len(sequence_of), edges)[of_image]
@@ -127,15 +138,22 @@ def parts_of(
     return [*(large or parts[:1])]
 
 
-def _common_points(
-    model: PosedModel, of_image: NDArray[np.int64], num_stretches: int
+def _common(
+    point: NDArray[np.int64], stretch: NDArray[np.int64], num_stretches: int
 ) -> NDArray[np.int64]:
-    """Int64 [n, n] how many points two stretches both see."""
+    """How many points two stretches both see.
+
+    Args:
+        point: int64 [n] point of each observation.
+        stretch: int64 [n] stretch of its image.
+        num_stretches: number of the stretches.
+
+    Returns:
+        int64 [num_stretches, num_stretches].
+    """
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
 
-    points = model.points
-    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
-    seen = np.unique(np.column_stack([point, of_image[points.image]]), axis=0)
-    shape = (len(points.xyz), num_stretches)
+    seen = np.unique(np.column_stack([point, stretch]), axis=0)
+    shape = (int(point.max(initial=-1)) + 1, num_stretches)
     sees = coo_array((np.ones(len(seen), np.int64), (seen[:, 0], seen[:, 1])), shape=shape).tocsr()
     return np.asarray((sees.T @ sees).toarray())

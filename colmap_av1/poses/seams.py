@@ -23,7 +23,7 @@ _DOUBTFUL = 0.15
 _WEAK = 0.07
 # Images between two that see a point, beyond which these say nothing of the seams between: a place
 # seen again would count for all of the way there and back.
-_REACH = 10
+REACH = 10
 # So many points hold any seam, however many others have: bent ones had 50 at most.
 _ENOUGH = 100
 # Share of the points of usual seams that images before a seam share with those after it, however
@@ -153,7 +153,7 @@ def model_seams(reconstruction: Any) -> Seams:
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))
     views, point = views[order], point[order]
-    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
+    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= REACH))
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
     np.minimum.at(first, point, views)
     np.maximum.at(last, point, views)

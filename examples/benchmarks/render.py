@@ -620,7 +620,6 @@ def walks(rows: list[Row]) -> str:
         words("images", "images"),
         words("registered", "registered"),
         words("camera centres", "errors"),
-        words("warnings", "warnings"),
     ]
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'walk')}"
 

@@ -62,6 +62,9 @@ def test_points_seen_in_a_turn_do_not_hold() -> None:
     image_set = images(10)
     known = model(image_set, [[3, 4]] * 1000)
     assert len(parts_of(known, image_set, [], [seam(image_set, 3)])) == 2
+    longer = images(30)
+    known = model(longer, [[3, 4]] * 1000 + [[0, 1, 28, 29]] * 200)
+    assert len(parts_of(known, longer, [], [seam(longer, 3)])) == 1
 
 
 def test_a_place_seen_again_holds() -> None:
