@@ -126,14 +126,14 @@ HDF5 = {
         lambda f, m: linked(f, "a/image_size", np.array([1, 2, 3])),
         "width",
     ),
-    "size in words": (lambda f, m: linked(f, "a/image_size", "64x48"), "numbers"),
+    "size in words": (lambda f, m: linked(f, "a/image_size", "64x48"), "numeric"),
     "size not a number": (
         lambda f, m: linked(f, "a/image_size", np.array([np.nan, 3])),
         "width",
     ),
     "size that is a group": (
         lambda f, m: linked(f, "a/image_size", h5py.SoftLink("/b")),
-        "numbers",
+        "numeric",
     ),
     "size that is nowhere": (
         lambda f, m: linked(f, "a/image_size", h5py.ExternalLink("none.h5", "/x")),

@@ -128,7 +128,7 @@ def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
     """Find frames around which tracks end soon, as the camera turns or moves fast.
 
     Args:
-        tracks: all tracks of a video, or all long ones. A selection by density has other shares.
+        tracks: all tracks of a video. A selection has other shares.
 
     Returns:
         bool [num_frames].

@@ -201,7 +201,7 @@ def _selected_tracks(
     for video, own in enumerate(videos):
         with run.clock.measure("pairs"):
             tracks = pose_tracks(run, own.tracks)
-            fast = fast_frames(tracks)
+            fast = fast_frames(own.tracks)
             sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
         path = run.shown[video].video.path
         selected.append(SelectedTracks(path, sparse, own.inter_share, fast))

@@ -214,12 +214,12 @@ def test_pair_in_both_directions_is_read_once(tmp_path: Path) -> None:
     [
         ({"a.png/c.png": [0, 1, 2]}, {"a.png": HALF, "b.png": HALF}, "images"),
         ({"a.png/b.png": [0, 1]}, {"a.png": HALF, "b.png": HALF}, "matches"),
-        ({"a.png/b.png": [0, 1, 3]}, {"a.png": HALF, "b.png": HALF}, "not there"),
-        ({"a.png/b.png": [0, -2, 1]}, {"a.png": HALF, "b.png": HALF}, "not there"),
+        ({"a.png/b.png": [0, 1, 3]}, {"a.png": HALF, "b.png": HALF}, "exist"),
+        ({"a.png/b.png": [0, -2, 1]}, {"a.png": HALF, "b.png": HALF}, "exist"),
         ({}, {"a.png": HALF}, r"matches\.h5"),
         ({"a.png/b.png": [0]}, {}, r"features\.h5"),
         ({"a_a/b": [0, 1, 2]}, {"a/b": HALF, "a-b": HALF}, "same name"),
-        ({"a_b_c": [0, 1, 2]}, dict.fromkeys(("a", "b_c", "a_b", "c"), HALF), "several"),
+        ({"a_b_c": [0, 1, 2]}, dict.fromkeys(("a", "b_c", "a_b", "c"), HALF), "ambiguous"),
         ({"a/b": [0, 1, 2]}, {"a": HALF[:, 0], "b": HALF}, "float16"),
     ],
 )

@@ -128,7 +128,7 @@ def test_files_that_cannot_be_made(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"init\.txt"):
         check_gaussians_path(tmp_path / "init.txt", [])
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(OptionError, match="no file"):
+    with pytest.raises(OptionError, match="not a file"):
         check_gaussians_path(tmp_path / "folder.ply", [])
     (tmp_path / "file").touch()
     with pytest.raises(OptionError, match="written"):

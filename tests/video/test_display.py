@@ -182,7 +182,8 @@ def test_cropped_by_the_container(
     assert shown.shape == first.shape == ((160, 114, 3) if angle else (114, 160, 3))
     assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
 
-    report = match(tmp_path / "a.db", cropped, image_path=tmp_path / "images")
+    by_pairs = MatchOptions(verify=PAIRS)
+    report = match(tmp_path / "a.db", cropped, image_path=tmp_path / "images", options=by_pairs)
     assert report.num_inliers > 1000
     with sqlite3.connect(tmp_path / "a.db") as connection:
         size = connection.execute("SELECT width, height FROM cameras").fetchone()
