@@ -238,7 +238,7 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        # With a guessed focal length the poses of pairs are wrong, and say nothing.
+        # With a guessed focal length the poses of pairs are wrong and cannot be compared.
         known = all(camera.has_prior_focal_length for camera in found.cameras)
         poses = found.poses if isinstance(found, JointMatches) and known else ()
         written = demote_bad_initial_pairs(found.matched, found.cameras, clock, poses)

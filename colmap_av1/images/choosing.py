@@ -63,6 +63,11 @@ class ChosenImages:
     names: list[str]
     frames: NDArray[np.int32]
 
+    @property
+    def frame_of(self) -> dict[str, int]:
+        """The display index of each image, by its name."""
+        return dict(zip(self.names, self.frames.tolist(), strict=True))
+
     def some(self, index: Sequence[int] | NDArray[np.integer[Any]]) -> ChosenImages:
         """Some of the images, by their index, ascending."""
         return ChosenImages([self.names[i] for i in index], self.frames[np.asarray(index, int)])

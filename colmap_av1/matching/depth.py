@@ -22,8 +22,9 @@ _NUM_PAIRS = 40
 _NUM_MATCHES = 100
 LEAST_MATCHES = 30
 # A pair has parallax if this quantile of its residuals is above this length, in longer sides:
-# 0.4 to 0.5 degrees. Of a hand-held zoom, whose lens changes its distortion, up to one pair in ten
-# has so much; of a flight over a plain more than half of them, of walks and drives nearly all.
+# 0.4 to 0.5 degrees. Up to one pair in ten of a hand-held zoom exceeds it, as the lens changes its
+# distortion. So do more than half of the pairs of a flight over a plain, and nearly all pairs of
+# walks and drives.
 _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
 # Depth is not observable if fewer pairs than the first share have parallax, and unreliable if fewer
 # than the second.

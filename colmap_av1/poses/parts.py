@@ -1,4 +1,4 @@
-"""The parts of a model that nothing holds together.
+"""Splits models at seams that hardly any point joins.
 
 An adjustment puts the two sides of a seam anywhere if hardly any point joins them, and gives them
 different scales if no point carries the scale across. Such a model is bent, although each side is
@@ -22,9 +22,10 @@ from colmap_av1.poses.seams import REACH
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage
 
-# Stretches of different videos with this many common points hold together, as for COLMAP's mapper.
+# Stretches of different videos belong together if they have this many points in common, which is
+# the least that COLMAP's mapper uses a pair of images for.
 _BETWEEN_VIDEOS = 15
-# Stretches of one video need this many, as models that were bent at a seam had half of it at most.
+# Stretches of one video need this many. Bent models had at most half of it at the seam.
 _WITHIN_VIDEO = 100
 
 
@@ -99,40 +100,32 @@ def parts_of(
         seams: names of the images before and after each seam that few points join.
         turns: names of those between which the camera turns and the scale is lost.
     """
-    turned = {first for first, _ in turns}
-    before = turned | {first for first, _ in seams}
-    registered = model.by_name
-    stretch: dict[str, int] = {}
-    sequence_of: list[int] = []
-    after_turn: list[int] = []
-    is_new = is_turn = False
-    for name, sequence in zip(image_set.images.names, image_set.sequence.tolist(), strict=True):
-        if is_new or not sequence_of or sequence_of[-1] != sequence:
-            if is_turn:
-                after_turn.append(len(sequence_of))
-            sequence_of.append(sequence)
-        is_new, is_turn = name in before, name in turned
-        if name in registered:
-            stretch[name] = len(sequence_of) - 1
-    of_image = np.array([stretch[image.name] for image in model.images])
+    names = image_set.images.names
+    is_turn = np.isin(names, [first for first, _ in turns])
+    is_seam = is_turn | np.isin(names, [first for first, _ in seams])
+    sequence = image_set.sequence
+    starts = np.append(True, is_seam[:-1] | (np.diff(sequence) != 0))
+    stretch = np.cumsum(starts) - 1
+    after_turn = stretch[np.flatnonzero(is_turn[:-1]) + 1]
+    sequence_of = sequence[starts]
+    index = {name: i for i, name in enumerate(names)}
+    place = np.array([index[image.name] for image in model.images])
+    of_image = stretch[place]
     points = model.points
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
-    place_of = {image: place for place, image in enumerate(image_set.images.names)}
-    place = np.array([place_of[image.name] for image in model.images])
     view = np.argsort(np.argsort(place))[points.image]
     order = np.lexsort((view, point))
     point, view, at = point[order], view[order], of_image[points.image][order]
     common = _common(point, at, len(sequence_of))
-    is_new = (np.diff(point, prepend=-1) != 0) | (np.diff(view, prepend=0) > REACH)
-    in_one_visit = _common(np.cumsum(is_new), at, len(sequence_of))
-    for stretch_after in after_turn:
-        pair = np.array([stretch_after - 1, stretch_after])
-        common[pair, pair[::-1]] -= in_one_visit[pair, pair[::-1]]
+    is_visit = (np.diff(point, prepend=-1) != 0) | (np.diff(view, prepend=0) > REACH)
+    in_one_visit = _common(np.cumsum(is_visit), at, len(sequence_of))
+    for pair in ((after_turn - 1, after_turn), (after_turn, after_turn - 1)):
+        common[pair] -= in_one_visit[pair]
     is_same = np.equal.outer(sequence_of, sequence_of)
     edges = np.argwhere(common >= np.where(is_same, _WITHIN_VIDEO, _BETWEEN_VIDEOS))
     component = connected_components(len(sequence_of), edges)[of_image]
-    names = np.array([image.name for image in model.images])
-    parts = [set(names[component == number].tolist()) for number in np.unique(component)]
+    registered = np.array([image.name for image in model.images])
+    parts = [set(registered[component == number].tolist()) for number in np.unique(component)]
     parts.sort(key=lambda part: -len(part))
     large = [part for part in parts if len(part) >= LEAST_IMAGES]
     return [*(large or parts[:1])]

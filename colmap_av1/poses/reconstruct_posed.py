@@ -161,7 +161,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         parts = split_stage(run, image_set, posed.mapped, posed.adjustment, seams, number=number)
         if parts.result.num_registered == adjusted.num_registered:
             break
-        frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
+        frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in {*seams, *adjusted.turns}]
         posed = replace(
             posed,
@@ -193,7 +193,7 @@ def _unlinked_seams(run: Run, image_set: ImageSet, posed: Posed) -> list[int]:
     """Frames after seams that few points join, and that no pictures have been matched across."""
     if posed.adjustment is None or run.options.match.links.links == "none":
         return []
-    frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
+    frame_of = image_set.images.frame_of
     links = posed.matches.result.links
     looked_at = [*links.frames_of_gaps(), *links.fast]
     seams = [

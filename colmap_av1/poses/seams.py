@@ -89,7 +89,7 @@ class Seams:
 
     @property
     def turns(self) -> list[int]:
-        """Of every run of seams that do not carry the scale, by index, the one that does least."""
+        """The weakest seam, by index, of every run of seams that do not carry the scale."""
         runs: list[list[int]] = []
         for seam in self.unscaled:
             if runs and runs[-1][-1] == seam - 1:

@@ -19,7 +19,7 @@ Pairs = NDArray[np.int32]
 
 def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
     """The observations of a model's points as tracks through the frames of its images."""
-    frame_of = dict(zip(image_set.images.names, image_set.images.frames.tolist(), strict=True))
+    frame_of = image_set.images.frame_of
     frames = np.array([frame_of[image.name] for image in model.images], np.int32)
     cameras = model.cameras.values()
     size = max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)

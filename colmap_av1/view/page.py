@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
@@ -246,7 +246,7 @@ class _View:
 
     def camera(self, image: ModelImage) -> dict[str, Any]:
         """Where plotly looks at the scene from the camera of an image."""
-        centre = -image.cam_from_world[:, :3].T @ image.cam_from_world[:, 3]
+        (centre,) = camera_centres(image.cam_from_world[None])
         ahead = centre + _AHEAD * self.radius * image.cam_from_world[2, :3]
         eye, towards = self.place(np.stack([centre, ahead])).tolist()
         return {"eye": _xyz(eye), "center": _xyz(towards), "up": _xyz((0.0, 0.0, 1.0))}
@@ -353,7 +353,7 @@ def _cameras(
     parts = []
     for image in images:
         corners = view.scene.corners(image, _CAMERA_SIZE * view.radius)
-        centre = -image.cam_from_world[:, :3].T @ image.cam_from_world[:, 3]
+        (centre,) = camera_centres(image.cam_from_world[None])
         at = view.place(np.vstack([corners, centre]))
         parts.append(np.vstack([at, np.full(3, np.nan, np.float32)])[list(_LINES)])
     trace = {

@@ -1,4 +1,4 @@
-"""Models that nothing holds together are split."""
+"""Splitting of models at seams that hardly any point joins."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def read_moving(stages: Path) -> dict[str, Mask]:
 def without_moving(
     tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], run: Run
 ) -> Tracks:
-    """The tracks of all sequences where nothing moves by itself, see `mask_tracks`."""
+    """The tracks of all sequences outside dynamic pixels, see `mask_tracks`."""
     images = image_set.images
     by_frame = {
         frame: moving[name]
