@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.reconstruct_poses import AdjustedResult, MappedResult, registered_by_video
-from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run
+from colmap_av1.poses.reconstruct_tracks import Run
 from colmap_av1.poses.seams import REACH
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage
 
+# Fewest images of a model beside the first one, as of COLMAP's mapper (`min_model_size`). Shorter
+# parts mostly show a turn on the spot, which leaves their shape open.
+FEWEST_IMAGES = 10
 # Stretches of different videos belong together if they have this many points in common, which is
 # the least that COLMAP's mapper uses a pair of images for.
 _BETWEEN_VIDEOS = 15
@@ -74,7 +77,14 @@ def split_stage(
     return run_stage(
         run.stages,
         name,
-        [mapped.digest, adjusted.digest, list(seams), _BETWEEN_VIDEOS, _WITHIN_VIDEO],
+        [
+            mapped.digest,
+            adjusted.digest,
+            list(seams),
+            _BETWEEN_VIDEOS,
+            _WITHIN_VIDEO,
+            FEWEST_IMAGES,
+        ],
         MappedResult,
         into=run.stages,
         products=[name],
@@ -92,7 +102,7 @@ def parts_of(
 
     The images between two seams of a video form a stretch. Stretches that see enough points in
     common belong to the same part. Points that are seen all through a turn do not count: they do
-    not carry the scale. Parts of fewer than three images are left out, if there is a larger one.
+    not carry the scale. Parts of fewer than ten images are left out, if there is a larger one.
 
     Args:
         model: the model with its points.
@@ -127,8 +137,7 @@ def parts_of(
     registered = np.array([image.name for image in model.images])
     parts = [set(registered[component == number].tolist()) for number in np.unique(component)]
     parts.sort(key=lambda part: -len(part))
-    large = [part for part in parts if len(part) >= LEAST_IMAGES]
-    return [*(large or parts[:1])]
+    return [parts[0], *(part for part in parts[1:] if len(part) >= FEWEST_IMAGES)]
 
 
 def _common(

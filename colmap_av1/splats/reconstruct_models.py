@@ -9,6 +9,7 @@ from pathlib import Path
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.parts import FEWEST_IMAGES
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
 from colmap_av1.poses.reconstruct_posed import (
     Posed,
@@ -107,7 +108,7 @@ def further_models(
             continue
         new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
-        if len(images) < LEAST_IMAGES:
+        if len(images) < FEWEST_IMAGES:
             continue
         left -= set(images)
         model = written_model(own, posed, new)[1].result

@@ -50,45 +50,47 @@ def seam(image_set: ImageSet, before: int) -> tuple[str, str]:
 
 
 def test_a_seam_that_few_points_join() -> None:
-    image_set = images(10)
-    known = model(image_set, [[3, 4]] * 50)
-    first, second = parts_of(known, image_set, [seam(image_set, 3)])
-    assert (first, second) == (names(image_set, *range(4, 10)), names(image_set, *range(4)))
-    known = model(image_set, [[2, 3, 4]] * 200)
-    assert len(parts_of(known, image_set, [seam(image_set, 3)])) == 1
+    image_set = images(30)
+    known = model(image_set, [[12, 13]] * 50)
+    first, second = parts_of(known, image_set, [seam(image_set, 12)])
+    assert (first, second) == (names(image_set, *range(13, 30)), names(image_set, *range(13)))
+    known = model(image_set, [[11, 12, 13]] * 200)
+    assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 1
 
 
 def test_points_seen_in_a_turn_do_not_hold() -> None:
-    image_set = images(10)
-    known = model(image_set, [[3, 4]] * 1000)
-    assert len(parts_of(known, image_set, [], [seam(image_set, 3)])) == 2
-    longer = images(30)
-    known = model(longer, [[3, 4]] * 1000 + [[0, 1, 28, 29]] * 200)
-    assert len(parts_of(known, longer, [], [seam(longer, 3)])) == 1
+    image_set = images(30)
+    known = model(image_set, [[12, 13]] * 1000)
+    assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 2
+    known = model(image_set, [[12, 13]] * 1000 + [[0, 1, 28, 29]] * 200)
+    assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 1
 
 
 def test_a_place_seen_again_holds() -> None:
-    image_set = images(12)
-    seams = [seam(image_set, 3), seam(image_set, 7)]
-    assert len(parts_of(model(image_set, [[0, 11]] * 50), image_set, seams)) == 3
-    first, second = parts_of(model(image_set, [[0, 11]] * 200), image_set, seams)
-    assert first == names(image_set, *range(4), *range(8, 12))
-    assert second == names(image_set, *range(4, 8))
+    image_set = images(36)
+    seams = [seam(image_set, 11), seam(image_set, 23)]
+    assert len(parts_of(model(image_set, [[0, 35]] * 50), image_set, seams)) == 3
+    first, second = parts_of(model(image_set, [[0, 35]] * 200), image_set, seams)
+    assert first == names(image_set, *range(12), *range(24, 36))
+    assert second == names(image_set, *range(12, 24))
 
 
 def test_another_video_holds() -> None:
-    image_set = images(8, 4)
-    seams = [seam(image_set, 3)]
-    apart = [[0, 1, 8]] * 100
+    image_set = images(24, 12)
+    seams = [seam(image_set, 11)]
+    apart = [[0, 1, 24]] * 100
     assert len(parts_of(model(image_set, apart), image_set, seams)) == 2
-    assert len(parts_of(model(image_set, [*apart, *[[7, 9]] * 30]), image_set, seams)) == 1
+    assert len(parts_of(model(image_set, [*apart, *[[23, 30]] * 30]), image_set, seams)) == 1
 
 
-def test_a_few_images_between_seams_are_left_out() -> None:
-    image_set = images(10)
-    seams = [seam(image_set, 3), seam(image_set, 5)]
+def test_short_parts_are_left_out() -> None:
+    image_set = images(30)
+    seams = [seam(image_set, 13), seam(image_set, 15)]
     parts = parts_of(model(image_set, [[0, 1]]), image_set, seams)
-    assert parts == [names(image_set, *range(4)), names(image_set, *range(6, 10))]
+    assert parts == [names(image_set, *range(14)), names(image_set, *range(16, 30))]
+    short = images(12)
+    parts = parts_of(model(short, [[0, 1]]), short, [seam(short, 6)])
+    assert parts == [names(short, *range(7))]
 
 
 @pytest.mark.slow
