@@ -132,7 +132,9 @@ def test_parts_that_are_joined_wrongly(
     assert "wrongly" in capsys.readouterr().err
 
 
-def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int = 0) -> list[str]:
+def _walk_with_a_turn(
+    folder: Path, degrees: float, aside: float = 0, rest: int = 0, *, back: bool = False
+) -> list[str]:
     """Write the model of a camera that walks, turns about itself and walks on.
 
     Args:
@@ -140,6 +142,7 @@ def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int 
         degrees: by which it turns.
         aside: how far it moves meanwhile.
         rest: images before it walks.
+        back: it turns back afterwards, and walks on once more.
 
     Returns:
         The names of the images from the last before the turn to the first after it.
@@ -149,6 +152,9 @@ def _walk_with_a_turn(folder: Path, degrees: float, aside: float = 0, rest: int 
     walked = np.concatenate([np.full(rest, -2), np.linspace(-2, 0, before)])
     turned = aside * np.linspace(0, 1, turning)
     along = np.concatenate([walked, turned, aside + np.linspace(0.2, 2, before)])
+    if back:
+        share = np.concatenate([share, np.linspace(1, 0, turning), np.zeros(before)])
+        along = np.concatenate([along, np.full(turning, 2), np.linspace(2.2, 4, before)])
     rng = np.random.default_rng(0)
     direction = np.radians(rng.uniform(-60, 60 + degrees, 4000))
     far = rng.uniform(5, 12, 4000)
@@ -199,3 +205,10 @@ def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
     assert lost <= set(pairwise(turn))
     assert seams.warning is not None
     assert "scale" in seams.warning
+
+
+def test_a_place_seen_again_carries_no_scale_to_what_lies_between(tmp_path: Path) -> None:
+    turn = _walk_with_a_turn(tmp_path, degrees=80, back=True)
+    seams = model_seams(read_model(tmp_path))
+    lost = {seams.pairs[i] for i in seams.unscaled} & set(pairwise(turn))
+    assert len(lost) > len(turn) / 2
