@@ -36,14 +36,17 @@ _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
 # Matches that show whether to search at all, and the share of the angle that they have to.
 _NUM_GLANCED = 64
 _LEAST = 0.75
-# Share of its triangulation angle that the rotation of a pair may be off by.
-_WRONG = 0.25
+# Share of its triangulation angle that the rotation of a pair may be off by, and by which two
+# searches find the same pose.
+_WRONG, _SAME = 0.25, 0.05
 # How far a focal length may be adjusted, as a factor, and a distortion parameter, by addition. The
 # mapper registers no images beside such whose parameters passed 1.
 _FAR, _DISTORTED = 2.0, 0.5
 # The limits of the mapper itself: focal lengths in longer sides of the image, distortion
 # (min_focal_length_ratio, max_focal_length_ratio, max_extra_param).
 _SANE = 0.1, 10.0, 1.0
+# Points that show where the adjustment of a pair ends.
+_NUM_ADJUSTED = 200
 # As the mapper where there are few images.
 _NUM_ITERATIONS, _GRADIENT_TOLERANCE = 100, 0.1
 
@@ -116,6 +119,12 @@ def triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 
 
+def _angle_between(rotation: _Floats, other: _Floats) -> float:
+    """The angle between two rotations in degrees."""
+    cosine = (np.trace(rotation @ other.T) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
 @dataclass(frozen=True)
 class KnownPoses:
     """Poses that those of pairs are compared with.
@@ -138,10 +147,7 @@ class KnownPoses:
     def contradict(self, pair: Sequence[int], rotation: _Floats, angle: float) -> bool:
         """Whether a rotation of a pair is wrong by much of the triangulation angle it leads to."""
         known = self.rotation(pair)
-        if known is None:
-            return False
-        cosine = (np.trace(rotation @ known.T) - 1.0) / 2.0
-        return bool(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) > _WRONG * angle)
+        return known is not None and _angle_between(rotation, known) > _WRONG * angle
 
     def misleading_pairs(
         self, matched: MatchedImages, cameras: Sequence[pycolmap.Camera]
@@ -250,19 +256,27 @@ def _look(
     if pose is None or not _is_wide(pose, triangulation_angle(pose[:, :3], glanced.rays), _LEAST):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
-    begun = []
-    for found in _poses(geometry, inliers):
-        start = _begun(inliers, *found)
-        if start is not None:
-            _, pose, angle = found
-            if known.contradict(pair, pose[:, :3], angle):
-                return replace(start, holds=False)
-            begun.append(start)
-            if not start.holds:
-                return start
-    if not begun:
+    rotations, certain = list[_Floats](), list[bool]()
+    for rows, pose, angle in _poses(geometry, inliers):
+        # Another search may take what this one leaves.
+        if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
+            continue
+        rotation = pose[:, :3]
+        if known.contradict(pair, rotation, angle):
+            return _Start(holds=False, is_certain=False)
+        # An adjustment ends where one from nearly the same pose did.
+        if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
+            holds = _holds(inliers, rows, pose)
+            if holds is None:
+                continue
+            if not holds:
+                return _Start(holds=False, is_certain=False)
+        rotations.append(rotation)
+        enough = len(rows) >= _MARGIN * INITIAL_MIN_INLIERS
+        certain.append(enough and _is_wide(pose, angle, _MARGIN))
+    if not certain:
         return None
-    return _Start(True, len(begun) >= _NUM_SEEDS and all(start.is_certain for start in begun))
+    return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
 
 
 def _glanced(
@@ -326,20 +340,6 @@ def _poses(
             yield rows, pose, triangulation_angle(pose[:, :3], rays)
 
 
-def _begun(
-    inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats, angle: float
-) -> _Start | None:
-    """Adjust a pair from a pose; None where the mapper looks for another pair."""
-    # Another search may take what this one leaves.
-    if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
-        return None
-    holds = _holds(inliers, rows, pose)
-    if holds is None:
-        return None
-    enough = len(rows) >= _MARGIN * INITIAL_MIN_INLIERS
-    return _Start(holds, enough and _is_wide(pose, angle, _MARGIN))
-
-
 def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
     """Whether the cameras stay near what they were; None where too few points come about."""
     x = [own[:, rows] for own in inliers.x]
@@ -357,7 +357,8 @@ def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> boo
     inside &= np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) >= INITIAL_MIN_ANGLE
     if inside.sum() < INITIAL_MIN_POINTS:
         return None
-    model = _adjusted(inliers, pose, points[inside], rows[inside].tolist())
+    some = np.flatnonzero(inside)[:: max(1, np.count_nonzero(inside) // _NUM_ADJUSTED)]
+    model = _adjusted(inliers, pose, points[some], rows[some].tolist())
     return all(
         _is_near(model.images[k + 1].camera, camera) for k, camera in enumerate(inliers.cameras)
     )
