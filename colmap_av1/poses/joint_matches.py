@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -33,7 +34,9 @@ from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept
+from colmap_av1.video.coded_size import smaller_grey
 
 # An observation of the adjusted model disagrees with the poses if its error exceeds both this many
 # pixels and this multiple of the median error, which a rolling shutter, for example, raises.
@@ -51,8 +54,12 @@ _SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
 _NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
 _MOST_PAIRS = 16
 _FEW = 3
-# Most keypoints per image of tracks with three observations, by the density preset; 0: no limit.
-_MOST_MOTION = {"sparse": 450, "default": 900, "dense": 0}
+# Most keypoints per image of tracks with three observations, by the density preset: this share of
+# the SIFT features of a picture, and this number. As many points come about as from SIFT and some
+# more, since a mapper makes 7 to 12 points an image of 100 features.
+_MOTION = {"sparse": (0.2, 450), "default": (0.4, 950)}
+# Pictures whose features are counted.
+_NUM_SAMPLED = 5
 # A motion track this close to a corner, in pixels, sees the same point, less exactly.
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other are the same.
@@ -250,15 +257,35 @@ def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> 
     return replace(start, points=start.points[::step])
 
 
+def _limits(run: Run, image_set: ImageSet, density: DensityOptions) -> DensityOptions:
+    """How many motion tracks keep three observations each."""
+    most = density.max_tracks_per_image
+    if most is None:
+        most = 0
+        if density.preset in _MOTION:
+            share, limit = _MOTION[density.preset]
+            most = min(limit, round(share * _num_features(run, image_set)))
+    return replace(density, max_tracks_per_image=most, min_images=_FEW)
+
+
+def _num_features(run: Run, image_set: ImageSet) -> float:
+    """Mean number of SIFT features of a picture, by a few of them."""
+    count = len(image_set.sequence)
+    some = evenly_spread(count, min(count, _NUM_SAMPLED))
+    sift = cv2.SIFT.create()
+    pictures = run.pictures(image_set)(some)
+    return float(np.mean([len(sift.detect(smaller_grey(own))) for _, own in pictures]))
+
+
 def _kept_observations(
-    agreeing: _Agreeing, frames: NDArray[np.int32], density: DensityOptions
+    agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions
 ) -> NDArray[np.bool_]:
     """Which observations are matched: few of most motion tracks, all of others.
 
     Args:
         agreeing: the tracks.
         frames: int32 [num_images] the frames of all images.
-        density: which motion tracks are matched.
+        limits: how many motion tracks keep three observations each.
 
     Returns:
         bool [num_observations].
@@ -272,12 +299,6 @@ def _kept_observations(
         is_long = np.add.reduceat(longest, motion.offsets[:-1]) > 0
         few = _first_middle_last(motion, np.searchsorted(frames, motion.frame))
         few[np.repeat(is_long, motion.lengths)] = False
-        most = density.max_tracks_per_image
-        limits = replace(
-            density,
-            max_tracks_per_image=_MOST_MOTION[density.preset] if most is None else most,
-            min_images=_FEW,
-        )
         few[few] = spread_observations(motion.keep_observations(few), limits)
         kept[is_motion] = longest | few
     if agreeing.start is not None:
@@ -317,7 +338,7 @@ def _paired(
 ) -> PairedImages:
     """Match all images: those with a pose along what agrees with it, the others along all."""
     frames, start = image_set.images.frames, agreeing.start
-    kept = _kept_observations(agreeing, frames, density)
+    kept = _kept_observations(agreeing, frames, _limits(run, image_set, density))
     matched = Tracks.concatenate(agreeing.tracks.keep_observations(kept), agreeing.others)
     placed = agreeing.placed.frames
     pair = list[int]()
