@@ -285,7 +285,9 @@ def info_rows(report: StreamReport) -> Rows:
     )
     if report.num_cut:
         frames += f", {report.num_cut} hidden by an edit list"
-    motion = f"{report.median_motion:.2f} px per frame"
+    longer = max(report.width, report.height)
+    share = report.median_motion / longer
+    motion = f"{report.median_motion:.2f} px per frame, {share:.1%} of the longer side"
     if math.isnan(report.median_motion):
         motion = "none"
     display = report.display

@@ -29,6 +29,9 @@ _MIN_INTER_SHARE = 0.35
 _MIN_BITS_PER_PIXEL = 0.03
 _MIN_KEY_FRAME_DISTANCE = 12
 _MIN_MOTION = 0.1
+# Tracks break where the picture moves faster than this share of its longer side per frame, as at a
+# fast turn. Walks with such turns have more than this share of such frames, other clips none.
+_FAST_MOTION, _MAX_FAST_SHARE = 0.08, 0.05
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class StreamReport:
         hidden_reference_share: share of references to frames that are never shown.
         median_motion: median length of the units' displacements in pixels per shown frame; NaN
             if no unit refers to a shown frame.
+        fast_share: share of the frames in which the picture moves by more than 8 % of its longer
+            side per shown frame.
         bytes_per_frame: size of the stream per shown frame.
         bits_per_pixel: the same in bits per pixel.
         reasons: why the stream is poor for matching; empty if it is good.
@@ -73,6 +78,7 @@ class StreamReport:
     reference_distances: dict[int, float]
     hidden_reference_share: float
     median_motion: float
+    fast_share: float
     bytes_per_frame: float
     bits_per_pixel: float
     reasons: tuple[str, ...]
@@ -119,11 +125,24 @@ def inspect(
     bits_per_pixel = 8 * bytes_per_frame / max(1, width * height)
     references = sum(counts.references.values()) + counts.hidden_references
     median_motion = float(np.median(counts.motion)) if counts.motion else math.nan
-    reasons = structure.reasons(bits_per_pixel)
+    fast = _FAST_MOTION * max(width, height)
+    fast_share = float(np.mean(np.array(counts.motion) > fast)) if counts.motion else 0.0
+    reasons = list(structure.reasons(bits_per_pixel))
     if median_motion < _MIN_MOTION:
-        reasons += (
+        reasons.append(
             f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
-            "there is no parallax",
+            "there is no parallax"
+        )
+    if fast_share > _MAX_FAST_SHARE:
+        reasons.append(
+            f"the picture moves by more than {fast:.0f} px per frame in {fast_share:.0%} of the "
+            "frames: tracks break there; turn more slowly, or film more frames per second"
+        )
+    if len(counts.first_of_size) > 1:
+        sizes = ", ".join(f"{w}x{h}" for w, h in counts.first_of_size)
+        where = sorted(counts.first_of_size.values())[1]
+        reasons.append(
+            f"the picture size changes at frame {where} ({sizes}): encode it at one size"
         )
     return StreamReport(
         path=opened.path,
@@ -143,9 +162,10 @@ def inspect(
         },
         hidden_reference_share=counts.hidden_references / references if references else 0.0,
         median_motion=median_motion,
+        fast_share=fast_share,
         bytes_per_frame=bytes_per_frame,
         bits_per_pixel=bits_per_pixel,
-        reasons=reasons,
+        reasons=tuple(reasons),
     )
 
 
@@ -220,6 +240,8 @@ class _Counts:
     references: Counter[int] = field(default_factory=Counter)
     hidden_references: int = 0
     motion: list[float] = field(default_factory=list)
+    # The display index of the first shown frame of each size (width, height).
+    first_of_size: dict[tuple[int, int], int] = field(default_factory=dict)
 
 
 def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None) -> _Counts:
@@ -236,6 +258,7 @@ def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None
 def _count_references(frame: FrameMotion, counts: _Counts) -> None:
     if frame.display_index < 0:
         return
+    counts.first_of_size.setdefault((frame.width, frame.height), frame.display_index)
     inter = frame.use_intrabc == 0
     for list_index in (0, 1):
         reference = frame.ref_frame[..., list_index]

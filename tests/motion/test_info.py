@@ -58,3 +58,25 @@ def test_poor_streams(
     report = inspect(encode(frames, tmp_path / "poor.mp4", *how))
     assert not report.good
     assert any(reason in r for r in report.reasons), report.reasons
+
+
+def test_fast_turns(encode: Encode, tmp_path: Path) -> None:
+    """The picture moves by a tenth of its width in a fifth of the frames."""
+    steps = np.where(np.arange(40) % 20 < 4, 20, 2)
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.integers(0, 255, (128, 1000), np.uint8), (0, 0), 3)
+    wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX)
+    frames = np.array([wall[:, x : x + 192] for x in np.cumsum(steps)])
+    report = inspect(encode(np.repeat(frames[..., None], 3, axis=3), tmp_path / "turns.mp4", *AV1))
+    assert 0.15 < report.fast_share < 0.25
+    assert any("slowly" in reason for reason in report.reasons), report.reasons
+
+
+def test_a_change_of_size(encode: Encode, tmp_path: Path) -> None:
+    frames = make_frames(12)
+    one = encode(frames, tmp_path / "one.obu", *AV1)
+    other = encode(frames[:, :96, :128].copy(), tmp_path / "other.obu", *AV1)
+    both = tmp_path / "both.obu"
+    both.write_bytes(one.read_bytes() + other.read_bytes())
+    reasons = inspect(both).reasons
+    assert any("size" in reason and "12" in reason for reason in reasons), reasons
