@@ -25,6 +25,7 @@ from colmap_av1 import (
     ReadOptions,
     ReconstructOptions,
     RunOptions,
+    VerifyOptions,
     run_batch,
     write_page,
 )
@@ -34,7 +35,9 @@ from colmap_av1.cli import main
 # The folder that the package under test is installed in.
 PACKAGES = Path(colmap_av1.__file__).parents[1]
 ONCE = BatchOptions(retries=0)
-SMALL = MatchOptions(images=ImageOptions(image_name="%03d.jpg"))
+SMALL = MatchOptions(
+    images=ImageOptions(image_name="%03d.jpg"), verify=VerifyOptions(verify="pairs")
+)
 DONE = ["a/clip0", "a/clip2", "a/clip4", "b/clip1", "b/clip3", "b/clip5"]
 
 

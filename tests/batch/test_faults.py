@@ -18,7 +18,7 @@ from batch_output import files_of, rows_of, workers_of
 from conftest import HEED_INTERRUPTS
 
 import colmap_av1
-from colmap_av1 import BatchOptions, MatchOptions, ReadOptions, run_batch
+from colmap_av1 import BatchOptions, MatchOptions, ReadOptions, VerifyOptions, run_batch
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for proce
 
 def drive(clips: Path, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-c", HEED_INTERRUPTS, "batch", "--inputs", clips, "--output", out]
-    words = [*command, "--task", "match", "--retries", "99", "--quiet"]
+    words = [*command, "--task", "match", "--verify", "pairs", "--retries", "99", "--quiet"]
     path = os.pathsep.join([str(PACKAGES), *filter(None, sys.path)])
     return subprocess.Popen(
         list(map(str, words)),
@@ -52,7 +52,7 @@ def wait_for_workers(driver: subprocess.Popen[bytes]) -> list[int]:
 def test_workers_and_drivers_are_killed(clips: Path, tmp_path: Path) -> None:
     """Every video ends done or named, none half-written, and a run goes on where one ended."""
     calm, out = tmp_path / "calm", tmp_path / "out"
-    run_batch(clips, calm, MatchOptions())
+    run_batch(clips, calm, MatchOptions(verify=VerifyOptions(verify="pairs")))
     rng = random.Random(0)
     for how in (signal.SIGKILL, signal.SIGINT):
         with drive(clips, out) as driver:
