@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 from colmap_av1.errors import ModelError
@@ -31,8 +32,6 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Mappings of a run at most: the second one finds nearly all that a third one does.
 _MOST_MAPPINGS = 3
-# Times that what is left of a model is split at most.
-_MOST_SPLITS = 4
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     two sides together before may not agree once the largest part is adjusted on its own, so its
     seams are looked at again.
     """
-    for number in range(_MOST_MAPPINGS + 1, _MOST_MAPPINGS + _MOST_SPLITS + 1):
+    for number in count(_MOST_MAPPINGS + 1):
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result

@@ -114,6 +114,7 @@ class AdjustedResult(PosesResult):
         thin_seams: names of those that few points join at this place, see `Seams.thin`.
         turns: names of those between which the camera turns and the scale is lost, see
             `Seams.turns`.
+        usual_scaled: number of points that carry the scale across a usual seam.
         seams_warning: what the user should know of them.
     """
 
@@ -121,6 +122,7 @@ class AdjustedResult(PosesResult):
     doubtful_seams: tuple[tuple[str, str], ...]
     thin_seams: tuple[tuple[str, str], ...]
     turns: tuple[tuple[str, str], ...]
+    usual_scaled: float
     seams_warning: str | None
 
 
@@ -410,7 +412,9 @@ def adjustment_stage(
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
             thin_seams=tuple(seams.pairs[i] for i in seams.thin),
             turns=tuple(seams.pairs[i] for i in seams.turns),
-            seams_warning=seams.warning,
+            usual_scaled=seams.usual_scaled,
+            # A model whose scale is lost somewhere is split there, see `parts`.
+            seams_warning=seams.weak_warning,
         )
 
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)

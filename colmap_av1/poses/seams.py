@@ -75,12 +75,15 @@ class Seams:
         return self._below(_DOUBTFUL)
 
     @property
+    def usual_scaled(self) -> float:
+        """Number of points that carry the scale across a usual seam: the third quartile."""
+        # Much of a clip may be a turn, so the median may be that of turns.
+        return float(np.quantile(self.num_scaled, 0.75)) if len(self.num_scaled) else 0.0
+
+    @property
     def unscaled(self) -> list[int]:
         """Seams, by index, across which nothing carries the scale of the model."""
-        if len(self.num_points) == 0:
-            return []
-        # Much of a clip may be a turn.
-        least = _LOST * float(np.quantile(self.num_scaled, 0.75))
+        least = _LOST * self.usual_scaled
         return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
 
     @property
@@ -111,8 +114,13 @@ class Seams:
     @property
     def warning(self) -> str | None:
         """What the user should know of a model that hardly holds together somewhere."""
+        return self.weak_warning or self._scale_warning
+
+    @property
+    def weak_warning(self) -> str | None:
+        """What the user should know of weak seams."""
         if not self.weak:
-            return self._about_scale()
+            return None
         where = min(self.weak, key=lambda i: (int(self.num_points[i]), i))
         (first, second), count = self.pairs[where], int(self.num_points[where])
         more = len(self.weak) - 1
@@ -124,7 +132,8 @@ class Seams:
             "more slowly, or reconstruct the parts on either side apart"
         )
 
-    def _about_scale(self) -> str | None:
+    @property
+    def _scale_warning(self) -> str | None:
         """What the user should know of a model whose parts have scales of their own."""
         if not self.unscaled:
             return None
