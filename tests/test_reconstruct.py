@@ -22,11 +22,12 @@ import pycolmap
 import pytest
 from conftest import Encode, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
+from sequences import model_poses
 from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import (

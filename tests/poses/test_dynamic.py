@@ -16,8 +16,9 @@ from conftest import Encode
 from dense_scene import SCENE, Truth
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from sequences import model_poses
 
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, no_points
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask

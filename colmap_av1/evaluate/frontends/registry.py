@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.frontends.av1 import av1_frontend
-from colmap_av1.evaluate.frontends.footage import Footage
-from colmap_av1.evaluate.frontends.frontend import (
-    Frontend,
-    FrontendRun,
-    run_measured_frontend,
-)
+from colmap_av1.evaluate.frontends.frontend import Frontend
 from colmap_av1.evaluate.frontends.learned import learned_frontend
 from colmap_av1.evaluate.frontends.sift import exhaustive_sift, sequential_sift
 from colmap_av1.options import LearnedOptions, MatchOptions
@@ -39,29 +31,3 @@ def make_frontends(
         "disk-lightglue": learned_frontend("disk", learned),
         "aliked-lightglue": learned_frontend("aliked", learned),
     }
-
-
-FRONTENDS = make_frontends()
-
-
-def run_frontend(
-    name: str, footage: Footage, folder: Path, frontend: Frontend | None = None
-) -> FrontendRun:
-    """Fill a database and measure the cost; a finished run is not repeated.
-
-    Args:
-        name: one of FRONTENDS, or the name of `frontend`.
-        footage: video and images.
-        folder: gets `database.db`, `log.txt` and the figures.
-        frontend: the front-end, if it is not one of FRONTENDS.
-
-    Raises:
-        OptionError: the name is unknown.
-        ColmapAv1Error: the front-end refuses the footage.
-        EvaluationError: the front-end failed.
-    """
-    if frontend is None:
-        if name not in FRONTENDS:
-            raise OptionError(f"front-end '{name}': give one of {', '.join(FRONTENDS)}")
-        frontend = FRONTENDS[name]
-    return run_measured_frontend(name, footage, folder, frontend)
