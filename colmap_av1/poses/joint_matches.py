@@ -28,12 +28,12 @@ from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
 from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
-from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks, pose_tracks
+from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks, pose_tracks
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.stages import Kept
+from colmap_av1.util.texts import some_names
 
 # An observation of the adjusted model disagrees with the poses if its error exceeds both this many
 # pixels and this multiple of the median error, which a rolling shutter, for example, raises.
@@ -59,8 +59,6 @@ _SAME_POINT = 1.0
 _SAME_TRACK = 0.01
 # Most matches of the initial pair.
 _MOST_STARTING = 300
-# Images without a pose that a warning names.
-_NUM_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,6 @@ def match_jointly(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
     density: DensityOptions,
 ) -> JointMatches:
     """Estimate the poses of all images, and match what agrees with them.
@@ -109,7 +106,6 @@ def match_jointly(
         run: what every stage is given.
         videos: the tracks and images of each video.
         image_set: all images.
-        tracked: what is kept of each video's tracks.
         density: which motion tracks are matched.
 
     Raises:
@@ -118,7 +114,7 @@ def match_jointly(
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
-    posed = estimate_poses(run, videos, image_set, tracked)
+    posed = estimate_poses(run, videos, image_set)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("pictures far apart in time contradict the poses")
@@ -392,11 +388,9 @@ def _warnings(posed: Posed, left: Sequence[str], num_images: int) -> list[str]:
     """What the user should know of the estimate."""
     warnings = []
     if left:
-        names = ", ".join(f"'{name}'" for name in left[:_NUM_NAMED])
-        more = ", ..." if len(left) > _NUM_NAMED else ""
         warnings.append(
             f"{len(left)} of {num_images} images have no pose in the joint estimate and are "
-            f"matched by motion alone: {names}{more}"
+            f"matched by motion alone: {some_names(left)}"
         )
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
         warnings.append(posed.adjustment.result.seams_warning)

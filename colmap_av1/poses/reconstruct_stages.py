@@ -30,7 +30,6 @@ from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.reconstruct_tracks import (
     Run,
-    TracksResult,
     VideoTracks,
     key_images_of_video,
     pose_tracks,
@@ -93,7 +92,6 @@ def match_stage(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
     doubted: Sequence[int],
 ) -> Kept[MatchesResult]:
     """Write the database of the tracks that the poses come from, and of links.
@@ -102,7 +100,6 @@ def match_stage(
         run: what every stage is given.
         videos: the tracks of each video.
         image_set: the images.
-        tracked: what `track_stage` kept of each video.
         doubted: frames, counted through the videos, whose motion is not to be trusted.
     """
     options, clock = run.options, run.clock
@@ -151,7 +148,7 @@ def match_stage(
         run.stages,
         "matches",
         [
-            [t.digest for t in tracked],
+            [own.digest for own in videos],
             image_set.videos,
             run.photo_digests,
             given,

@@ -100,17 +100,21 @@ class Run:
 
 @dataclass(frozen=True)
 class VideoTracks:
-    """What `track_stage` keeps of a video.
+    """Tracks and images of a video.
 
     Attributes:
         tracks: its tracks.
         chosen: the frames that are images.
         inter_share: see `TrackedVideo`.
+        read_out: see `TracksResult`.
+        digest: digest of the stage that keeps them; empty if none does.
     """
 
     tracks: Tracks
     chosen: ChosenImages
     inter_share: NDArray[np.float32]
+    read_out: float | None
+    digest: str = ""
 
     def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
         """The same, but for frames whose motion is not to be trusted, whatever the stream says."""
@@ -170,7 +174,14 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
         # Of a long video no other frame is of use from here on.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
-        _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
+        with (partial / f"{name}.npz").open("wb") as file:
+            np.savez(
+                file,
+                **vars(tracks),
+                names=np.array(chosen.names),  # np.savez keeps names as they are
+                frames=chosen.frames,
+                inter_share=tracked.inter_share,
+            )
         check_unchanged(*source.files)
         return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
 
@@ -302,18 +313,22 @@ def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
         raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
 
 
-def _write_tracks(path: Path, own: VideoTracks) -> None:
-    with path.open("wb") as file:
-        # Names are kept by np.savez as they are.
-        names, frames = np.array(own.chosen.names), own.chosen.frames
-        np.savez(file, **vars(own.tracks), names=names, frames=frames, inter_share=own.inter_share)
-
-
-def read_tracks(run: Run, video: int) -> VideoTracks:
-    """The tracks, images and shares of inter units that `track_stage` kept of a video."""
+def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
+    """The tracks and images that `track_stage` kept of a video."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
-        chosen = ChosenImages([str(name) for name in file["names"]], file["frames"])
-        return VideoTracks(tracks_of(file), chosen, file["inter_share"])
+        return VideoTracks(
+            tracks_of(file),
+            ChosenImages([str(name) for name in file["names"]], file["frames"]),
+            file["inter_share"],
+            stage.result.read_out,
+            stage.digest,
+        )
+
+
+def read_tracks_only(run: Run, video: int) -> Tracks:
+    """The tracks that `track_stage` kept of a video, without its images."""
+    with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
+        return tracks_of(file)
 
 
 def tracks_of(file: Any) -> Tracks:

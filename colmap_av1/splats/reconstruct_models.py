@@ -17,7 +17,7 @@ from colmap_av1.poses.reconstruct_posed import (
     split_at_seams,
 )
 from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
-from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
+from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks_only
 from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
@@ -90,8 +90,8 @@ def further_models(
         own_poses = _poses_of_model(run, own, first, poses)
         free = left.difference(*names[number + 1 :])
         some, key = _named(image_set, known | free), _named(keyed, known)
-        videos = [read_tracks(run, video) for video in range(len(run.sources))]
-        believed = believed_tracks(run, videos, image_set)
+        tracks = [read_tracks_only(run, video) for video in range(len(run.sources))]
+        believed = believed_tracks(run, tracks, image_set)
         try:
             posed = refined_poses(
                 own,
