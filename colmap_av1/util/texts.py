@@ -18,9 +18,9 @@ _MOST_NAMED = 4
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def shown(text: str) -> str:
+def shown(text: str, most: int = _MOST_SHOWN) -> str:
     """The start of a text for a message, without characters that control a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text[:_MOST_SHOWN])
+    return "".join(c if c.isprintable() else "?" for c in text[:most])
 
 
 def some_names(names: Sequence[str]) -> str:
