@@ -37,7 +37,6 @@ from colmap_av1.poses.reconstruct_tracks import (
 )
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
@@ -213,7 +212,7 @@ def _match_images(
     Cameras are estimated from all images: a few that lie far apart mislead.
     """
     options = run.options.match
-    context = RunContext.of(options.run, run.clock, run.progress)
+    context = run.context
     groups = ImageMatchOptions(
         options.pairs, options.verify, options.links, least_length(options.tracks)
     )

@@ -249,7 +249,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
 
         def choose(tracked: TrackedVideo) -> ChosenImages:
             few = tracked.tracks.every_nth(_FEWER)
-            return _spread_in(run, video, replace(tracked, tracks=few), candidates)
+            return _spread_in(run, replace(tracked, tracks=few), candidates)
 
         return track(options, choose, frames=candidates, context=run.context)
 
@@ -258,7 +258,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
             TrackingOptions(
                 options.read, replace(run.options.match.tracks, seeding=_SEEDING), RefineOptions()
             ),
-            lambda tracked: _spread_in(run, video, tracked, candidates),
+            lambda tracked: _spread_in(run, tracked, candidates),
             frames=candidates,
             refine=False,
             context=replace(run.context, clock=Clock()),
@@ -271,9 +271,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
     )
 
 
-def _spread_in(
-    run: Run, video: int, tracked: TrackedVideo, candidates: NDArray[np.int32]
-) -> ChosenImages:
+def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -> ChosenImages:
     """As many images as a trainer wants among some frames of a video, its key images with them."""
     tracks = tracked.tracks
     candidates = candidates[candidates < tracks.num_frames]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from colmap_av1.evaluate.frontends.av1 import av1_frontend
 from colmap_av1.evaluate.frontends.frontend import Frontend
 from colmap_av1.evaluate.frontends.learned import learned_frontend
-from colmap_av1.evaluate.frontends.sift import exhaustive_sift, sequential_sift
+from colmap_av1.evaluate.frontends.sift import sift_frontend
 from colmap_av1.options import LearnedOptions, MatchOptions
 
 
@@ -18,6 +18,8 @@ def make_frontends(
         match: options of this package's front-ends, except refinement and preset.
         learned: options of the learned front-ends.
     """
+    match = match if match is not None else MatchOptions()
+    learned = learned if learned is not None else LearnedOptions()
     return {
         # "av1" uses the bitstream alone; "av1-refined" refines tracks in the decoded pictures.
         "av1": av1_frontend("none", "default", match),
@@ -26,8 +28,8 @@ def make_frontends(
         "av1-refined": av1_frontend("lk", "default", match),
         "av1-refined-sparse": av1_frontend("lk", "sparse", match),
         "av1-refined-dense": av1_frontend("lk", "dense", match),
-        "sift-sequential": sequential_sift(),
-        "sift-exhaustive": exhaustive_sift(),
+        "sift-sequential": sift_frontend("sequential"),
+        "sift-exhaustive": sift_frontend("exhaustive"),
         "disk-lightglue": learned_frontend("disk", learned),
         "aliked-lightglue": learned_frontend("aliked", learned),
     }
