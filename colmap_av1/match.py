@@ -39,7 +39,8 @@ from colmap_av1.matching.match_images import (
 from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
-from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks, encoding_for_pictures
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import decodable_frames

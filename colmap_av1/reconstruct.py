@@ -25,9 +25,9 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
-from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
-from colmap_av1.poses.reconstruct_tracks import (
-    Run,
+from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import (
     encoding_for_pictures,
     read_tracks,
     stage_of_video,

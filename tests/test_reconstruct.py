@@ -237,12 +237,12 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
 
     tracks = []
     for name, held in (("once", 1 << 40), ("twice", 0)):
-        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._MOST_HELD", held)
+        monkeypatch.setattr("colmap_av1.poses.track_stage._MOST_HELD", held)
         monkeypatch.setattr(
-            "colmap_av1.poses.reconstruct_tracks.spread_images",
+            "colmap_av1.poses.track_stage.spread_images",
             lambda *_: np.arange(0, 60, 5, dtype=np.int32),
         )
-        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._CANDIDATES", 6)
+        monkeypatch.setattr("colmap_av1.poses.track_stage._CANDIDATES", 6)
         options = ReconstructOptions(max_images=10)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
@@ -355,7 +355,7 @@ def test_model_of_two_images_is_none(copy: Path, monkeypatch: pytest.MonkeyPatch
     def map_two(*_: object, **__: object) -> tuple[int, ...]:
         return (2,)
 
-    stages = importlib.import_module("colmap_av1.poses.reconstruct_poses")
+    stages = importlib.import_module("colmap_av1.poses.pose_stages")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(ModelError, match="--mapper"):

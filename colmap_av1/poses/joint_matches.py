@@ -26,11 +26,12 @@ from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
-from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
-from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks, pose_tracks
+from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
+from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.texts import some_names

@@ -9,15 +9,17 @@ from pathlib import Path
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.placing.stage import PlaceResult, place_stage
-from colmap_av1.poses.reconstruct_posed import (
+from colmap_av1.poses.estimate import (
     Posed,
     believed_tracks,
     refined_poses,
     split_at_seams,
 )
-from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
-from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks_only
+from colmap_av1.poses.placing.stage import PlaceResult, place_stage
+from colmap_av1.poses.pose_stages import MappedResult
+from colmap_av1.poses.posed_images import read_posed_images
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import LEAST_IMAGES, read_tracks_only
 from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers

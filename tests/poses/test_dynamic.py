@@ -42,8 +42,8 @@ from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
 from colmap_av1.poses.dynamic.regions import moving_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import surely_still
-from colmap_av1.poses.reconstruct_poses import PosedImages
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import PosedImages
+from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks

@@ -15,25 +15,21 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
-from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
-from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
-from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
-from colmap_av1.options import EncodeOptions, ReconstructOptions, RefineOptions, TrackingOptions
+from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource, count_frames
+from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
-from colmap_av1.util.progress import Clock, Progress
-from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept, run_stage
-from colmap_av1.video.unchanged import FileState, check_unchanged
+from colmap_av1.video.unchanged import check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
@@ -46,56 +42,6 @@ _PIXELS_OF_UNIT = 16
 # those that poses come from.
 _FEWER = 4
 _SEEDING = 8
-
-
-@dataclass(frozen=True)
-class Run:
-    """What every stage is given.
-
-    Attributes:
-        inputs: the videos and photos.
-        sources: for each video, where its motion and pictures come from.
-        shown: for each video, how its pictures are looked at.
-        output: the folder that is made.
-        stages: the folder in it that holds what later runs resume from.
-        options: options of every stage.
-        clock: gets the time of each stage.
-        progress: called in each stage.
-        positions: where the images were taken; None before these are chosen.
-        cameras: of all images, where a database lists them; None: they are made anew.
-    """
-
-    inputs: Inputs
-    sources: tuple[VideoSource, ...]
-    shown: tuple[ShownVideo, ...]
-    output: Path
-    stages: Path
-    options: ReconstructOptions
-    clock: Clock
-    progress: Progress
-    positions: ImagePositions | None = None
-    cameras: ImageCameras | None = None
-
-    @property
-    def context(self) -> RunContext:
-        """Clock, progress, threads and seed of the run."""
-        return RunContext.of(self.options.match.run, self.clock, self.progress)
-
-    @property
-    def files(self) -> tuple[FileState, ...]:
-        """All files as they were at the start."""
-        photos = [photo.state for photo in self.inputs.photos]
-        return (*(file for source in self.sources for file in source.files), *photos)
-
-    @property
-    def photo_digests(self) -> list[list[str]]:
-        """Name and digest of each photo, which stages depend on."""
-        return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
-
-    def pictures(self, image_set: ImageSet) -> Pictures:
-        """What gives the pictures of images, see `pictures_of`."""
-        photos = [photo.path for photo in self.inputs.photos]
-        return pictures_of(image_set, self.shown, photos, self.options.match.reading)
 
 
 @dataclass(frozen=True)

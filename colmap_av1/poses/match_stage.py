@@ -28,13 +28,8 @@ from colmap_av1.matching.match_images import (
 )
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions
-from colmap_av1.poses.reconstruct_tracks import (
-    Run,
-    VideoTracks,
-    key_images_of_video,
-    pose_tracks,
-    tracks_of,
-)
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks, key_images_of_video, pose_tracks, tracks_of
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.stages import Kept, run_stage

@@ -1,4 +1,4 @@
-"""The stages of `reconstruct` that end in poses, in their order."""
+"""The joint estimate of all poses: its stages in their order, for `match` and `reconstruct`."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
 from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
 from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import split_stage
-from colmap_av1.poses.reconstruct_poses import (
+from colmap_av1.poses.pose_stages import (
     AdjustedResult,
     MappedResult,
-    PosesResult,
     adjustment_stage,
     pose_stage,
     resection_stage,
 )
-from colmap_av1.poses.reconstruct_stages import MatchesResult, match_stage, read_links
-from colmap_av1.poses.reconstruct_tracks import Run, VideoTracks
+from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.remapping import remap_stage
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
