@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from colmap_av1.check.model_figures import model_figures
 from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
-from colmap_av1.evaluate.frontends.frontend import Frontend
+from colmap_av1.evaluate.frontends.frontend import Frontend, run_frontend
 from colmap_av1.evaluate.frontends.imported import imported_frontend
 from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
-from colmap_av1.evaluate.frontends.registry import make_frontends, run_frontend
+from colmap_av1.evaluate.frontends.registry import make_frontends
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
-from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
-from colmap_av1.evaluate.metrics.sequence import read_poses
+from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors, read_poses
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split

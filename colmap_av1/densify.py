@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.colmap_model import (
@@ -140,13 +139,14 @@ def densify(
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
     read = [model, *paths_of(video), photos, folder, *options.match.files]
-    _check_outputs(output, gaussians, read, overwrite=overwrite)
+    # What can be refused is refused before the long work.
+    check_new_folder(output, MODEL_FILES, read, overwrite=overwrite)
+    check_gaussians_path(gaussians, read, overwrite=overwrite)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
     inputs = _read_inputs(video, photos, options, posed)
     with unchanged(*inputs.states):
-        # What can be refused is refused before the long work.
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
         of_videos = images_of_videos(model, sizes, inputs, folder, options.match.images)
         context = RunContext.of(options.match.run, clock, progress)
@@ -163,7 +163,16 @@ def densify(
         row = Tracks.in_sequence([own.tracks for own in tracked], image_set.num_frames)
         seen, view = seen_in(row, image_set.images.frames)
         with clock.measure("points"):
-            points = _triangulate(seen, view, views, options, progress)
+            points = triangulate_tracks(
+                seen,
+                view,
+                [own.camera for own in views],
+                [own.cam_from_world for own in views],
+                None,
+                options=options.triangulate,
+                num_threads=options.match.run.num_threads,
+                progress=progress,
+            )
         agreeing = _agreement(model, points)
         of_tracks = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
         with scratch_folder(output) as scratch:
@@ -236,25 +245,6 @@ def _track(
         )
     tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.size)
     return found.with_tracks(tracks), source.conversion
-
-
-def _triangulate(
-    seen: Tracks,
-    view: NDArray[np.int64],
-    views: Sequence[PosedCamera],
-    options: DensifyOptions,
-    progress: Progress,
-) -> TriangulatedPoints:
-    return triangulate_tracks(
-        seen,
-        view,
-        [own.camera for own in views],
-        [own.cam_from_world for own in views],
-        None,
-        options=options.triangulate,
-        num_threads=options.match.run.num_threads,
-        progress=progress,
-    )
 
 
 def _pictures(
@@ -343,18 +333,6 @@ def _agreement(model: Path, points: TriangulatedPoints) -> float:
             "and see that their names count its frames (--first_number, --frame_list)"
         )
     return agreeing
-
-
-def _check_outputs(
-    output: Path,
-    gaussians: str | os.PathLike[str] | None,
-    inputs: Sequence[str | os.PathLike[str] | None],
-    *,
-    overwrite: bool,
-) -> None:
-    """Refuse what must not or cannot be written, before the long work."""
-    check_new_folder(output, MODEL_FILES, inputs, overwrite=overwrite)
-    check_gaussians_path(gaussians, inputs, overwrite=overwrite)
 
 
 def _read_inputs(

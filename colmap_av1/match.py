@@ -39,12 +39,8 @@ from colmap_av1.matching.match_images import (
 from colmap_av1.matching.shutter.correct import without_shutter
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
-from colmap_av1.poses.reconstruct_tracks import (
-    Run,
-    TracksResult,
-    VideoTracks,
-    encoding_for_pictures,
-)
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import decodable_frames
@@ -52,7 +48,6 @@ from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
-from colmap_av1.util.stages import Kept
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
@@ -496,16 +491,11 @@ def _match_jointly(
     tracked = [own.tracked for own in images.videos]
     return match_jointly(
         run,
-        [VideoTracks(own.tracks, own.chosen, own.video.inter_share) for own in tracked],
-        images.image_set,
         [
-            Kept(
-                TracksResult(own.tracks.num_frames, own.tracks.num_tracks, own.video.read_out, ()),
-                digest="",
-                resumed=False,
-            )
+            VideoTracks(own.tracks, own.chosen, own.video.inter_share, own.video.read_out)
             for own in tracked
         ],
+        images.image_set,
         options.density,
     )
 

@@ -25,9 +25,9 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
-from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
-from colmap_av1.poses.reconstruct_tracks import (
-    Run,
+from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import (
     encoding_for_pictures,
     read_tracks,
     stage_of_video,
@@ -42,13 +42,12 @@ from colmap_av1.util.files import check_apart, scratch_folder, whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
+from colmap_av1.util.texts import some_names
 from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
 _REPORT = "report.json"
-# Images without a pose that a warning names.
-_NUM_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,6 @@ def reconstruct(
             masks.check([own.picture_size], names, options.match.images)
     context = RunContext.of(options.match.run, clock, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
-        _remove_earlier_layout(stages)
         sources = tuple(
             opened.enter_context(
                 open_source(
@@ -246,17 +244,6 @@ def reconstruct(
     return report
 
 
-def _remove_earlier_layout(stages: Path) -> None:
-    """Remove models that earlier versions kept among the stages, in folders.
-
-    Trainers that search the whole output folder would find them.
-    """
-    for folder in (stages, *stages.parent.glob(f"model_*/{stages.name}")):
-        for name in ("poses", "placed", "adjusted", "in_place"):
-            for file in (folder / name).rglob("*.bin"):
-                file.unlink()
-
-
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
     """The options with which videos are converted."""
     if not options.mapping.adjust:
@@ -267,13 +254,13 @@ def _as_converted(options: ReconstructOptions) -> MatchOptions:
 def _run_stages(run: Run) -> ReconstructReport:
     numbers = range(len(run.sources))
     tracked = [track_stage(run, video) for video in numbers]
-    videos = [read_tracks(run, video) for video in numbers]
+    videos = [read_tracks(run, video, stage) for video, stage in enumerate(tracked)]
     image_set = run.inputs.image_set(
         [own.chosen for own in videos], [own.tracks.num_frames for own in videos]
     )
     positions = image_positions(image_set, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
-    posed = estimate_poses(run, videos, image_set, tracked)
+    posed = estimate_poses(run, videos, image_set)
     del videos  # as large as the tracks that the poses agree with
     placed, written = written_model(run, posed, image_set)
     further, unplaced = further_models(run, posed, image_set)
@@ -368,10 +355,9 @@ def _warnings(
             "'images' and 'sparse/0'"
         )
     if unplaced:
-        names = ", ".join(f"'{name}'" for name in unplaced[:_NUM_NAMED])
-        more = ", ..." if len(unplaced) > _NUM_NAMED else ""
         warnings.append(
-            f"{len(unplaced)} of {num_images} images have no pose and are left out: {names}{more}"
+            f"{len(unplaced)} of {num_images} images have no pose and are left out: "
+            f"{some_names(unplaced)}"
         )
     left_out = [name for name, count in poses.registered.items() if count == 0]
     if left_out and not further:

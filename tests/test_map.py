@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from dense_scene import EVERY, NUM_IMAGES, SCENE, Truth
+from sequences import model_poses
 
 from colmap_av1 import (
     DatabaseError,
@@ -28,7 +29,7 @@ from colmap_av1 import (
     match,
 )
 from colmap_av1.cli import main
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import Mapper
 from colmap_av1.reconstruct import ReconstructReport

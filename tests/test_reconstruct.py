@@ -22,11 +22,12 @@ import pycolmap
 import pytest
 from conftest import Encode, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
+from sequences import model_poses
 from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import (
@@ -147,15 +148,6 @@ def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: Reconstr
     assert found == {"images", "sparse"}
 
 
-def test_models_among_the_stages_of_an_earlier_version_go(copy: Path) -> None:
-    """Such folders had a model with as many images as the finished one, and a smaller path."""
-    for name in ("poses/0", "placed", "adjusted"):
-        shutil.copytree(copy / "sparse" / "0", copy / ".stages" / name)
-    assert brush(copy).model == copy / ".stages" / "adjusted"
-    reconstruct(SCENE, copy, options=OPTIONS)
-    check_taken(brush(copy), copy)
-
-
 def test_masks_are_those_of_the_model(copy: Path) -> None:
     masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():
@@ -245,12 +237,12 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
 
     tracks = []
     for name, held in (("once", 1 << 40), ("twice", 0)):
-        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._MOST_HELD", held)
+        monkeypatch.setattr("colmap_av1.poses.track_stage._MOST_HELD", held)
         monkeypatch.setattr(
-            "colmap_av1.poses.reconstruct_tracks.spread_images",
+            "colmap_av1.poses.track_stage.spread_images",
             lambda *_: np.arange(0, 60, 5, dtype=np.int32),
         )
-        monkeypatch.setattr("colmap_av1.poses.reconstruct_tracks._CANDIDATES", 6)
+        monkeypatch.setattr("colmap_av1.poses.track_stage._CANDIDATES", 6)
         options = ReconstructOptions(max_images=10)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
@@ -363,7 +355,7 @@ def test_model_of_two_images_is_none(copy: Path, monkeypatch: pytest.MonkeyPatch
     def map_two(*_: object, **__: object) -> tuple[int, ...]:
         return (2,)
 
-    stages = importlib.import_module("colmap_av1.poses.reconstruct_poses")
+    stages = importlib.import_module("colmap_av1.poses.pose_stages")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(ModelError, match="--mapper"):

@@ -377,7 +377,7 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
         shutil.copytree(output / "0", output / "1")
         return size, size
 
-    monkeypatch.setattr("colmap_av1.poses.reconstruct_poses.map_poses", twice)
+    monkeypatch.setattr("colmap_av1.poses.pose_stages.map_poses", twice)
     alone = reconstruct(halves[0], tmp_path / "out", options=ReconstructOptions(match=QUICK))
     assert alone.other_models == ()
     assert alone.warnings == ()

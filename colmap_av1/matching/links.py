@@ -48,6 +48,7 @@ from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.spread import evenly_spread
+from colmap_av1.util.texts import some_names
 
 # --- Which pictures are examined.
 # Images on either side of a gap, by their distance from it. The nearest see most in common, the
@@ -113,7 +114,7 @@ _JOIN_DISTANCE = 1.0
 # Expected error of a feature in pixels.
 _SIGMA = 0.5
 
-# Gaps and photos that a warning names.
+# Gaps that a warning names.
 _NUM_NAMED = 4
 
 
@@ -194,11 +195,10 @@ class LinkReport:
     def _photo_warnings(self) -> tuple[str, ...]:
         if not self.unlinked_photos:
             return ()
-        names = ", ".join(f"'{name}'" for name in self.unlinked_photos[:_NUM_NAMED])
-        more = ", ..." if len(self.unlinked_photos) > _NUM_NAMED else ""
+        names = some_names(self.unlinked_photos)
         return (
             f"{len(self.unlinked_photos)} photos show nothing that a video shows, and are "
-            f"connected to none: {names}{more}",
+            f"connected to none: {names}",
         )
 
 

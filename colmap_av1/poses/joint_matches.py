@@ -27,15 +27,16 @@ from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.reconstruct_posed import Posed, estimate_poses
-from colmap_av1.poses.reconstruct_poses import PosedImages, posed_images_of, triangulate_in
-from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks, pose_tracks
+from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
+from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.spread import evenly_spread
-from colmap_av1.util.stages import Kept
+from colmap_av1.util.texts import some_names
 from colmap_av1.video.coded_size import smaller_grey
 
 # An observation of the adjusted model disagrees with the poses if its error exceeds both this many
@@ -66,8 +67,6 @@ _SAME_POINT = 1.0
 _SAME_TRACK = 0.01
 # Most matches of the initial pair.
 _MOST_STARTING = 300
-# Images without a pose that a warning names.
-_NUM_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,6 @@ def match_jointly(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
     density: DensityOptions,
 ) -> JointMatches:
     """Estimate the poses of all images, and match what agrees with them.
@@ -116,7 +114,6 @@ def match_jointly(
         run: what every stage is given.
         videos: the tracks and images of each video.
         image_set: all images.
-        tracked: what is kept of each video's tracks.
         density: which motion tracks are matched.
 
     Raises:
@@ -125,7 +122,7 @@ def match_jointly(
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
-    posed = estimate_poses(run, videos, image_set, tracked)
+    posed = estimate_poses(run, videos, image_set)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("pictures far apart in time contradict the poses")
@@ -413,11 +410,9 @@ def _warnings(posed: Posed, left: Sequence[str], num_images: int) -> list[str]:
     """What the user should know of the estimate."""
     warnings = []
     if left:
-        names = ", ".join(f"'{name}'" for name in left[:_NUM_NAMED])
-        more = ", ..." if len(left) > _NUM_NAMED else ""
         warnings.append(
             f"{len(left)} of {num_images} images have no pose in the joint estimate and are "
-            f"matched by motion alone: {names}{more}"
+            f"matched by motion alone: {some_names(left)}"
         )
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
         warnings.append(posed.adjustment.result.seams_warning)

@@ -13,14 +13,15 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.long_range import FarViewCheck, FarViews
-from colmap_av1.poses.reconstruct_poses import (
+from colmap_av1.poses.posed_images import (
     FOR_POSES,
     PosedImages,
     PosesResult,
     read_posed_images,
     triangulate_in,
 )
-from colmap_av1.poses.reconstruct_tracks import Run, pose_tracks
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.reconstruct_poses import AdjustedResult, MappedResult, registered_by_video
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.pose_stages import AdjustedResult, MappedResult
+from colmap_av1.poses.posed_images import registered_by_video
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import REACH
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage

@@ -30,19 +30,17 @@ from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.reconstruct_poses import (
+from colmap_av1.poses.pose_stages import (
     FROM_PICTURES,
     LOSS_SCALES,
     START_TRACKS,
     TOLERANCE,
     AdjustedResult,
-    PosesResult,
     adjust_in,
-    posed_images_of,
     refines_intrinsics,
-    triangulate_in,
 )
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import PosesResult, posed_images_of, triangulate_in
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage

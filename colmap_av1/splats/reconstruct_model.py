@@ -33,14 +33,14 @@ from colmap_av1.geometry.undistortion import (
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.dynamic.short_tracks import surely_still
-from colmap_av1.poses.reconstruct_poses import (
+from colmap_av1.poses.posed_images import (
     PosedImages,
     PosesResult,
     check_agreement,
     read_posed_images,
     triangulate_in,
 )
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.run import Run
 from colmap_av1.splats.cloud import take_points
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks

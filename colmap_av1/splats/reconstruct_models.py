@@ -9,16 +9,18 @@ from pathlib import Path
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.parts import FEWEST_IMAGES
-from colmap_av1.poses.placing.stage import PlaceResult, place_stage
-from colmap_av1.poses.reconstruct_posed import (
+from colmap_av1.poses.estimate import (
     Posed,
     believed_tracks,
     refined_poses,
     split_at_seams,
 )
-from colmap_av1.poses.reconstruct_poses import MappedResult, read_posed_images
-from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, read_tracks
+from colmap_av1.poses.parts import FEWEST_IMAGES
+from colmap_av1.poses.placing.stage import PlaceResult, place_stage
+from colmap_av1.poses.pose_stages import MappedResult
+from colmap_av1.poses.posed_images import read_posed_images
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import LEAST_IMAGES, read_tracks_only
 from colmap_av1.splats.reconstruct_model import ModelResult, model_stage
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
@@ -98,8 +100,8 @@ def further_models(
         own_poses = _poses_of_model(run, own, first, poses)
         free = left.difference(*names[number + 1 :])
         some, key = _named(image_set, known | free), _named(keyed, known)
-        videos = [read_tracks(run, video) for video in range(len(run.sources))]
-        believed = believed_tracks(run, videos, image_set)
+        tracks = [read_tracks_only(run, video) for video in range(len(run.sources))]
+        believed = believed_tracks(run, tracks, image_set)
         try:
             posed = refined_poses(
                 own,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import os
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from colmap_av1.errors import ImageError
@@ -12,12 +13,20 @@ from colmap_av1.errors import ImageError
 _LARGEST = 1 << 28
 # Number of characters that a message shows of a text.
 _MOST_SHOWN = 40
+# Number of names that a message shows.
+_MOST_NAMED = 4
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def shown(text: str) -> str:
+def shown(text: str, most: int = _MOST_SHOWN) -> str:
     """The start of a text for a message, without characters that control a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text[:_MOST_SHOWN])
+    return "".join(c if c.isprintable() else "?" for c in text[:most])
+
+
+def some_names(names: Sequence[str]) -> str:
+    """The first names of a list for a message."""
+    listed = [f"'{name}'" for name in names[:_MOST_NAMED]]
+    return ", ".join([*listed, "..."] if len(names) > _MOST_NAMED else listed)
 
 
 def read_lines(path: str | os.PathLike[str]) -> list[str]:

@@ -17,17 +17,10 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 from rich.console import Console
+from sequences import Sequence, measure_frontend, model_poses, prepare_footage, read_sequence
 
 from colmap_av1 import CameraOptions, ColmapAv1Error, MapOptions
-from colmap_av1.evaluate import (
-    Footage,
-    measure_mapper,
-    model_poses,
-    prepare_footage,
-    read_sequence,
-    run_frontend,
-)
-from colmap_av1.evaluate.metrics.sequence import Sequence
+from colmap_av1.evaluate import Footage, measure_mapper
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
@@ -254,7 +247,7 @@ def with_reference(truth: Truth, model: Any, num_frames: int) -> Truth:
 def reference_model(footage: Footage, folder: Path, settings: MapOptions, console: Console) -> Any:
     """The model that replaces unknown ground truth."""
     console.print(f"{folder.name}: {REFERENCE} as the reference", markup=False)
-    run = run_frontend(REFERENCE, footage, folder / REFERENCE)
+    run = measure_frontend(REFERENCE, footage, folder / REFERENCE)
     where = folder / f"{REFERENCE}-model"
     mapper = measure_mapper(run.database, footage.image_path, where, settings)
     if mapper.model is None:

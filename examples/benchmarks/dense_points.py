@@ -22,12 +22,17 @@ import render
 from clips import EXAMPLES, load_render_scene
 from numpy.typing import NDArray
 from results import Value, add_results, read_rows, save
+from scipy.spatial import KDTree
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
-from colmap_av1.evaluate.metrics.clouds import depth_differences, point_cloud
+from colmap_av1.evaluate.metrics.clouds import point_cloud
 from colmap_av1.geometry.colmap_model import ModelImage, no_points, read_model, write_model
 from colmap_av1.options import TriangulateOptions
+
+# Smallest track length of a reference point, and number of nearby reference points to consider.
+REFERENCE_LENGTH = 4
+NEAREST = 3
 
 
 @dataclass(frozen=True)
@@ -133,6 +138,57 @@ def true_model(scene: Any, folder: Path) -> Path:
     ]
     write_model(folder, {1: camera}, images, no_points())
     return folder
+
+
+def depth_differences(
+    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction, *, pixels: float = 5.0
+) -> NDArray[np.float64]:
+    """Relative differences between a model's depths and those of nearby reference points.
+
+    Each point is projected into the middle image of its track. Of the three nearest reference
+    points there with four or more observations, the one with the most similar depth counts, because
+    at an occlusion boundary others lie on the background.
+
+    Args:
+        model: a pycolmap.Reconstruction.
+        reference: another model with the same poses and image ids.
+        pixels: largest distance in the image to a reference point, in pixels.
+
+    Returns:
+        float64 [num_points], in the order of the point ids: the difference divided by the
+        reference's depth; NaN if no reference point is near.
+    """
+    ids = sorted(model.points3D)
+    xyz = point_cloud(model)
+    middle = np.array([_middle_image(model.points3D[i].track) for i in ids], np.int64)
+    difference = np.full(len(ids), np.nan)
+    for image_id in np.unique(middle):
+        seen = [
+            (p.xy, reference.points3D[p.point3D_id].xyz)
+            for p in reference.images[image_id].points2D
+            if p.has_point3D()
+            and reference.points3D[p.point3D_id].track.length() >= REFERENCE_LENGTH
+        ]
+        if not seen:
+            continue
+        image = model.images[image_id]
+        pose = np.asarray(image.cam_from_world().matrix())
+        own = np.flatnonzero(middle == image_id)
+        in_camera = xyz[own] @ pose[:, :3].T + pose[:, 3]
+        own, in_camera = own[in_camera[:, 2] > 0], in_camera[in_camera[:, 2] > 0]
+        xy, there = (np.array(column) for column in zip(*seen, strict=True))
+        depth = np.append(there @ pose[2, :3] + pose[2, 3], np.nan)
+        projected = np.asarray(model.cameras[image.camera_id].img_from_cam(in_camera))
+        # KDTree returns len(xy) for a missing neighbour, whose depth here is NaN.
+        _, near = KDTree(xy).query(projected, k=NEAREST, distance_upper_bound=pixels)
+        off = np.abs(in_camera[:, 2:] / depth[near] - 1)
+        difference[own] = np.fmin.reduce(off, axis=1)
+    return difference
+
+
+def _middle_image(track: pycolmap.Track) -> int:
+    image_ids = sorted(int(element.image_id) for element in track.elements)
+    return image_ids[len(image_ids) // 2]
 
 
 if __name__ == "__main__":

@@ -23,6 +23,8 @@ import clips as ruler
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from results import add_results, save
 from rich.console import Console
+from sequences import Sequence, model_poses, read_sequence
+from track_metrics import epipolar_errors
 
 from colmap_av1 import (
     CameraOptions,
@@ -36,8 +38,7 @@ from colmap_av1 import (
     read_motion,
     reconstruct,
 )
-from colmap_av1.evaluate import epipolar_errors, model_poses, pose_errors, run_measured
-from colmap_av1.evaluate.metrics.sequence import Sequence, read_sequence
+from colmap_av1.evaluate import pose_errors, run_measured
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in

@@ -35,6 +35,7 @@ from clips import (
 )
 from results import Value, add_results, read_rows, save
 from rich.console import Console
+from sequences import measure_frontend, model_poses
 
 from colmap_av1 import (
     ColmapAv1Error,
@@ -52,9 +53,7 @@ from colmap_av1.evaluate import (
     Measured,
     measure_mapper,
     model_figures,
-    model_poses,
     pose_errors,
-    run_frontend,
     run_measured,
 )
 from colmap_av1.geometry.colmap_model import read_model
@@ -156,11 +155,11 @@ def measure_case(
 
         made = step_of(run_measured(run_reconstruct, footage, case, where / "dense", log=log))
         add("reconstruct: dense model", made, where / "dense" / "sparse" / "0")
-        sift = step_of_frontend(run_frontend("sift-sequential", footage, where / "sift"))
+        sift = step_of_frontend(measure_frontend("sift-sequential", footage, where / "sift"))
         mapped = measure_mapper(
             where / "sift" / "database.db", footage.image_path, where / "sift-model", settings
         )
-        ours = step_of_frontend(run_frontend("av1", footage, where / "match"))
+        ours = step_of_frontend(measure_frontend("av1", footage, where / "match"))
         our_model = measure_mapper(
             where / "match" / "database.db", footage.image_path, where / "match-model", settings
         )

@@ -23,9 +23,9 @@ import pycolmap
 from clips import EXAMPLES, load_render_scene
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from sequences import model_poses
 
 from colmap_av1 import FrameMotion, RefineOptions, Tracks, build_tracks, read_motion
-from colmap_av1.evaluate import model_poses
 from colmap_av1.tracks.refine import match_tracks
 from colmap_av1.video.decoding import decode_frames
 

@@ -31,6 +31,7 @@ import render
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
 from rich.console import Console
+from sequences import measure_frontend, model_poses, prepare_footage, read_sequence
 
 from colmap_av1 import (
     ColmapAv1Error,
@@ -42,15 +43,7 @@ from colmap_av1 import (
     match,
     reconstruct,
 )
-from colmap_av1.evaluate import (
-    measure_mapper,
-    model_poses,
-    pose_errors,
-    prepare_footage,
-    read_sequence,
-    run_frontend,
-    run_measured,
-)
+from colmap_av1.evaluate import measure_mapper, pose_errors, run_measured
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.video.decoding import decode_frames
@@ -179,7 +172,7 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
         camera=camera,
     )
     console.print(f"{name}: SIFT's model of the whole", markup=False)
-    database = run_frontend("sift-sequential", footage, folder / "sift").database
+    database = measure_frontend("sift-sequential", footage, folder / "sift").database
     settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
     mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
     if mapped.model is None:

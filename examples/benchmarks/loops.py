@@ -26,16 +26,10 @@ import render
 from clips import load_render_scene
 from numpy.typing import NDArray
 from results import Value, add_results, read_rows, save
+from sequences import measure_frontend, model_poses, prepare_footage
 
 from colmap_av1 import CameraOptions, ImageOptions, MatchOptions, ReconstructOptions, reconstruct
-from colmap_av1.evaluate import (
-    measure_mapper,
-    model_poses,
-    pose_errors,
-    prepare_footage,
-    run_frontend,
-    run_measured,
-)
+from colmap_av1.evaluate import measure_mapper, pose_errors, run_measured
 from colmap_av1.geometry.colmap_model import camera_centres, read_model
 
 SCRIPT = load_render_scene()
@@ -193,7 +187,7 @@ def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[
             image_step=STEP,
             camera=CameraOptions(),
         )
-        matched = run_frontend("sift-exhaustive", footage, folder / "sift")
+        matched = measure_frontend("sift-exhaustive", footage, folder / "sift")
         database = matched.database
         mapped = measure_mapper(database, footage.image_path, folder / "sift-model")
         if mapped.model is None:

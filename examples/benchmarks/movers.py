@@ -24,10 +24,11 @@ import render
 from clips import load_render_scene
 from numpy.typing import NDArray
 from results import Value, add_results, read_rows, save
+from sequences import model_poses
 
 from colmap_av1 import CameraOptions, MaskOptions, MatchOptions, ReconstructOptions, reconstruct
 from colmap_av1.evaluate import run_measured
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 
 Floats = NDArray[np.float64]

@@ -26,10 +26,11 @@ from jerks import Whole, whole_sequence, write_clip
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
 from rich.console import Console
+from sequences import read_sequence
 
 from colmap_av1 import ColmapAv1Error, ReconstructOptions, ReconstructReport, reconstruct
-from colmap_av1.evaluate import pose_errors, read_sequence, run_measured
-from colmap_av1.evaluate.metrics.sequence import frame_number
+from colmap_av1.evaluate import pose_errors, run_measured
+from colmap_av1.evaluate.metrics.poses import frame_number
 from colmap_av1.geometry.colmap_model import posed_images, read_model
 
 

@@ -31,6 +31,7 @@ import pycolmap
 import render
 from results import add_results, read_rows, save
 from rich.console import Console
+from sequences import model_poses, read_sequence
 
 from colmap_av1 import (
     CameraOptions,
@@ -50,9 +51,7 @@ from colmap_av1.evaluate import (
     Measured,
     measure_mapper,
     model_figures,
-    model_poses,
     pose_errors,
-    read_sequence,
     run_measured,
 )
 from colmap_av1.evaluate.frontends.frontend import list_images

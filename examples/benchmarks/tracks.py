@@ -40,6 +40,15 @@ from clips import (
 )
 from results import Value, add_results, read_rows, save
 from rich.console import Console
+from sequences import FRONTENDS, measure_frontend, model_poses
+from track_metrics import (
+    SPANS,
+    TrackStatistics,
+    database_tracks,
+    epipolar_errors,
+    exact_errors,
+    track_statistics,
+)
 
 from colmap_av1 import (
     CameraOptions,
@@ -50,24 +59,15 @@ from colmap_av1 import (
     Tracks,
 )
 from colmap_av1.evaluate import (
-    FRONTENDS,
-    SPANS,
     Footage,
     FrontendRun,
     MapperRun,
     ModelFigures,
     PoseErrors,
-    TrackStatistics,
-    database_tracks,
     densify_model,
-    epipolar_errors,
-    exact_errors,
     measure_mapper,
     model_figures,
-    model_poses,
     pose_errors,
-    run_frontend,
-    track_statistics,
 )
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
@@ -182,7 +182,7 @@ def measure_case(
             given = (
                 footage if name not in FROM_SOURCE else source_footage(footage, material, folder)
             )
-            run = run_frontend(FROM_SOURCE.get(name, name), given, folder / name)
+            run = measure_frontend(FROM_SOURCE.get(name, name), given, folder / name)
             run = replace(run, name=name)
             mapper = dense = None
             if mapping:

@@ -28,10 +28,11 @@ import render
 from clips import ENCODING, EXAMPLES, SEQUENCES, camera_options, ffmpeg, ffmpeg_input, is_there
 from numpy.typing import NDArray
 from results import Value, add_results, read_rows, save
+from sequences import read_sequence
 
 from colmap_av1 import CameraOptions, ColmapAv1Error, MatchOptions, match
 from colmap_av1.database.reading import image_ids_from_pair_id
-from colmap_av1.evaluate import read_sequence, run_measured
+from colmap_av1.evaluate import run_measured
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import DensityOptions, VerifyOptions

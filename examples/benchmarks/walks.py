@@ -26,9 +26,10 @@ import render
 import room
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
+from sequences import model_poses
 
 from colmap_av1 import ColmapAv1Error, reconstruct
-from colmap_av1.evaluate import model_poses, pose_errors
+from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 
 Floats = NDArray[np.float64]

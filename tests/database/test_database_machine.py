@@ -26,7 +26,6 @@ from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error
-from colmap_av1.evaluate import database_tracks
 from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
@@ -201,7 +200,6 @@ class Databases(RuleBasedStateMachine):
         self.attempt(lambda: read_cameras(self.path))
         self.attempt(lambda: export_hloc(self.path, self.folder / "hloc"))
         self.attempt(lambda: view_database(self.path, self.folder))
-        self.attempt(lambda: database_tracks(self.path, len(NAMES)))
         (self.folder / "copy.db").unlink(missing_ok=True)
         self.attempt(lambda: copy_database(self.path, self.folder / "copy.db"))
 

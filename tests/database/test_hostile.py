@@ -31,7 +31,6 @@ from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error, DatabaseError
-from colmap_av1.evaluate import database_tracks
 from colmap_av1.interop.hloc import export_hloc
 from colmap_av1.view import view_database
 
@@ -215,7 +214,6 @@ def opened_by_all(path: Path, folder: Path) -> list[tuple[str, Callable[[], obje
         ("export", lambda: export_hloc(path, folder / "hloc")),
         ("view", lambda: view_database(path, folder)),
         ("copy", lambda: copy_database(path, folder / "copy.db")),
-        ("tracks", lambda: database_tracks(path, NUM_IMAGES)),
     ]
 
 

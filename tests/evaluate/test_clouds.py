@@ -5,8 +5,9 @@ import copy
 import numpy as np
 import pycolmap
 import pytest
+from dense_points import depth_differences
 
-from colmap_av1.evaluate.metrics.clouds import cloud_distances, depth_differences, point_cloud
+from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses
 
 

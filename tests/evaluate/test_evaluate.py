@@ -13,20 +13,17 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import PROJECT
+from sequences import measure_frontend, model_poses, prepare_footage
+from track_metrics import database_tracks, track_statistics
 
 from colmap_av1 import build_tracks, match, read_motion
-from colmap_av1.errors import DatabaseError, EvaluationError, OptionError, VideoError
+from colmap_av1.errors import DatabaseError, EvaluationError, VideoError
 from colmap_av1.evaluate import (
-    database_tracks,
     densify_model,
     measure_mapper,
     model_figures,
-    model_poses,
     pose_errors,
-    prepare_footage,
-    run_frontend,
     run_measured,
-    track_statistics,
 )
 from colmap_av1.options import CameraOptions, DensityOptions, MapOptions, MatchOptions, TrackOptions
 
@@ -178,8 +175,8 @@ def scene_footage(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["av1-dense", "sift-sequential"])
 def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
-    run = run_frontend(name, scene_footage, tmp_path / name)
-    again = run_frontend(name, scene_footage, tmp_path / name)
+    run = measure_frontend(name, scene_footage, tmp_path / name)
+    again = measure_frontend(name, scene_footage, tmp_path / name)
     assert again == run  # to the last digit of its times: it was kept
     assert run.cpu_seconds > 0.1
     assert sum(run.seconds.values()) > 0.1
@@ -223,19 +220,11 @@ def test_a_database_that_makes_no_model(clip, tmp_path):
         clip, tmp_path / "footage", num_frames=16, image_step=8, camera=CameraOptions()
     )
     assert sorted(p.name for p in footage.image_path.iterdir()) == footage.names
-    run = run_frontend("sift-exhaustive", footage, tmp_path / "run")
+    run = measure_frontend("sift-exhaustive", footage, tmp_path / "run")
     with pycolmap.Database.open(run.database) as database:
         database.clear_two_view_geometries()
     mapper = measure_mapper(run.database, footage.image_path, tmp_path / "model")
     assert (mapper.model, mapper.num_models) == (None, 0)
-
-
-def test_unknown_frontend(clip, tmp_path):
-    footage = prepare_footage(
-        clip, tmp_path / "footage", num_frames=16, image_step=8, camera=CameraOptions()
-    )
-    with pytest.raises(OptionError, match="surf"):
-        run_frontend("surf", footage, tmp_path / "run")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -10,17 +11,17 @@ import pycolmap
 import pytest
 from conftest import PROJECT
 
-from colmap_av1.errors import EvaluationError, ModelError, OptionError
+from colmap_av1.errors import EvaluationError, ModelError
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics
-from colmap_av1.evaluate.training import splatting
+from colmap_av1.evaluate.training import trainers
 from colmap_av1.evaluate.training.splatting import (
     Milestone,
     quality_after,
     share_of_time,
     split_images,
-    train_gaussians,
     write_scene,
 )
+from colmap_av1.evaluate.training.trainers import Training, train, write_split
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
 
 # A Python with torch, gsplat and pytorch-msssim; they are too large for every machine.
@@ -110,9 +111,9 @@ def test_quality_after_seconds() -> None:
 
 
 def test_scene_is_the_model(scene: tuple[Path, Path], tmp_path: Path) -> None:
-    test_files = write_scene(*scene, tmp_path / "scene.npz")
-    assert [file.name for file in test_files] == [f"frame_{i:06d}.png" for i in (1, 3, 5, 7)]
+    write_scene(*scene, tmp_path / "scene.npz")
     arrays = np.load(tmp_path / "scene.npz")
+    assert arrays["files"].tolist() == [str(scene[1] / f"frame_{i:06d}.png") for i in range(8)]
     assert arrays["is_test"].tolist() == [False, True] * 4
     np.testing.assert_array_equal(arrays["K"][3], [[24, 0, 16], [0, 24, 12], [0, 0, 1]])
     np.testing.assert_allclose(arrays["cam_from_world"][2, :, 3], [0.3, -0.2, 0, 1], atol=1e-6)
@@ -130,45 +131,43 @@ def test_distortion_is_refused(scene: tuple[Path, Path], tmp_path: Path) -> None
         write_scene(tmp_path, scene[1], tmp_path / "scene.npz")
 
 
-def test_bad_options(scene: tuple[Path, Path], tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="milestones"):
-        train_gaussians(*scene, tmp_path, iterations=10, milestones=[20])
+def train_with_gsplat(scene: tuple[Path, Path], folder: Path, *milestones: int) -> Training:
+    split = write_split(*scene, folder / "split")
+    *stops, iterations = milestones
+    folder = folder / "training"
+    return train("gsplat", split, folder, name="av1", iterations=iterations, milestones=stops)
 
 
-def test_what_is_missing_is_said(scene: tuple[Path, Path], tmp_path: Path) -> None:
-    if TORCH_PYTHON is None:
-        with pytest.raises(EvaluationError, match="torch"):
-            train_gaussians(*scene, tmp_path, iterations=1)
-    else:
-        with pytest.raises(EvaluationError, match="CUDA"):
-            train_gaussians(*scene, tmp_path, iterations=1, python=TORCH_PYTHON)
+def test_missing_packages_and_gpu_are_reported(
+    scene: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = "torch"
+    if TORCH_PYTHON is not None:
+        monkeypatch.setattr(sys, "executable", TORCH_PYTHON)
+        missing = "CUDA"
+    with pytest.raises(EvaluationError, match=rf"{missing}.*log\.txt"):
+        train_with_gsplat(scene, tmp_path, 1)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(TORCH_PYTHON is None, reason="COLMAP_AV1_TORCH_PYTHON names no Python")
-def test_training_on_cpu(scene: tuple[Path, Path], tmp_path: Path) -> None:
+def test_training_on_cpu(
+    scene: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All of the training but gsplat's rasterizer, which runs on GPUs only."""
-    assert TORCH_PYTHON is not None
-    told: list[int] = []
     script = tmp_path / "program.py"
     aid = PROJECT / "tests" / "support" / "splatting_on_cpu.py"
     script.write_text(
-        f"import runpy, sys\nsys.argv.insert(1, {str(splatting._PROGRAM)!r})\n"
+        f"import runpy, sys\nsys.argv.insert(1, {str(trainers._PROGRAM)!r})\n"
         f"runpy.run_path({str(aid)!r}, run_name='__main__')\n"
     )
-    first, last = train_gaussians(
-        *scene,
-        tmp_path / "renders",
-        iterations=1400,
-        milestones=[1],
-        progress=told.append,
-        python=TORCH_PYTHON,
-        program=script,
-    )
-    assert told == [1, *range(100, 1401, 100)]
+    monkeypatch.setattr(trainers, "_PROGRAM", script)
+    monkeypatch.setattr(sys, "executable", TORCH_PYTHON)
+    training = train_with_gsplat(scene, tmp_path, 1, 1400)
+    first, last = training.states
     assert (first.iteration, last.iteration) == (1, 1400)
     assert first.num_gaussians == 80 < last.num_gaussians
-    assert 0 < first.seconds < last.seconds
+    assert 0 < first.seconds < last.seconds == training.seconds
     # The images tested on were not trained on.
     assert last.metrics.psnr_y.mean() > first.metrics.psnr_y.mean() + 6
-    assert len(last.metrics.psnr_y) == 4
+    assert len(last.metrics.psnr_y) == len(training.renders) == 4

@@ -16,12 +16,12 @@ from conftest import PROJECT, Encode, make_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from sequences import model_poses
 from synthetic_scene import alignment_error
 
 from colmap_av1.check.database import check
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
-from colmap_av1.evaluate import model_poses
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import MatchReport, match
 from colmap_av1.matching.features.retrieval import similar_images

@@ -21,7 +21,8 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import MapperOptions
 from colmap_av1.poses.corners.in_images import place_anew
-from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, adjustment_stage
+from colmap_av1.poses.pose_stages import adjustment_stage
+from colmap_av1.poses.posed_images import PosedImages, PosesResult
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.util.stages import Kept

@@ -16,8 +16,9 @@ from conftest import Encode
 from dense_scene import SCENE, Truth
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from sequences import model_poses
 
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, no_points
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
@@ -41,8 +42,8 @@ from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
 from colmap_av1.poses.dynamic.regions import moving_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import surely_still
-from colmap_av1.poses.reconstruct_poses import PosedImages
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import PosedImages
+from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks

@@ -15,10 +15,11 @@ import pytest
 from databases import keypoints_of
 from dense_scene import SCENE, Truth
 from scipy.spatial import cKDTree
+from sequences import model_poses
 
 from colmap_av1.database.reading import read_cameras
 from colmap_av1.errors import ModelError, OptionError, VideoError
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.match import MatchReport, match
 from colmap_av1.options import (

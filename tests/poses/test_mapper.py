@@ -9,9 +9,10 @@ import pycolmap
 import pytest
 from dense_scene import NUM_IMAGES, Truth
 from scipy.spatial.transform import Rotation
+from sequences import model_poses
 
 from colmap_av1.errors import ModelError
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model, write_model
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.options import MapOptions, Mapper

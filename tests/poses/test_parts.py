@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pytest
 import walks
+from sequences import model_poses
 
-from colmap_av1.evaluate import model_poses, pose_errors
+from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.choosing import ChosenImages

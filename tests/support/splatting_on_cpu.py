@@ -61,5 +61,5 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     torch.set_num_threads(1)
     program = runpy.run_path(str(PROGRAM), run_name="program")
-    scene, output, *numbers = sys.argv[1:]
-    program["run"](Path(scene), Path(output), rasterize, "cpu", [int(n) for n in numbers])
+    scene, renders, *milestones = sys.argv[1:]
+    program["run"](Path(scene), Path(renders), rasterize, "cpu", [int(n) for n in milestones])

@@ -9,17 +9,12 @@ import pytest
 import render_scene
 from conftest import PROJECT
 from scipy.spatial.transform import Rotation
+from sequences import read_sequence
+from track_metrics import epipolar_errors, exact_errors, pairs_at_span, track_statistics
 
 from colmap_av1 import build_tracks, read_motion
 from colmap_av1.errors import ImageError, VideoError
-from colmap_av1.evaluate import (
-    epipolar_errors,
-    exact_errors,
-    pairs_at_span,
-    pose_errors,
-    read_sequence,
-    track_statistics,
-)
+from colmap_av1.evaluate import pose_errors
 from colmap_av1.options import DensityOptions, RefineOptions
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.selection import select_tracks

@@ -15,11 +15,8 @@ from colmap_av1.options import ImageOptions, MatchOptions
 Preset = Literal["sparse", "default", "dense"]
 
 
-def av1_frontend(
-    refine: Literal["none", "lk"], preset: Preset, options: MatchOptions | None = None
-) -> Frontend:
+def av1_frontend(refine: Literal["none", "lk"], preset: Preset, options: MatchOptions) -> Frontend:
     """This package's `match`, with the given options except refinement and preset."""
-    options = options if options is not None else MatchOptions()
     given = replace(
         options,
         refine=replace(options.refine, refine=refine),

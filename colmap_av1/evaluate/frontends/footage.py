@@ -9,14 +9,12 @@ from typing import Any
 
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.files import existing_images, write_images
-from colmap_av1.images.names import image_names
+from colmap_av1.images.files import existing_images
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
 from colmap_av1.matching.image_matches import pair_images, verify_images
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
-    ImageOptions,
     MatchOptions,
     PairOptions,
 )
@@ -26,7 +24,7 @@ from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import run_stage_in
-from colmap_av1.video.facts import Video, read_video
+from colmap_av1.video.facts import Video
 from colmap_av1.video.unchanged import unchanged
 
 
@@ -59,44 +57,6 @@ class Footage:
     forward_motion: bool = False
     warnings: tuple[str, ...] = ()
     existed: bool = False
-
-
-def prepare_footage(
-    video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
-) -> Footage:
-    """Write frames of a video at regular steps as the images that every front-end gets.
-
-    Args:
-        video: an AV1 video.
-        folder: gets `images/`; existing images of the same video are kept.
-        num_frames: number of frames of the video.
-        image_step: step between the frames that become images.
-        camera: camera options of all images.
-
-    Raises:
-        VideoError: the video cannot be read.
-        ImageError: the video has fewer frames.
-    """
-    frames = tuple(range(0, num_frames, image_step))
-    opened = read_video(video)
-    footage = Footage(
-        video=video,
-        image_path=folder / "images",
-        names=image_names(ImageOptions().file_name, frames),
-        frames=frames,
-        num_frames=num_frames,
-        size=opened.picture_size,
-        pixel_aspect=opened.display.pixel_aspect,
-        camera=camera,
-    )
-
-    def make() -> dict[str, Any]:
-        footage.image_path.mkdir()
-        write_images(opened, footage.image_path, footage.names, frames)
-        return {}
-
-    run_stage_in(folder, [file_digest(video), frames], make, products=[footage.image_path])
-    return footage
 
 
 def choose_footage(

@@ -60,9 +60,7 @@ class Frontend:
     files: tuple[Path, ...] = ()
 
 
-def run_measured_frontend(
-    name: str, footage: Footage, folder: Path, frontend: Frontend
-) -> FrontendRun:
+def run_frontend(name: str, footage: Footage, folder: Path, frontend: Frontend) -> FrontendRun:
     """Fill a database and measure the cost; a finished run is not repeated.
 
     Args:

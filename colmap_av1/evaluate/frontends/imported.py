@@ -24,7 +24,7 @@ from colmap_av1.util.progress import Clock
 def imported_frontend(features: Path, matches: Path) -> Frontend:
     """Features and matches from files in hloc's layout, verified by COLMAP."""
     return Frontend(
-        partial(_import_all, (features, matches)),
+        partial(import_hloc, (features, matches)),
         lambda footage: (
             *(digest_if_there(path) for path in (features, matches)),
             pycolmap.__version__,
@@ -35,14 +35,19 @@ def imported_frontend(features: Path, matches: Path) -> Frontend:
     )
 
 
-def _import_all(files: tuple[Path, Path], footage: Footage, database: Path) -> dict[str, float]:
-    return import_hloc(files, footage.names, footage, database)
-
-
 def import_hloc(
-    files: tuple[Path, Path], names: Sequence[str], footage: Footage, database: Path
+    files: tuple[Path, Path],
+    footage: Footage,
+    database: Path,
+    names: Sequence[str] | None = None,
 ) -> dict[str, float]:
-    """Fill a database from files in hloc's layout, which must contain the named images.
+    """Fill a database from files in hloc's layout.
+
+    Args:
+        files: files of the features and of the matches.
+        footage: the images of the database.
+        database: the database.
+        names: the images that the files must contain; None: all.
 
     Returns:
         Wall time of "import" and "verification".
@@ -50,6 +55,7 @@ def import_hloc(
     Raises:
         HlocError: the files cannot be read, or lack an image.
     """
+    names = names if names is not None else footage.names
     clock = Clock()
     pycolmap.set_random_seed(0)
     with clock.measure("import"):

@@ -22,17 +22,16 @@ _FEW = 30
 _OFFSETS = (1, 2, 4, 8)
 
 
-def learned_frontend(features: str, options: LearnedOptions | None = None) -> Frontend:
+def learned_frontend(features: str, options: LearnedOptions) -> Frontend:
     """Learned features matched by LightGlue and verified by COLMAP, see `extract_and_match`.
 
     Args:
         features: "disk" or "aliked".
-        options: the options; the defaults of LearnedOptions if None.
+        options: number of features, image size and pairs.
     """
-    given = options if options is not None else LearnedOptions()
     return Frontend(
-        partial(_learned, features, given),
-        lambda footage: (given, pycolmap.__version__, images_digest(footage)),
+        partial(_learned, features, options),
+        lambda footage: (options, pycolmap.__version__, images_digest(footage)),
         (*OF_OTHERS, "database"),
         partial(check_packages, f"front-end {features}-lightglue", _PACKAGES, "learned"),
     )
@@ -44,7 +43,7 @@ def _learned(
     files = database.with_name("features.h5"), database.with_name("matches.h5")
     names = footage.names[:: options.learned_every]
     seconds = extract_and_match(features, footage.image_path, names, files, options)
-    return {**seconds, **import_hloc(files, names, footage, database)}
+    return {**seconds, **import_hloc(files, footage, database, names)}
 
 
 def extract_and_match(

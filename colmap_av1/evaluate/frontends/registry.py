@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.frontends.av1 import av1_frontend
-from colmap_av1.evaluate.frontends.footage import Footage
-from colmap_av1.evaluate.frontends.frontend import (
-    Frontend,
-    FrontendRun,
-    run_measured_frontend,
-)
+from colmap_av1.evaluate.frontends.frontend import Frontend
 from colmap_av1.evaluate.frontends.learned import learned_frontend
-from colmap_av1.evaluate.frontends.sift import exhaustive_sift, sequential_sift
+from colmap_av1.evaluate.frontends.sift import sift_frontend
 from colmap_av1.options import LearnedOptions, MatchOptions
 
 
@@ -26,6 +18,8 @@ def make_frontends(
         match: options of this package's front-ends, except refinement and preset.
         learned: options of the learned front-ends.
     """
+    match = match if match is not None else MatchOptions()
+    learned = learned if learned is not None else LearnedOptions()
     return {
         # "av1" uses the bitstream alone; "av1-refined" refines tracks in the decoded pictures.
         "av1": av1_frontend("none", "default", match),
@@ -34,34 +28,8 @@ def make_frontends(
         "av1-refined": av1_frontend("lk", "default", match),
         "av1-refined-sparse": av1_frontend("lk", "sparse", match),
         "av1-refined-dense": av1_frontend("lk", "dense", match),
-        "sift-sequential": sequential_sift(),
-        "sift-exhaustive": exhaustive_sift(),
+        "sift-sequential": sift_frontend("sequential"),
+        "sift-exhaustive": sift_frontend("exhaustive"),
         "disk-lightglue": learned_frontend("disk", learned),
         "aliked-lightglue": learned_frontend("aliked", learned),
     }
-
-
-FRONTENDS = make_frontends()
-
-
-def run_frontend(
-    name: str, footage: Footage, folder: Path, frontend: Frontend | None = None
-) -> FrontendRun:
-    """Fill a database and measure the cost; a finished run is not repeated.
-
-    Args:
-        name: one of FRONTENDS, or the name of `frontend`.
-        footage: video and images.
-        folder: gets `database.db`, `log.txt` and the figures.
-        frontend: the front-end, if it is not one of FRONTENDS.
-
-    Raises:
-        OptionError: the name is unknown.
-        ColmapAv1Error: the front-end refuses the footage.
-        EvaluationError: the front-end failed.
-    """
-    if frontend is None:
-        if name not in FRONTENDS:
-            raise OptionError(f"front-end '{name}': give one of {', '.join(FRONTENDS)}")
-        frontend = FRONTENDS[name]
-    return run_measured_frontend(name, footage, folder, frontend)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import pycolmap
 
@@ -17,18 +17,11 @@ from colmap_av1.evaluate.frontends.frontend import (
 )
 from colmap_av1.util.progress import Clock
 
-
-def sequential_sift() -> Frontend:
-    """SIFT; each image is matched with the following ones, by COLMAP's sequential matcher."""
-    return _sift_frontend(_pair_sequentially)
+Pairing = Literal["sequential", "exhaustive"]
 
 
-def exhaustive_sift() -> Frontend:
-    """SIFT; all image pairs are matched."""
-    return _sift_frontend(_pair_exhaustively)
-
-
-def _sift_frontend(pairing: Callable[[Path], None]) -> Frontend:
+def sift_frontend(pairing: Pairing) -> Frontend:
+    """SIFT features, matched by one of COLMAP's matchers."""
     return Frontend(
         partial(_sift, pairing),
         lambda footage: (pycolmap.__version__, images_digest(footage)),
@@ -36,20 +29,15 @@ def _sift_frontend(pairing: Callable[[Path], None]) -> Frontend:
     )
 
 
-def _sift(pairing: Callable[[Path], None], footage: Footage, database: Path) -> dict[str, float]:
+def _sift(pairing: Pairing, footage: Footage, database: Path) -> dict[str, float]:
     clock = Clock()
     pycolmap.set_random_seed(0)
     list_images(footage, database)
     with clock.measure("extraction"):
         pycolmap.extract_features(database, footage.image_path, footage.names)
     with clock.measure("matching"):
-        pairing(database)
+        if pairing == "sequential":
+            pycolmap.match_sequential(database)
+        else:
+            pycolmap.match_exhaustive(database)
     return clock.seconds
-
-
-def _pair_sequentially(database: Path) -> None:
-    pycolmap.match_sequential(database)
-
-
-def _pair_exhaustively(database: Path) -> None:
-    pycolmap.match_exhaustive(database)

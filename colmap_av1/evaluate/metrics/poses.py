@@ -1,18 +1,23 @@
-"""Errors of estimated poses against ground truth, after similarity alignment."""
+"""Poses of models and of ground truth, and their errors after similarity alignment."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_av1.evaluate.metrics.sequence import frame_number
+from colmap_av1.errors import ImageError
 from colmap_av1.geometry.alignment import Similarity
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
+from colmap_av1.util.texts import read_lines
+
+_WHAT_TO_GIVE = "give lines of 'name tx ty tz qx qy qz qw', or the folder of a COLMAP model"
 
 
 @dataclass(frozen=True)
@@ -129,22 +134,57 @@ def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> NDArray
     return cam_from_world
 
 
-def model_poses(model: pycolmap.Reconstruction, num_frames: int) -> NDArray[np.float64]:
-    """Poses of a model's registered images, by frame.
+def frame_number(name: str) -> int:
+    """The frame number in a file name: its last group of digits.
+
+    Raises:
+        ImageError: the name has no number.
+    """
+    numbers = re.findall(r"\d+", Path(name).stem)
+    if not numbers:
+        raise ImageError(f"image '{name}': its name has no frame number: rename it")
+    return int(numbers[-1])
+
+
+def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
+    """Read true poses from lines of `name tx ty tz qx qy qz qw`.
+
+    They are camera-to-world poses, with x right, y down, z forward. The number in a name is the
+    frame index, from 0.
 
     Args:
-        model: pycolmap.Reconstruction whose image names contain the frame number, from 0.
+        path: the file.
         num_frames: number of frames of the video.
 
     Returns:
-        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a registered image.
+        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a line.
 
     Raises:
-        ImageError: an image's name has no frame number.
+        ImageError: the file cannot be read, or refers to a frame that the video lacks.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
-    for name, image in posed_images(model).items():
-        cam_from_world[frame_number(name)] = image.cam_from_world
+    try:
+        lines = read_lines(path)
+    except UnicodeDecodeError as error:
+        raise ImageError(f"{path}: is not a text file: {_WHAT_TO_GIVE}") from error
+    except OSError as error:
+        raise ImageError(f"{path}: {error.strerror}: {_WHAT_TO_GIVE}") from error
+    for line in lines:
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        frame = frame_number(words[0])
+        if frame >= num_frames:
+            raise ImageError(
+                f"{path}: '{words[0]}' is not one of the {num_frames} frames: give the ground "
+                "truth of this video"
+            )
+        try:
+            values = np.array(words[1:], dtype=np.float64)
+            rotation = Rotation.from_quat(values[3:7]).as_matrix().T
+        except ValueError as error:
+            raise ImageError(f"{path}: '{line[:80]}' is not a pose: {_WHAT_TO_GIVE}") from error
+        cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
     return cam_from_world
 
 

@@ -7,7 +7,7 @@ import itertools
 import json
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,11 +55,7 @@ class RenderingMetrics:
     no_lpips: str
 
 
-def rendering_metrics(
-    rendered: Sequence[Path],
-    references: Sequence[Path],
-    progress: Callable[[int], None] | None = None,
-) -> RenderingMetrics:
+def rendering_metrics(rendered: Sequence[Path], references: Sequence[Path]) -> RenderingMetrics:
     """Compare rendered images with the photographs of the same views.
 
     libvmaf measures PSNR-Y, SSIM and VMAF, on BT.709 luma in limited range, as for video.
@@ -67,7 +63,6 @@ def rendering_metrics(
     Args:
         rendered: image files.
         references: file of the photograph of each, of the same size.
-        progress: called with the number of images done so far.
 
     Raises:
         ImageError: a file is missing or not an image, or the sizes of a pair differ.
@@ -89,8 +84,6 @@ def rendering_metrics(
         # The patches with structure are those of the reference, for both images.
         structure = _is_structure(_luma(reference))
         sharpness.append([_sharpness(_luma(x), structure) for x in (image, reference)])
-        if progress is not None:
-            progress(i + 1)
     values = np.empty((len(rendered), 3))
     for indices in by_size.values():
         pairs = [(rendered[i], references[i]) for i in indices]
@@ -110,22 +103,14 @@ def rendering_metrics(
     )
 
 
-def sharpness(image: _Image) -> float:
+def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float:
     """Zhu and Milanfar's no-reference sharpness measure Q.
 
     X. Zhu and P. Milanfar, "Automatic Parameter Selection for Denoising Algorithms Using a
     No-Reference Measure of Image Content", IEEE Transactions on Image Processing 19 (2010):
     the singular values s1 >= s2 of a patch's gradients give s1 (s1 - s2) / (s1 + s2), summed
     over the patches with a dominant direction and divided by the number of all patches.
-
-    Args:
-        image: uint8 [height, width, 3] BGR, at least 8x8 pixels.
     """
-    luma = _luma(image)
-    return _sharpness(luma, _is_structure(luma))
-
-
-def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float:
     s1, s2 = _singular_values(luma)
     total = s1 + s2
     q = np.divide(s1 * (s1 - s2), total, out=np.zeros_like(s1), where=total > 0)

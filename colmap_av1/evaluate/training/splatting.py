@@ -1,29 +1,22 @@
-"""Training 3D Gaussians with gsplat on half of a model's images, evaluated on the other half."""
+"""The scene that 3D Gaussians are trained on with gsplat, and the milestones of a training."""
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 import pycolmap
 import scipy.spatial
 from numpy.typing import NDArray
 
-from colmap_av1.errors import EvaluationError, ModelError, OptionError
-from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
+from colmap_av1.errors import ModelError
+from colmap_av1.evaluate.metrics.renderings import RenderingMetrics
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.util.processes import bound
 
-_PROGRAM = Path(__file__).with_name("train_gaussians.py")
 # The mean distance to this many nearest points is the initial size of a point's Gaussian.
 _NUM_NEIGHBOURS = 3
 
@@ -54,65 +47,6 @@ def split_images(names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Training and test images: the even and odd ones in the order of their names."""
     ordered = sorted(names)
     return ordered[::2], ordered[1::2]
-
-
-def train_gaussians(
-    model: Path,
-    image_path: Path,
-    output: Path,
-    *,
-    iterations: int = 30_000,
-    milestones: Sequence[int] = (),
-    seed: int = 0,
-    progress: Callable[[int], None] | None = None,
-    python: str = sys.executable,
-    program: Path = _PROGRAM,
-) -> list[Milestone]:
-    """Train 3D Gaussians by the published recipe, with gsplat on a GPU.
-
-    The recipe is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
-    Rendering" (2023). With fewer than its 30,000 iterations, densification stops after half of
-    them.
-
-    Args:
-        model: folder of a COLMAP model whose cameras have no distortion.
-        image_path: folder of its images.
-        output: folder for the renderings of the test images, in one folder for each milestone,
-            named by the iteration.
-        iterations: number of iterations.
-        milestones: iterations after which the test images are rendered, in addition to the last.
-        seed: random seed for the order of the images.
-        progress: called with the number of iterations done so far.
-        python: the Python interpreter, with torch and gsplat installed.
-        program: the training program that it runs.
-
-    Raises:
-        ModelError: the model cannot be read, its cameras have distortion, or it has fewer than
-            two images or five points.
-        OptionError: iterations or milestones are out of range.
-        EvaluationError: packages or the GPU are missing, or the training failed.
-    """
-    if iterations < 1 or any(not 1 <= m <= iterations for m in milestones):
-        raise OptionError(
-            f"iterations is {iterations}, milestones are {list(milestones)}: give 1 "
-            "or more, and milestones up to that"
-        )
-    stops = sorted({*milestones, iterations})
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        scene = Path(folder) / "scene.npz"
-        test_files = write_scene(model, image_path, scene)
-        numbers = [str(n) for n in (iterations, seed, *stops)]
-        command = [python, str(program), str(scene), str(output), *numbers]
-        states = _run(command, Path(folder) / "log.txt", progress)
-    done = []
-    for state in states:
-        rendered = [output / str(state["iteration"]) / f"{f.stem}.png" for f in test_files]
-        metrics = rendering_metrics(rendered, test_files)
-        done.append(
-            Milestone(state["iteration"], state["seconds"], state["num_gaussians"], metrics)
-        )
-    return done
 
 
 def share_of_time(
@@ -160,7 +94,7 @@ def quality_after(
     return float(np.interp(seconds, times, [m.mean(quality) for m in milestones]))
 
 
-def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
+def write_scene(model: Path, image_path: Path, path: Path) -> None:
     """Write cameras and points of a model as plain arrays, for the program without pycolmap.
 
     The file contains, for n images and m points: `files` [n], `is_test` bool [n], `cam_from_world`
@@ -172,11 +106,9 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
         image_path: folder of its images.
         path: the .npz file.
 
-    Returns:
-        The files of the test images.
-
     Raises:
-        ModelError: see `train_gaussians`.
+        ModelError: the model cannot be read, its cameras have distortion, or it has fewer than
+            two images or five points.
     """
     reconstruction = read_model(model)
     images = sorted(reconstruction.images.values(), key=lambda image: str(image.name))
@@ -191,10 +123,9 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
     poses[:, :3] = [image.cam_from_world().matrix() for image in images]
     points = reconstruction.points3D.values()
     xyz = np.array([point.xyz for point in points])
-    files = [image_path / image.name for image in images]
     np.savez(
         path,
-        files=np.array([str(file) for file in files]),
+        files=np.array([str(image_path / image.name) for image in images]),
         is_test=np.array([image.name in test for image in images]),
         cam_from_world=poses,
         K=np.array([_intrinsics(model, image.camera) for image in images], dtype=np.float32),
@@ -202,7 +133,6 @@ def write_scene(model: Path, image_path: Path, path: Path) -> list[Path]:
         colors=np.array([point.color for point in points], dtype=np.float32) / 255,
         spacing=_spacing(xyz),
     )
-    return [file for file, image in zip(files, images, strict=True) if image.name in test]
 
 
 def _intrinsics(model: Path, camera: pycolmap.Camera) -> NDArray[np.float64]:
@@ -217,32 +147,3 @@ def _spacing(xyz: NDArray[np.float64]) -> NDArray[np.float32]:
     """Mean distance of each point to its nearest neighbours."""
     distance, _ = scipy.spatial.KDTree(xyz).query(xyz, k=_NUM_NEIGHBOURS + 1)
     return np.asarray(distance[:, 1:].mean(axis=1), dtype=np.float32)
-
-
-def _run(
-    command: list[str], log: Path, progress: Callable[[int], None] | None
-) -> list[dict[str, Any]]:
-    """Run the training program; returns the milestones that it reports."""
-    states = []
-    with (
-        log.open("w+", encoding="utf-8", errors="replace") as errors,
-        subprocess.Popen(
-            bound(command), stdout=subprocess.PIPE, stderr=errors, text=True
-        ) as process,
-    ):
-        try:
-            output: IO[str] = process.stdout  # type: ignore[assignment]
-            for line in output:
-                state = json.loads(line)
-                if state.pop("milestone"):
-                    states.append(state)
-                if progress is not None:
-                    progress(state["iteration"])
-        except BaseException:
-            process.terminate()
-            raise
-        if process.wait() != 0:
-            errors.seek(0)
-            lines = errors.read().strip().splitlines()
-            raise EvaluationError(lines[-1] if lines else f"{command[1]} failed without a message")
-    return states

@@ -1,13 +1,13 @@
 """Program that trains 3D Gaussians on a scene.
 
-    train_gaussians.py SCENE.npz OUTPUT ITERATIONS SEED MILESTONE [MILESTONE ...]
+    train_gaussians.py SCENE.npz RENDERS MILESTONE [MILESTONE ...]
 
 It runs in a separate process because torch and pycolmap must not share one, and imports nothing
 from this package. SCENE.npz is described at `write_scene` in
-`colmap_av1.evaluate.training.splatting`. Standard output gets a JSON line for every hundredth
-iteration and every milestone; after a milestone `OUTPUT/ITERATION/` has the renderings of the test
-images. If packages or the GPU are missing, the program prints one line on standard error and exits
-with status 3.
+`colmap_av1.evaluate.training.splatting`. The last milestone is the number of iterations. After each
+milestone `RENDERS/ITERATION/` has the renderings of the test images, and `RENDERS/times.csv` a line
+with the training time and the number of Gaussians. If packages or the GPU are missing, the program
+prints one line on standard error and exits with status 3.
 
 The recipe is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
 Rendering", ACM Transactions on Graphics 42 (2023), with gsplat's rasterizer and densification.
@@ -15,7 +15,6 @@ Rendering", ACM Transactions on Graphics 42 (2023), with gsplat's rasterizer and
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -54,7 +53,6 @@ _RATES = {
 _LAST_RATE = 0.01
 # Iterations of the published schedule. Shorter runs densify in their first half only.
 _DENSIFY_FROM, _DENSIFY_UNTIL, _RESET_EVERY, _DEGREE_EVERY = 500, 15_000, 3000, 1000
-_REPORT_EVERY = 100
 
 Gaussians = dict[str, torch.nn.Parameter]
 # Renders (Gaussians, view, degree of the spherical harmonics); returns the image
@@ -123,16 +121,14 @@ def train(
     views: list[View],
     rasterize: Rasterizer,
     iterations: int,
-    seed: int,
-) -> Iterator[tuple[int, float]]:
-    """Optimise the Gaussians in place, and yield (iteration, loss) after each iteration.
+) -> Iterator[int]:
+    """Optimise the Gaussians in place, and yield the number of each iteration after it.
 
     Args:
         gaussians: parameters by name, see `initial_gaussians`.
         views: training images; each is used once in a random order before any is used again.
         rasterize: renders a view.
         iterations: number of iterations.
-        seed: random seed for the order of the images.
     """
     size = scene_size(views)
     optimizers = {
@@ -149,7 +145,7 @@ def train(
     )
     strategy.check_sanity(gaussians, optimizers)
     state = strategy.initialize_state(scene_scale=size)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     order: list[int] = []
     for iteration in range(1, iterations + 1):
         if not order:
@@ -165,7 +161,7 @@ def train(
             optimizer.zero_grad(set_to_none=True)
         falling.step()
         strategy.step_post_backward(gaussians, optimizers, state, iteration, info)
-        yield iteration, float(loss.detach())
+        yield iteration
 
 
 def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[View]]:
@@ -195,36 +191,31 @@ def read_scene(path: Path, device: str) -> tuple[Gaussians, list[View], list[Vie
     )
 
 
-def run(scene: Path, output: Path, rasterize: Rasterizer, device: str, numbers: list[int]) -> None:
-    """Train, report progress, and render the test images at the milestones."""
-    iterations, seed, *milestones = numbers
+def run(
+    scene: Path, renders: Path, rasterize: Rasterizer, device: str, milestones: list[int]
+) -> None:
+    """Train, and render the test images at the milestones."""
     gaussians, train_views, test_views = read_scene(scene, device)
+    times = renders / "times.csv"
+    times.write_text("iterations,seconds,gaussians\n")
     seconds, started = 0.0, time.perf_counter()
-    for iteration, loss in train(gaussians, train_views, rasterize, iterations, seed):
-        is_milestone = iteration in milestones
-        if not is_milestone and iteration % _REPORT_EVERY:
+    for iteration in train(gaussians, train_views, rasterize, milestones[-1]):
+        if iteration not in milestones:
             continue
         if device == "cuda":
             torch.cuda.synchronize()
         seconds += time.perf_counter() - started
-        if is_milestone:
-            folder = output / str(iteration)
-            folder.mkdir(parents=True, exist_ok=True)
-            for view in test_views:
-                with torch.no_grad():
-                    rendered = rasterize(gaussians, view, _SH_DEGREE)[0]
-                pixels = (rendered.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-                path = (folder / view.name).with_suffix(".png")
-                picture = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-                cv2.imencode(".png", picture)[1].tofile(path)
-        words = {
-            "iteration": iteration,
-            "seconds": seconds,
-            "num_gaussians": len(gaussians["means"]),
-            "loss": loss,
-            "milestone": is_milestone,
-        }
-        print(json.dumps(words), flush=True)
+        folder = renders / str(iteration)
+        folder.mkdir()
+        for view in test_views:
+            with torch.no_grad():
+                rendered = rasterize(gaussians, view, _SH_DEGREE)[0]
+            pixels = (rendered.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+            path = (folder / view.name).with_suffix(".png")
+            picture = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+            cv2.imencode(".png", picture)[1].tofile(path)
+        with times.open("a") as file:
+            file.write(f"{iteration},{seconds},{len(gaussians['means'])}\n")
         # Do not count the time of rendering test images.
         started = time.perf_counter()
 
@@ -263,8 +254,8 @@ def main() -> int:
             file=sys.stderr,
         )
         return _NOT_HERE
-    scene, output, *numbers = sys.argv[1:]
-    run(Path(scene), Path(output), gsplat_rasterizer(), "cuda", [int(n) for n in numbers])
+    scene, renders, *milestones = sys.argv[1:]
+    run(Path(scene), Path(renders), gsplat_rasterizer(), "cuda", [int(n) for n in milestones])
     return 0
 
 

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,19 +21,24 @@ from colmap_av1.errors import EvaluationError
 from colmap_av1.evaluate.frontends.measure import run_measured
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_metrics
 from colmap_av1.evaluate.programs import check_packages
-from colmap_av1.evaluate.training.splatting import Milestone, split_images, train_gaussians
+from colmap_av1.evaluate.training.splatting import Milestone, split_images, write_scene
 from colmap_av1.geometry.colmap_model import model_points, posed_images, read_model, write_model
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.splats.gaussians import write_model_gaussians
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
 from colmap_av1.util.stages import run_stage_in
+from colmap_av1.util.texts import shown
 
 # Only changes of this code affect the results of a training. Changes elsewhere in the package do
 # not repeat trainings.
 _CODE = ("evaluate/training", "evaluate/metrics")
-# File with the training times of a command's milestones, in the folder of the renderings.
+# The program of the trainer gsplat.
+_PROGRAM = Path(__file__).with_name("train_gaussians.py")
+# File with the training times of milestones, in the folder of the renderings.
 _TIMES = "times.csv"
+# Number of characters that a message shows of a program's last line.
+_MOST_SHOWN = 200
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
 
@@ -171,30 +177,19 @@ def train(
     given = [file_digest(path) for path in sorted(inputs) if path.is_file()]
     names = [reference.name for reference in references]
     stops = tuple(sorted({stop for stop in milestones if stop < iterations}))
-    if trainer == GSPLAT:
-        seconds, states = _kept_gsplat(split, folder, (given, iterations, stops))
-        last = folder / "output" / str(iterations)
-        files = [last / f"{reference.stem}.png" for reference in references]
-        return Training(seconds, states, names, references, files, states[-1].metrics)
-    stops = (*stops, iterations) if "{milestones}" in trainer else ()
+    stops = (*stops, iterations) if trainer == GSPLAT or "{milestones}" in trainer else ()
 
     def make() -> dict[str, Any]:
         for path in (folder / "output", renders):
             path.mkdir()
-        gaussians = folder / "init.ply"
-        if "{gaussians}" in trainer:
-            write_model_gaussians(gaussians, split.train / "sparse" / "0")
-        values = {
-            "data": split.train.resolve(),
-            "test": split.test.resolve(),
-            "gaussians": gaussians.resolve(),
-            "output": (folder / "output").resolve(),
-            "renders": renders.resolve(),
-            "iterations": iterations,
-            "milestones": ",".join(map(str, stops)),
-            "name": name,
-        }
-        command = [word.format(**values) for word in words_of_trainer(trainer)]
+        if trainer == GSPLAT:
+            scene = folder / "scene.npz"
+            write_scene(split.data / "sparse" / "0", split.data / "images", scene)
+            command = [sys.executable, *map(str, (_PROGRAM, scene, renders, *stops))]
+        else:
+            command = _command(
+                trainer, split, folder, name=name, iterations=iterations, milestones=stops
+            )
         measured = run_measured(_run, command, folder / "log.txt", log=folder / "log.txt")
         if not stops:
             match_renders(renders, references)  # Raise before the result is marked as finished.
@@ -211,6 +206,32 @@ def train(
     if states and not math.isnan(states[-1].seconds):
         seconds = states[-1].seconds
     return Training(seconds, states, names, references, files, metrics)
+
+
+def _command(
+    trainer: str,
+    split: Split,
+    folder: Path,
+    *,
+    name: str,
+    iterations: int,
+    milestones: Sequence[int],
+) -> list[str]:
+    """The words of a trainer's command, with its values in place; writes initial Gaussians."""
+    gaussians = folder / "init.ply"
+    if "{gaussians}" in trainer:
+        write_model_gaussians(gaussians, split.train / "sparse" / "0")
+    values = {
+        "data": split.train.resolve(),
+        "test": split.test.resolve(),
+        "gaussians": gaussians.resolve(),
+        "output": (folder / "output").resolve(),
+        "renders": (folder / "renders").resolve(),
+        "iterations": iterations,
+        "milestones": ",".join(map(str, milestones)),
+        "name": name,
+    }
+    return [word.format(**values) for word in words_of_trainer(trainer)]
 
 
 def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
@@ -278,28 +299,6 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(w), "") if w.isdigit() else (-1, w) for w in re.split(r"(\d+)", path.name)]
 
 
-def _kept_gsplat(
-    split: Split, folder: Path, key: tuple[Any, int, tuple[int, ...]]
-) -> tuple[float, tuple[Milestone, ...]]:
-    _, iterations, stops = key
-
-    def make() -> dict[str, Any]:
-        states = train_gaussians(
-            split.data / "sparse" / "0",
-            split.data / "images",
-            folder / "output",
-            iterations=iterations,
-            milestones=stops,
-        )
-        return {"states": [_plain(state) for state in states]}
-
-    finished = run_stage_in(
-        folder, (GSPLAT, *key), make, products=[folder / "output"], made_by=_CODE
-    )
-    states = tuple(_milestone(state) for state in finished.result["states"])
-    return states[-1].seconds, states
-
-
 def _plain(state: Milestone) -> dict[str, Any]:
     metrics = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
@@ -319,7 +318,10 @@ def _milestone(plain: dict[str, Any]) -> Milestone:
 def _run(command: Sequence[str], log: Path) -> None:
     run = subprocess.run(bound_group(command), check=False, stdin=subprocess.DEVNULL)
     if run.returncode != 0:
-        raise EvaluationError(f"the trainer ended with status {run.returncode}: see {log}")
+        reason = shown(log.read_text(errors="replace").strip().rpartition("\n")[2], _MOST_SHOWN)
+        raise EvaluationError(
+            f"the trainer ended with status {run.returncode}{reason and f' ({reason})'}: see {log}"
+        )
 
 
 def _undistort(model: Path, image_path: Path, output: Path, names: Sequence[str]) -> None:

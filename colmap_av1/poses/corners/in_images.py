@@ -15,8 +15,9 @@ from colmap_av1.geometry.resection import resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.seen_again import found_again
-from colmap_av1.poses.reconstruct_poses import FROM_PICTURES, PosedImages, triangulate_in
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.pose_stages import FROM_PICTURES
+from colmap_av1.poses.posed_images import PosedImages, triangulate_in
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import progress_in

@@ -19,8 +19,8 @@ from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import RefineOptions
-from colmap_av1.poses.reconstruct_poses import FOR_POSES, PosedImages
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import FOR_POSES, PosedImages
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import no_progress, progress_in

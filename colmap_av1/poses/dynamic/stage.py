@@ -17,8 +17,8 @@ from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
 from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
-from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, read_posed_images
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import no_progress

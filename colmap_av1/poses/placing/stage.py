@@ -23,8 +23,8 @@ from colmap_av1.poses.placing.placement import (
     write_place,
 )
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
-from colmap_av1.poses.reconstruct_poses import PosedImages, PosesResult, read_posed_images
-from colmap_av1.poses.reconstruct_tracks import Run
+from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
+from colmap_av1.poses.run import Run
 from colmap_av1.util.stages import Kept, run_stage
 
 

@@ -15,25 +15,21 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
-from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
-from colmap_av1.images.positions import ImagePositions
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
-from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links import images_to_link
 from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
-from colmap_av1.options import EncodeOptions, ReconstructOptions, RefineOptions, TrackingOptions
+from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.tracks.video_tracks import TrackedVideo, VideoSource, count_frames
+from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
 from colmap_av1.util.digests import digest_if_there, file_digest
-from colmap_av1.util.progress import Clock, Progress
-from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept, run_stage
-from colmap_av1.video.unchanged import FileState, check_unchanged
+from colmap_av1.video.unchanged import check_unchanged
 
 # A mapper may leave a bogus model of two images where it finds no start.
 LEAST_IMAGES = 3
@@ -49,68 +45,22 @@ _SEEDING = 8
 
 
 @dataclass(frozen=True)
-class Run:
-    """What every stage is given.
-
-    Attributes:
-        inputs: the videos and photos.
-        sources: for each video, where its motion and pictures come from.
-        shown: for each video, how its pictures are looked at.
-        output: the folder that is made.
-        stages: the folder in it that holds what later runs resume from.
-        options: options of every stage.
-        clock: gets the time of each stage.
-        progress: called in each stage.
-        positions: where the images were taken; None before these are chosen.
-        cameras: of all images, where a database lists them; None: they are made anew.
-    """
-
-    inputs: Inputs
-    sources: tuple[VideoSource, ...]
-    shown: tuple[ShownVideo, ...]
-    output: Path
-    stages: Path
-    options: ReconstructOptions
-    clock: Clock
-    progress: Progress
-    positions: ImagePositions | None = None
-    cameras: ImageCameras | None = None
-
-    @property
-    def context(self) -> RunContext:
-        """Clock, progress, threads and seed of the run."""
-        return RunContext.of(self.options.match.run, self.clock, self.progress)
-
-    @property
-    def files(self) -> tuple[FileState, ...]:
-        """All files as they were at the start."""
-        photos = [photo.state for photo in self.inputs.photos]
-        return (*(file for source in self.sources for file in source.files), *photos)
-
-    @property
-    def photo_digests(self) -> list[list[str]]:
-        """Name and digest of each photo, which stages depend on."""
-        return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
-
-    def pictures(self, image_set: ImageSet) -> Pictures:
-        """What gives the pictures of images, see `pictures_of`."""
-        photos = [photo.path for photo in self.inputs.photos]
-        return pictures_of(image_set, self.shown, photos, self.options.match.reading)
-
-
-@dataclass(frozen=True)
 class VideoTracks:
-    """What `track_stage` keeps of a video.
+    """Tracks and images of a video.
 
     Attributes:
         tracks: its tracks.
         chosen: the frames that are images.
         inter_share: see `TrackedVideo`.
+        read_out: see `TracksResult`.
+        digest: digest of the stage that keeps them; empty if none does.
     """
 
     tracks: Tracks
     chosen: ChosenImages
     inter_share: NDArray[np.float32]
+    read_out: float | None
+    digest: str = ""
 
     def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
         """The same, but for frames whose motion is not to be trusted, whatever the stream says."""
@@ -170,7 +120,14 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
         # Of a long video no other frame is of use from here on.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
-        _write_tracks(partial / f"{name}.npz", VideoTracks(tracks, chosen, tracked.inter_share))
+        with (partial / f"{name}.npz").open("wb") as file:
+            np.savez(
+                file,
+                **vars(tracks),
+                names=np.array(chosen.names),  # np.savez keeps names as they are
+                frames=chosen.frames,
+                inter_share=tracked.inter_share,
+            )
         check_unchanged(*source.files)
         return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
 
@@ -238,7 +195,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
 
         def choose(tracked: TrackedVideo) -> ChosenImages:
             few = tracked.tracks.every_nth(_FEWER)
-            return _spread_in(run, video, replace(tracked, tracks=few), candidates)
+            return _spread_in(run, replace(tracked, tracks=few), candidates)
 
         return track(options, choose, frames=candidates, context=run.context)
 
@@ -247,7 +204,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
             TrackingOptions(
                 options.read, replace(run.options.match.tracks, seeding=_SEEDING), RefineOptions()
             ),
-            lambda tracked: _spread_in(run, video, tracked, candidates),
+            lambda tracked: _spread_in(run, tracked, candidates),
             frames=candidates,
             refine=False,
             context=replace(run.context, clock=Clock()),
@@ -260,9 +217,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
     )
 
 
-def _spread_in(
-    run: Run, video: int, tracked: TrackedVideo, candidates: NDArray[np.int32]
-) -> ChosenImages:
+def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -> ChosenImages:
     """As many images as a trainer wants among some frames of a video, its key images with them."""
     tracks = tracked.tracks
     candidates = candidates[candidates < tracks.num_frames]
@@ -302,18 +257,22 @@ def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
         raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
 
 
-def _write_tracks(path: Path, own: VideoTracks) -> None:
-    with path.open("wb") as file:
-        # Names are kept by np.savez as they are.
-        names, frames = np.array(own.chosen.names), own.chosen.frames
-        np.savez(file, **vars(own.tracks), names=names, frames=frames, inter_share=own.inter_share)
-
-
-def read_tracks(run: Run, video: int) -> VideoTracks:
-    """The tracks, images and shares of inter units that `track_stage` kept of a video."""
+def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
+    """The tracks and images that `track_stage` kept of a video."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
-        chosen = ChosenImages([str(name) for name in file["names"]], file["frames"])
-        return VideoTracks(tracks_of(file), chosen, file["inter_share"])
+        return VideoTracks(
+            tracks_of(file),
+            ChosenImages([str(name) for name in file["names"]], file["frames"]),
+            file["inter_share"],
+            stage.result.read_out,
+            stage.digest,
+        )
+
+
+def read_tracks_only(run: Run, video: int) -> Tracks:
+    """The tracks that `track_stage` kept of a video, without its images."""
+    with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
+        return tracks_of(file)
 
 
 def tracks_of(file: Any) -> Tracks:

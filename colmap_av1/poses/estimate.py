@@ -1,4 +1,4 @@
-"""The stages of `reconstruct` that end in poses, in their order."""
+"""The joint estimate of all poses: its stages in their order, for `match` and `reconstruct`."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
 from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
 from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import split_stage
-from colmap_av1.poses.reconstruct_poses import (
+from colmap_av1.poses.pose_stages import (
     AdjustedResult,
     MappedResult,
-    PosesResult,
     adjustment_stage,
     pose_stage,
     resection_stage,
 )
-from colmap_av1.poses.reconstruct_stages import MatchesResult, match_stage, read_links
-from colmap_av1.poses.reconstruct_tracks import Run, TracksResult, VideoTracks
+from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.remapping import remap_stage
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -96,12 +97,7 @@ class _ToMend:
     apart: bool
 
 
-def estimate_poses(
-    run: Run,
-    videos: Sequence[VideoTracks],
-    image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
-) -> Posed:
+def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
     """Estimate poses; where they do not hold together, again with links.
 
     These take the place of motion where few points join what lies on either side of two images, and
@@ -111,7 +107,7 @@ def estimate_poses(
     first: list[Posed] = []
 
     def make(_: Path) -> _ToMend:
-        posed = _pose_stages(run, videos, image_set, tracked, doubted=())
+        posed = _pose_stages(run, videos, image_set, doubted=())
         first.append(posed)
         return _ToMend(
             doubted=tuple(_unlinked_seams(run, image_set, posed)),
@@ -123,7 +119,7 @@ def estimate_poses(
         run.stages,
         "seams",
         [
-            [t.digest for t in tracked],
+            [own.digest for own in videos],
             image_set.videos,
             run.photo_digests,
             options.match,
@@ -137,7 +133,7 @@ def estimate_poses(
     if first and not found.doubted and not found.apart:
         return split_at_seams(run, first[0], image_set)
     again = _with_all_links(run) if found.apart else run
-    posed = _pose_stages(again, videos, image_set, tracked, doubted=found.doubted)
+    posed = _pose_stages(again, videos, image_set, doubted=found.doubted)
     return split_at_seams(again, posed, image_set)
 
 
@@ -210,20 +206,19 @@ def _pose_stages(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
     *,
     doubted: Sequence[int],
 ) -> Posed:
     """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
-    matched = match_stage(run, videos, image_set, tracked, doubted)
+    matched = match_stage(run, videos, image_set, doubted)
     depth = matched.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
     # Where no read-out is found nothing has been moved, whether one was looked for or not.
-    in_place = not any(stage.result.read_out for stage in tracked)
-    believed = believed_tracks(run, videos, image_set)
+    in_place = not any(own.read_out for own in videos)
+    believed = believed_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
         run, matched, mapped, believed=believed, image_set=image_set, keyed=keyed, in_place=in_place
     )
@@ -240,12 +235,12 @@ def _far_views(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeRes
 
 
 def believed_tracks(
-    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet
+    run: Run, tracks: Sequence[Tracks], image_set: ImageSet
 ) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut where motion is not believed, and the links."""
     links, broken = read_links(run.stages)
-    tracks = Tracks.in_sequence([own.tracks for own in videos], image_set.num_frames)
-    return tracks.split_after_frames(broken.tolist()), links
+    every = Tracks.in_sequence(tracks, image_set.num_frames)
+    return every.split_after_frames(broken.tolist()), links
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:

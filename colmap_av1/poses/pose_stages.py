@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import (
@@ -21,25 +19,32 @@ from colmap_av1.geometry.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.geometry.posed_model import (
     PosedModel,
     posed_model,
-    read_posed_model,
     write_posed_model,
 )
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
-from colmap_av1.geometry.track_points import seen_in, to_model_points, triangulate_tracks
-from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
 from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
-from colmap_av1.poses.reconstruct_stages import MatchesResult
-from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
+from colmap_av1.poses.match_stage import MatchesResult
+from colmap_av1.poses.posed_images import (
+    FOR_POSES,
+    PosedImages,
+    PosesResult,
+    check_agreement,
+    read_posed_images,
+    registered_by_video,
+    triangulate_in,
+)
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import model_seams
+from colmap_av1.poses.track_stage import LEAST_IMAGES, pose_tracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import Progress, no_progress, progress_in
+from colmap_av1.util.progress import progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
 # Of an image, below which a mapper that finds no start may lack them.
@@ -66,28 +71,11 @@ _RESECTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
 )
 _FEWEST_VIEWS = 3
-# Poses follow from rays, however uncertain the points are that these meet in.
-FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 # Beside corners, which say where an image is, motion that is off by more tells nothing. A corner is
 # where the picture shows it, and where a shutter bends this, all of it is to count; a link, too:
 # where poses do not hold together it is as far off as they are.
 _BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
 FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
-
-
-@dataclass(frozen=True)
-class PosesResult:
-    """What a stage found that ends in poses.
-
-    Attributes:
-        poses: file of the posed model, in the folder of the stages.
-        num_registered: images with a pose.
-        registered: those of each of several videos, by its name.
-    """
-
-    poses: str
-    num_registered: int
-    registered: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -216,21 +204,6 @@ def _largest_first(
         for images in (model.by_name for model in models)
     ]
     return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
-
-
-def registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
-    """Number of registered images of each of several videos, by its name.
-
-    Args:
-        names: names of the registered images.
-        image_set: the images.
-    """
-    if len(image_set.videos) == 1:
-        return {}
-    return {
-        name: sum(image in names for image in image_set.of_video(video).names)
-        for video, name in enumerate(image_set.videos)
-    }
 
 
 def refines_intrinsics(options: ReconstructOptions) -> bool:
@@ -450,87 +423,3 @@ def _black_points(
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=options)
     return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
-
-
-@dataclass(frozen=True)
-class PosedImages:
-    """The images that have a pose.
-
-    Attributes:
-        images: the images, in the order of their frames.
-        frames: int32 [n] their frames, counted through all sequences.
-        sequence: int32 [n] their sequences.
-        first_frame: first frame of each sequence, see `ImageSet`.
-        cameras: their pycolmap.Cameras, by id.
-        masks: of each, which of its pixels count; None: all.
-    """
-
-    images: list[ModelImage]
-    frames: NDArray[np.int32]
-    sequence: NDArray[np.int32]
-    first_frame: NDArray[np.int64]
-    cameras: dict[int, Any]
-    masks: tuple[Mask | None, ...]
-
-    @property
-    def camera_of_image(self) -> list[Any]:
-        """The camera of each image."""
-        return [self.cameras[image.camera_id] for image in self.images]
-
-    def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
-        """The mask of each image, joined with another of its name where there is one."""
-        return [
-            joined_masks(mask, others.get(image.name))
-            for mask, image in zip(self.masks, self.images, strict=True)
-        ]
-
-
-def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
-    """The images with the poses that a stage left."""
-    return posed_images_of(read_posed_model(run.stages / posed.result.poses), image_set)
-
-
-def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
-    """The images that have a pose in a model."""
-    posed_by_name = poses.by_name
-    names = image_set.images.names
-    index = [i for i, name in enumerate(names) if name in posed_by_name]
-    found = [posed_by_name[names[i]] for i in index]
-    cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
-    images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
-    own = image_set.some(index)
-    return PosedImages(images, own.images.frames, own.sequence, own.first_frame, cameras, own.masks)
-
-
-def triangulate_in(
-    run: Run,
-    placed: PosedImages,
-    seen: Tracks,
-    view: NDArray[np.int64],
-    *,
-    options: TriangulateOptions,
-    pinholes: Sequence[Any] | None = None,
-    rays: NDArray[np.float64] | None = None,
-    progress: Progress = no_progress,
-) -> TriangulatedPoints:
-    """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
-    return triangulate_tracks(
-        seen,
-        view,
-        placed.camera_of_image,
-        [image.cam_from_world for image in placed.images],
-        pinholes,
-        options=options,
-        num_threads=run.options.match.run.num_threads,
-        progress=progress,
-        rays=rays,
-    )
-
-
-def check_agreement(num_points: int, num_tracks: int) -> None:
-    """Refuse poses that no track agrees with."""
-    if num_points == 0:
-        raise ModelError(
-            f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
-            "give --camera_params"
-        )

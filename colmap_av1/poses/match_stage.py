@@ -28,17 +28,10 @@ from colmap_av1.matching.match_images import (
 )
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions
-from colmap_av1.poses.reconstruct_tracks import (
-    Run,
-    TracksResult,
-    VideoTracks,
-    key_images_of_video,
-    pose_tracks,
-    tracks_of,
-)
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks, key_images_of_video, pose_tracks, tracks_of
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
@@ -93,7 +86,6 @@ def match_stage(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    tracked: Sequence[Kept[TracksResult]],
     doubted: Sequence[int],
 ) -> Kept[MatchesResult]:
     """Write the database of the tracks that the poses come from, and of links.
@@ -102,7 +94,6 @@ def match_stage(
         run: what every stage is given.
         videos: the tracks of each video.
         image_set: the images.
-        tracked: what `track_stage` kept of each video.
         doubted: frames, counted through the videos, whose motion is not to be trusted.
     """
     options, clock = run.options, run.clock
@@ -151,7 +142,7 @@ def match_stage(
         run.stages,
         "matches",
         [
-            [t.digest for t in tracked],
+            [own.digest for own in videos],
             image_set.videos,
             run.photo_digests,
             given,
@@ -216,7 +207,7 @@ def _match_images(
     Cameras are estimated from all images: a few that lie far apart mislead.
     """
     options = run.options.match
-    context = RunContext.of(options.run, run.clock, run.progress)
+    context = run.context
     groups = ImageMatchOptions(
         options.pairs, options.verify, options.links, least_length(options.tracks)
     )

@@ -1,22 +1,29 @@
-"""Image sequences with ground-truth cameras."""
+"""Image sequences with ground-truth cameras, and the images and poses of their frames."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from colmap_av1.errors import ImageError, VideoError
-from colmap_av1.util.texts import read_lines
+from colmap_av1 import CameraOptions, ImageOptions, VideoError
+from colmap_av1.evaluate import Footage, FrontendRun, make_frontends, run_frontend
+from colmap_av1.evaluate.metrics.poses import frame_number, read_poses
+from colmap_av1.geometry.colmap_model import posed_images
+from colmap_av1.images.files import write_images
+from colmap_av1.images.names import image_names
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.stages import run_stage_in
+from colmap_av1.video.facts import read_video
 
-_WHAT_TO_GIVE = "give lines of 'name tx ty tz qx qy qz qw', or the folder of a COLMAP model"
+# The front-ends with default options, by name.
+FRONTENDS = make_frontends()
 
 
 @dataclass(frozen=True)
@@ -89,52 +96,63 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     )
 
 
-def frame_number(name: str) -> int:
-    """The frame number in a file name: its last group of digits.
-
-    Raises:
-        ImageError: the name has no number.
-    """
-    numbers = re.findall(r"\d+", Path(name).stem)
-    if not numbers:
-        raise ImageError(f"image '{name}': its name has no frame number: rename it")
-    return int(numbers[-1])
-
-
-def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
-    """Read true poses from lines of `name tx ty tz qx qy qz qw`, see `read_sequence`.
+def prepare_footage(
+    video: Path, folder: Path, *, num_frames: int, image_step: int, camera: CameraOptions
+) -> Footage:
+    """Write frames of a video at regular steps as the images that every front-end gets.
 
     Args:
-        path: the file.
+        video: an AV1 video.
+        folder: gets `images/`; existing images of the same video are kept.
+        num_frames: number of frames of the video.
+        image_step: step between the frames that become images.
+        camera: camera options of all images.
+
+    Raises:
+        VideoError: the video cannot be read.
+        ImageError: the video has fewer frames.
+    """
+    frames = tuple(range(0, num_frames, image_step))
+    opened = read_video(video)
+    footage = Footage(
+        video=video,
+        image_path=folder / "images",
+        names=image_names(ImageOptions().file_name, frames),
+        frames=frames,
+        num_frames=num_frames,
+        size=opened.picture_size,
+        pixel_aspect=opened.display.pixel_aspect,
+        camera=camera,
+    )
+
+    def make() -> dict[str, Any]:
+        footage.image_path.mkdir()
+        write_images(opened, footage.image_path, footage.names, frames)
+        return {}
+
+    run_stage_in(folder, [file_digest(video), frames], make, products=[footage.image_path])
+    return footage
+
+
+def measure_frontend(name: str, footage: Footage, folder: Path) -> FrontendRun:
+    """Fill a database with a front-end's default options, see `run_frontend`."""
+    return run_frontend(name, footage, folder, FRONTENDS[name])
+
+
+def model_poses(model: pycolmap.Reconstruction, num_frames: int) -> NDArray[np.float64]:
+    """Poses of a model's registered images, by frame.
+
+    Args:
+        model: pycolmap.Reconstruction whose image names contain the frame number, from 0.
         num_frames: number of frames of the video.
 
     Returns:
-        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a line.
+        float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a registered image.
 
     Raises:
-        ImageError: the file cannot be read, or refers to a frame that the video lacks.
+        ImageError: an image's name has no frame number.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
-    try:
-        lines = read_lines(path)
-    except UnicodeDecodeError as error:
-        raise ImageError(f"{path}: is not a text file: {_WHAT_TO_GIVE}") from error
-    except OSError as error:
-        raise ImageError(f"{path}: {error.strerror}: {_WHAT_TO_GIVE}") from error
-    for line in lines:
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        frame = frame_number(words[0])
-        if frame >= num_frames:
-            raise ImageError(
-                f"{path}: '{words[0]}' is not one of the {num_frames} frames: give the ground "
-                "truth of this video"
-            )
-        try:
-            values = np.array(words[1:], dtype=np.float64)
-            rotation = Rotation.from_quat(values[3:7]).as_matrix().T
-        except ValueError as error:
-            raise ImageError(f"{path}: '{line[:80]}' is not a pose: {_WHAT_TO_GIVE}") from error
-        cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
+    for name, image in posed_images(model).items():
+        cam_from_world[frame_number(name)] = image.cam_from_world
     return cam_from_world

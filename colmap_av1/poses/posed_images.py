@@ -1,0 +1,140 @@
+"""The images that a stage has placed, and points of tracks in them."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.masks import Mask, joined_masks
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
+from colmap_av1.geometry.track_points import triangulate_tracks
+from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import TriangulateOptions
+from colmap_av1.poses.run import Run
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.stages import Kept
+
+# Poses follow from rays, however uncertain the points are that these meet in.
+FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
+
+
+@dataclass(frozen=True)
+class PosesResult:
+    """What a stage found that ends in poses.
+
+    Attributes:
+        poses: file of the posed model, in the folder of the stages.
+        num_registered: images with a pose.
+        registered: those of each of several videos, by its name.
+    """
+
+    poses: str
+    num_registered: int
+    registered: dict[str, int]
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The images that have a pose.
+
+    Attributes:
+        images: the images, in the order of their frames.
+        frames: int32 [n] their frames, counted through all sequences.
+        sequence: int32 [n] their sequences.
+        first_frame: first frame of each sequence, see `ImageSet`.
+        cameras: their pycolmap.Cameras, by id.
+        masks: of each, which of its pixels count; None: all.
+    """
+
+    images: list[ModelImage]
+    frames: NDArray[np.int32]
+    sequence: NDArray[np.int32]
+    first_frame: NDArray[np.int64]
+    cameras: dict[int, Any]
+    masks: tuple[Mask | None, ...]
+
+    @property
+    def camera_of_image(self) -> list[Any]:
+        """The camera of each image."""
+        return [self.cameras[image.camera_id] for image in self.images]
+
+    def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
+        """The mask of each image, joined with another of its name where there is one."""
+        return [
+            joined_masks(mask, others.get(image.name))
+            for mask, image in zip(self.masks, self.images, strict=True)
+        ]
+
+
+def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
+    """The images with the poses that a stage left."""
+    return posed_images_of(read_posed_model(run.stages / posed.result.poses), image_set)
+
+
+def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
+    """The images that have a pose in a model."""
+    posed_by_name = poses.by_name
+    names = image_set.images.names
+    index = [i for i, name in enumerate(names) if name in posed_by_name]
+    found = [posed_by_name[names[i]] for i in index]
+    cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
+    images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
+    own = image_set.some(index)
+    return PosedImages(images, own.images.frames, own.sequence, own.first_frame, cameras, own.masks)
+
+
+def triangulate_in(
+    run: Run,
+    placed: PosedImages,
+    seen: Tracks,
+    view: NDArray[np.int64],
+    *,
+    options: TriangulateOptions,
+    pinholes: Sequence[Any] | None = None,
+    rays: NDArray[np.float64] | None = None,
+    progress: Progress = no_progress,
+) -> TriangulatedPoints:
+    """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
+    return triangulate_tracks(
+        seen,
+        view,
+        placed.camera_of_image,
+        [image.cam_from_world for image in placed.images],
+        pinholes,
+        options=options,
+        num_threads=run.options.match.run.num_threads,
+        progress=progress,
+        rays=rays,
+    )
+
+
+def check_agreement(num_points: int, num_tracks: int) -> None:
+    """Refuse poses that no track agrees with."""
+    if num_points == 0:
+        raise ModelError(
+            f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
+            "give --camera_params"
+        )
+
+
+def registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
+    """Number of registered images of each of several videos, by its name.
+
+    Args:
+        names: names of the registered images.
+        image_set: the images.
+    """
+    if len(image_set.videos) == 1:
+        return {}
+    return {
+        name: sum(image in names for image in image_set.of_video(video).names)
+        for video, name in enumerate(image_set.videos)
+    }

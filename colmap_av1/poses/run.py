@@ -1,0 +1,67 @@
+"""What every stage of the estimate is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
+from colmap_av1.images.inputs import Inputs
+from colmap_av1.images.positions import ImagePositions
+from colmap_av1.matching.cameras import ImageCameras
+from colmap_av1.options import ReconstructOptions
+from colmap_av1.tracks.video_tracks import VideoSource
+from colmap_av1.util.digests import file_digest
+from colmap_av1.util.progress import Clock, Progress
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.video.unchanged import FileState
+
+
+@dataclass(frozen=True)
+class Run:
+    """What every stage is given.
+
+    Attributes:
+        inputs: the videos and photos.
+        sources: for each video, where its motion and pictures come from.
+        shown: for each video, how its pictures are looked at.
+        output: the folder that is made.
+        stages: the folder in it that holds what later runs resume from.
+        options: options of every stage.
+        clock: gets the time of each stage.
+        progress: called in each stage.
+        positions: where the images were taken; None before these are chosen.
+        cameras: of all images, where a database lists them; None: they are made anew.
+    """
+
+    inputs: Inputs
+    sources: tuple[VideoSource, ...]
+    shown: tuple[ShownVideo, ...]
+    output: Path
+    stages: Path
+    options: ReconstructOptions
+    clock: Clock
+    progress: Progress
+    positions: ImagePositions | None = None
+    cameras: ImageCameras | None = None
+
+    @property
+    def context(self) -> RunContext:
+        """Clock, progress, threads and seed of the run."""
+        return RunContext.of(self.options.match.run, self.clock, self.progress)
+
+    @property
+    def files(self) -> tuple[FileState, ...]:
+        """All files as they were at the start."""
+        photos = [photo.state for photo in self.inputs.photos]
+        return (*(file for source in self.sources for file in source.files), *photos)
+
+    @property
+    def photo_digests(self) -> list[list[str]]:
+        """Name and digest of each photo, which stages depend on."""
+        return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
+
+    def pictures(self, image_set: ImageSet) -> Pictures:
+        """What gives the pictures of images, see `pictures_of`."""
+        photos = [photo.path for photo in self.inputs.photos]
+        return pictures_of(image_set, self.shown, photos, self.options.match.reading)
