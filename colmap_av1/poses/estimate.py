@@ -31,8 +31,8 @@ from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# Mappings of a run at most: the second one finds nearly all that a third one does.
-_MOST_MAPPINGS = 3
+# Number of the adjustment after the first split: after that of the key images and a second mapping.
+_FIRST_SPLIT = 3
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     two sides together before may not agree once the largest part is adjusted on its own, so its
     seams are looked at again.
     """
-    for number in count(_MOST_MAPPINGS + 1):
+    for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result
@@ -244,19 +244,17 @@ def believed_tracks(
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Map the adjusted observations again, and adjust, as long as that lowers the cost.
+    """Map the adjusted observations again, and adjust, if that lowers the cost.
 
-    See `remapping` for why. Poses that no adjustment by corners has left stay as they are.
+    See `remapping` for why. A third mapping never lowered the cost further. Poses that no
+    adjustment by corners has left stay as they are.
     """
-    adjustment = posed.adjustment
-    if adjustment is None or not posed.in_place:
+    if posed.adjustment is None or not posed.in_place:
         return posed
-    for number in range(2, _MOST_MAPPINGS + 1):
-        again = remap_stage(run, image_set, adjustment, number=number)
-        if not again.result.is_better:
-            break
-        adjustment = _adjusted(run, posed, image_set, again, number=number)
-    return replace(posed, adjustment=adjustment)
+    again = remap_stage(run, image_set, posed.adjustment)
+    if not again.result.is_better:
+        return posed
+    return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))
 
 
 def _adjusted(

@@ -73,7 +73,7 @@ class RemappedResult(PosesResult):
 
 
 def remap_stage(
-    run: Run, image_set: ImageSet, adjusted: Kept[AdjustedResult], *, number: int
+    run: Run, image_set: ImageSet, adjusted: Kept[AdjustedResult]
 ) -> Kept[RemappedResult]:
     """Map the images again, by the observations that their poses were adjusted on.
 
@@ -81,9 +81,8 @@ def remap_stage(
         run: what every stage is given.
         image_set: the images.
         adjusted: the stage that adjusted them.
-        number: of the mapping, 2 or more.
     """
-    name = f"remapped_{number}"
+    name = "remapped"
 
     def make(partial: Path) -> RemappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
