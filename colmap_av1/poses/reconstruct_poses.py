@@ -37,6 +37,7 @@ from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_u
 from colmap_av1.poses.reconstruct_stages import MatchesResult
 from colmap_av1.poses.reconstruct_tracks import LEAST_IMAGES, Run, pose_tracks
 from colmap_av1.poses.seams import model_seams
+from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress, no_progress, progress_in
@@ -318,9 +319,9 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
             np.array([known.images[i].cam_from_world for i in own]), frames, left
         )
         found = resect(
-            sightings_of(points, seen, spread, left, camera),
+            sightings_of(points, seen, spread, left, [camera] * len(left)),
             guesses,
-            float(camera.mean_focal_length()),
+            np.full(len(left), camera.mean_focal_length()),
             seed=run_options.seed,
             num_threads=run_options.num_threads,
             progress=progress_in(run.progress, "resection", len(left)),
@@ -401,6 +402,8 @@ def adjustment_stage(
         result = posed_model(adjusted, with_points=True)
         # Point ids count from 1, in the order of the points.
         is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
+        with run.clock.measure("adjustment"):
+            result = with_own_cameras(run, result, LOSS_SCALES, refine_intrinsics=refine)
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
@@ -416,10 +419,11 @@ def adjustment_stage(
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
     given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, LOSS_SCALES, FEW_SEEN, refine, *how)
+    single_camera = options.match.camera.single_camera
     return run_stage(
         run.stages,
         f"adjustment{suffix}",
-        [posed.digest, given, moved],
+        [posed.digest, given, moved, single_camera],
         AdjustedResult,
         into=run.stages,
         products=[f"adjusted{suffix}.npz"],
