@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -133,46 +133,58 @@ def pose_stage(
     mapping = options.mapping
     found_before = matched.result
     forward = found_before.forward_motion
-    mapper = mapping.mapper
-    if mapper == "auto":
-        mapper = "incremental" if found_before.guessed else "global"
+    mappers: list[Literal["incremental", "global"]]
+    if mapping.mapper != "auto":
+        mappers = [mapping.mapper]
+    else:
+        # The global mapper needs the focal length, and a zoom misleads its estimate.
+        mappers = ["incremental"] if found_before.guessed else ["global", "incremental"]
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     hangs = links.num_between or reasons & {"contradicted", "few tracks"}
     start_tracks = None if hangs else START_TRACKS
     tolerance = TOLERANCE if mapping.adjust and not hangs else None
-    how = MapOptions(
-        mapper=mapper,
-        forward_motion=forward and mapper == "incremental",
-        refine_intrinsics=refines_intrinsics(options),
-        seed=options.match.run.seed,
-        num_threads=mapping.mapper_threads,
-    )
+    hows = [
+        MapOptions(
+            mapper=mapper,
+            forward_motion=forward and mapper == "incremental",
+            refine_intrinsics=refines_intrinsics(options),
+            seed=options.match.run.seed,
+            num_threads=mapping.mapper_threads,
+        )
+        for mapper in mappers
+    ]
+
+    def map_with(how: MapOptions, database: Path) -> list[PosedModel]:
+        with tempfile.TemporaryDirectory() as models:
+            sizes = map_poses(
+                database,
+                Path(models),
+                how,
+                image_path=None,
+                log=run.stages / "mapper.log",
+                num_images=len(keyed.images.names),
+                progress=progress,
+                start_tracks=start_tracks,
+                tolerance=tolerance,
+            )
+            return [
+                posed_model(read_model(Path(models) / str(number)))
+                for number, size in enumerate(sizes)
+                if size >= LEAST_IMAGES
+            ]
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
             # pycolmap brings a database to its own layout.
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
-            with tempfile.TemporaryDirectory() as models:
-                sizes = map_poses(
-                    copy,
-                    Path(models),
-                    how,
-                    image_path=None,
-                    log=run.stages / "mapper.log",
-                    num_images=len(keyed.images.names),
-                    progress=progress,
-                    start_tracks=start_tracks,
-                    tolerance=tolerance,
-                )
-                found = [
-                    posed_model(read_model(Path(models) / str(number)))
-                    for number, size in enumerate(sizes)
-                    if size >= LEAST_IMAGES
-                ]
+            for how in hows:
+                found = map_with(how, copy)
+                if found:
+                    break
         if not found:
-            raise ModelError(_why_no_start(found_before, mapper))
+            raise ModelError(_why_no_start(found_before, how.mapper))
         found = _largest_first(found, image_set, keyed)
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
@@ -182,14 +194,14 @@ def pose_stage(
             poses=files[0],
             num_registered=len(found[0].images),
             registered=registered_by_video(found[0].by_name, keyed),
-            mapper=mapper,
+            mapper=how.mapper,
             other_models=tuple(files[1:]),
         )
 
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, how, start_tracks, tolerance, pycolmap.__version__],
+        [matched.digest, hows, start_tracks, tolerance, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],

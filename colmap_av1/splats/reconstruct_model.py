@@ -236,7 +236,7 @@ class ModelResult:
         num_observations: number of observations of all points.
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean reprojection error of the points in pixels.
-        focal_length: focal length of the first camera in pixels.
+        focal_lengths: the shortest and the longest of the cameras in pixels.
         agreeing: share of the tracks that agree with the poses.
     """
 
@@ -244,7 +244,7 @@ class ModelResult:
     num_observations: int
     coverage: float
     mean_error: float
-    focal_length: float
+    focal_lengths: tuple[float, float]
     agreeing: float
 
 
@@ -292,12 +292,13 @@ def model_stage(
             if masked:
                 shown = counting if options.moving == "mask" else given
                 _write_masks(partial / _MASKS, images, cameras, shown)
+        focal = [camera.mean_focal_length() for camera in cameras.values()]
         return ModelResult(
             num_points=len(cloud.xyz),
             num_observations=len(cloud.image),
             coverage=covered,
             mean_error=mean_error(cloud),
-            focal_length=float(views[0].camera.params[0]),
+            focal_lengths=(min(focal), max(focal)),
             agreeing=agreeing,
         )
 
