@@ -105,7 +105,7 @@ class ReconstructReport:
             picture, where tracks were corrected for it; None: they were not.
         place: where the model lies in the world: units, axes, origin and what said so, as in
             `place.json`.
-        focal_length: of the output's first camera, in pixels.
+        focal_lengths: the shortest and the longest of the output's cameras, in pixels.
         mapper: which of COLMAP's mappers found the poses.
         forward_motion: the camera moves along its axis, see `MatchReport`.
         links: what connects images where motion does not, see `LinkReport`.
@@ -139,7 +139,7 @@ class ReconstructReport:
     far_views_largest: float | None
     read_outs: tuple[float | None, ...]
     place: dict[str, Any]
-    focal_length: float
+    focal_lengths: tuple[float, float]
     mapper: str
     forward_motion: bool
     links: LinkReport
@@ -291,7 +291,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         far_views_largest=long_range.far_views_largest,
         read_outs=tuple(stage.result.read_out for stage in tracked),
         place=placed.result.place,
-        focal_length=model.focal_length,
+        focal_lengths=model.focal_lengths,
         mapper=posed.mapped.result.mapper,
         forward_motion=matches.forward_motion,
         links=matches.links,

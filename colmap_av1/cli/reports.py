@@ -11,7 +11,6 @@ if TYPE_CHECKING:  # each is slow to import
     from colmap_av1.batch.run import BatchReport
     from colmap_av1.check.database import CheckReport
     from colmap_av1.check.model import ModelCheck
-    from colmap_av1.check.model_figures import ModelFigures
     from colmap_av1.densify import DensifyReport
     from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.map import MapReport
@@ -86,7 +85,7 @@ def map_rows(report: MapReport) -> Rows:
         ("points", str(figures.num_points)),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         ("mean track length", f"{figures.mean_track_length:.2f}"),
-        _focal_length_row(figures),
+        _focal_length_row(figures.focal_lengths),
     ]
     if report.far_views is not None:
         rows += _far_view_rows(report.far_views.median, report.far_views.largest)
@@ -97,11 +96,11 @@ def map_rows(report: MapReport) -> Rows:
     return [*rows, ("model written to", str(report.model))]
 
 
-def _focal_length_row(figures: ModelFigures) -> tuple[str, str]:
+def _focal_length_row(focal_lengths: tuple[float, float]) -> tuple[str, str]:
     """The focal length of a model, or the range where its cameras differ."""
-    shortest, longest = figures.focal_lengths
+    shortest, longest = focal_lengths
     if longest - shortest < _SAME_FOCAL_LENGTH * longest:
-        return ("focal length", f"{figures.focal_length:.2f} px")
+        return ("focal length", f"{(shortest + longest) / 2:.2f} px")
     return ("focal lengths", f"{shortest:.2f} to {longest:.2f} px")
 
 
@@ -129,7 +128,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *_far_view_rows(report.far_views, report.far_views_largest),
-        ("focal length", f"{report.focal_length:.2f} px"),
+        _focal_length_row(report.focal_lengths),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
         *_link_rows(report.links),
@@ -174,7 +173,7 @@ def model_rows(found: ModelCheck) -> Rows:
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         *(_far_view_rows(far_views.median, far_views.largest) if far_views else ()),
-        _focal_length_row(figures),
+        _focal_length_row(figures.focal_lengths),
     ]
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -51,7 +50,7 @@ def sightings_of(
     seen: Tracks,
     tracks: Tracks,
     frames: NDArray[np.int32],
-    camera: pycolmap.Camera,
+    cameras: Sequence[pycolmap.Camera],
 ) -> Sightings:
     """Observations, in frames without a pose, of the points of tracks.
 
@@ -60,7 +59,7 @@ def sightings_of(
         seen: the tracks in the frames with known poses, from `Tracks.keep_frames`.
         tracks: the same tracks in all frames.
         frames: int32 [num_images] ascending frames without a pose.
-        camera: their pycolmap.Camera.
+        cameras: the pycolmap.Camera of each of them.
     """
     number = tracks.track
     known = np.zeros(tracks.num_frames, dtype=np.bool_)
@@ -76,14 +75,18 @@ def sightings_of(
     rows = np.flatnonzero((place[tracks.frame] >= 0) & (point[number] >= 0))
     rows = rows[np.argsort(place[tracks.frame[rows]], kind="stable")]
     bounds = np.searchsorted(place[tracks.frame[rows]], np.arange(len(frames) + 1))
-    rays = np.asarray(camera.cam_from_img(tracks.xy[rows].astype(np.float64))).reshape(-1, 2)
+    xy = tracks.xy[rows].astype(np.float64)
+    rays = np.empty(xy.shape)
+    for camera, first_row, last_row in zip(cameras, bounds[:-1], bounds[1:], strict=True):
+        own_rows = slice(int(first_row), int(last_row))
+        rays[own_rows] = np.asarray(camera.cam_from_img(xy[own_rows])).reshape(-1, 2)
     return Sightings(rays, points.xyz[point[number[rows]]], bounds)
 
 
 def resect(
     sightings: Sightings,
     guesses: _Floats,
-    focal: float,
+    focal: _Floats,
     *,
     loss_scale: float = _LOSS_SCALE,
     seed: int = 0,
@@ -95,7 +98,7 @@ def resect(
     Args:
         sightings: the observations of points in the images.
         guesses: float64 [num_images, 3, 4] initial poses, x_cam = R x_world + t.
-        focal: focal length in pixels, which converts errors to pixels.
+        focal: float64 [num_images] focal lengths in pixels, which convert errors to pixels.
         loss_scale: scale in pixels of the Cauchy loss.
         seed: random seed of the samples.
         num_threads: number of threads; None: one per CPU. The result does not depend on it.
@@ -104,14 +107,17 @@ def resect(
     Returns:
         The pose float64 [3, 4] of each image; None for images with fewer than 30 inliers.
     """
-    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 
     def work(image: int) -> _Floats | None:
         own = slice(int(sightings.bounds[image]), int(sightings.bounds[image + 1]))
         rays, xyz = sightings.rays[own], sightings.xyz[own]
-        own_seed = seed_of(seed, image)
         return _resect_one(
-            rays * focal, xyz, guesses[image], camera, loss_scale=loss_scale, seed=own_seed
+            rays,
+            xyz,
+            guesses[image],
+            float(focal[image]),
+            loss_scale=loss_scale,
+            seed=seed_of(seed, image),
         )
 
     found: list[_Floats | None] = []
@@ -124,18 +130,19 @@ def resect(
 
 
 def _resect_one(
-    xy: _Floats,
+    rays: _Floats,
     xyz: _Floats,
     guess: _Floats,
-    camera: dict[str, Any],
+    focal: float,
     *,
     loss_scale: float,
     seed: int,
 ) -> _Floats | None:
     import poselib  # noqa: PLC0415 - after NumPy
 
-    if len(xy) < _MIN_INLIERS:
+    if len(rays) < _MIN_INLIERS:
         return None
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
     ransac = {
         "max_reproj_error": _MAX_ERROR,
         "min_iterations": _MIN_SAMPLES,
@@ -145,7 +152,7 @@ def _resect_one(
     bundle = {"loss_type": "CAUCHY", "loss_scale": loss_scale}
     start = poselib.CameraPose()
     start.R, start.t = guess[:, :3], guess[:, 3]
-    pose, info = poselib.estimate_absolute_pose(xy, xyz, camera, ransac, bundle, start)
+    pose, info = poselib.estimate_absolute_pose(rays * focal, xyz, camera, ransac, bundle, start)
     if info["num_inliers"] < _MIN_INLIERS:
         return None
     return np.column_stack([np.asarray(pose.R), np.asarray(pose.t)])

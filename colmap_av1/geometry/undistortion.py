@@ -114,7 +114,8 @@ def undistorted_masks(
         pinholes: the pinhole camera for each camera, by camera id.
     """
 
-    @functools.cache
+    # As images of a camera follow one another, one map is kept: it takes much memory.
+    @functools.lru_cache(maxsize=1)
     def change_of(camera_id: int) -> Undistortion | None:
         return undistortion(of_id[camera_id], pinholes[camera_id], cv2.INTER_NEAREST)
 
@@ -184,8 +185,10 @@ def undistortion(
         return None
     fx, fy, cx, cy = pinhole.params
     width, height = int(pinhole.width), int(pinhole.height)
-    y, x = np.mgrid[0:height, 0:width].reshape(2, -1) + 0.5
-    source = _project(camera, np.column_stack([(x - cx) / fx, (y - cy) / fy]))
+    rays = np.ones((height, width, 3))
+    rays[..., 0] = (np.arange(width) + 0.5 - cx) / fx
+    rays[..., 1] = ((np.arange(height) + 0.5 - cy) / fy)[:, None]
+    source = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))
     # In OpenCV, the first pixel's centre is (0, 0).
     at = (source - 0.5).reshape(height, width, 2).astype(np.float32)
     return Undistortion(at, interpolation)

@@ -134,10 +134,10 @@ class ReconstructOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.match.camera.single_camera is False:
+        if self.match.camera.single_camera is False and not self.mapping.adjust:
             raise OptionError(
-                "single_camera is 0, but trainers want one camera for all images of a video: leave "
-                "it out, or give 1"
+                "single_camera is 0, but only the adjustment estimates the cameras: leave out "
+                "--adjust 0"
             )
         name = self.match.images.image_name
         if name.count(".") > 1:

@@ -390,14 +390,18 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
     named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
     first = {sequence: matched[name] for sequence, name in named if name in matched}
     adjusted = dict[int, pycolmap.Camera]()
+    own = dict[str, pycolmap.Camera]()
     for image in known.images:
-        camera = matched.get(image.name)
-        if camera is not None and camera.has_prior_focal_length:
-            adjusted[id(camera)] = known.cameras[image.camera_id]
-            adjusted[id(camera)].has_prior_focal_length = True  # models do not hold it
+        own[image.name] = known.cameras[image.camera_id]
+        own[image.name].has_prior_focal_length = True  # models do not hold it
+        if image.name in matched:
+            adjusted[id(matched[image.name])] = own[image.name]
     # Images share a camera if it is the same object, see `ImageMatches`.
     cameras = [first[sequence] for sequence, _ in named]
-    return [adjusted.get(id(camera), camera) for camera in cameras]
+    return [
+        own.get(name, adjusted.get(id(camera), camera)) if camera.has_prior_focal_length else camera
+        for (_, name), camera in zip(named, cameras, strict=True)
+    ]
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:

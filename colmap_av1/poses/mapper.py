@@ -153,6 +153,8 @@ def adjust_model(
     seed: int,
     num_threads: int,
     log: Path,
+    max_steps: int = _ADJUSTMENT_STEPS,
+    tolerance: float = _ADJUSTMENT_TOLERANCE,
 ) -> None:
     """Bundle-adjust poses, points and, if asked to, intrinsics of a model; it is overwritten.
 
@@ -165,11 +167,14 @@ def adjust_model(
         seed: the random seed.
         num_threads: threads; the result is the same from run to run with one only.
         log: file that gets what COLMAP prints.
+        max_steps: steps of each adjustment at most.
+        tolerance: share of the cost that a step of the last adjustment must lower it by, or be the
+            last.
 
     Raises:
         ModelError: the adjustment failed; the log says more.
     """
-    tolerances = [_FIRST_TOLERANCE] * (len(loss_scales) - 1) + [_ADJUSTMENT_TOLERANCE]
+    tolerances = [_FIRST_TOLERANCE] * (len(loss_scales) - 1) + [tolerance]
     settings = {
         "task": "adjustment",
         "model": str(model),
@@ -177,7 +182,7 @@ def adjust_model(
         "loss_scales": list(loss_scales),
         "seed": seed,
         "num_threads": num_threads,
-        "max_num_iterations": _ADJUSTMENT_STEPS,
+        "max_num_iterations": max_steps,
         "function_tolerances": tolerances,
         "most_dense_images": _MOST_DENSE_IMAGES,
     }

@@ -207,6 +207,10 @@ def _match_images(
     Cameras are estimated from all images: a few that lie far apart mislead.
     """
     options = run.options.match
+    camera = options.camera
+    if camera.single_camera is False:
+        # The adjustment separates them: mappers hardly find many focal lengths at once.
+        camera = replace(camera, single_camera=None)
     context = run.context
     groups = ImageMatchOptions(
         options.pairs, options.verify, options.links, least_length(options.tracks)
@@ -218,10 +222,10 @@ def _match_images(
             return replace(run.cameras, of_images=[run.cameras.of_images[i] for i in index])
         shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in run.shown]
         photos = run.inputs.photos
-        if options.camera.camera_params is not None or len(index) == len(image_set.sequence):
-            return new_cameras(paired, keyed, shapes, photos, options.camera, context=context)
+        if camera.camera_params is not None or len(index) == len(image_set.sequence):
+            return new_cameras(paired, keyed, shapes, photos, camera, context=context)
         every = pair_videos(image_set, _selected_tracks(run, videos, image_set), groups, context)
-        made = new_cameras(every, image_set, shapes, photos, options.camera, context=context)
+        made = new_cameras(every, image_set, shapes, photos, camera, context=context)
         return replace(made, of_images=[made.of_images[i] for i in index])
 
     return match_images(

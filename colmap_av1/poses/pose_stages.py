@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -42,6 +43,7 @@ from colmap_av1.poses.posed_images import (
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import model_seams
 from colmap_av1.poses.track_stage import LEAST_IMAGES, pose_tracks
+from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import progress_in
@@ -122,46 +124,58 @@ def pose_stage(
     mapping = options.mapping
     found_before = matched.result
     forward = found_before.forward_motion
-    mapper = mapping.mapper
-    if mapper == "auto":
-        mapper = "incremental" if found_before.guessed else "global"
+    mappers: list[Literal["incremental", "global"]]
+    if mapping.mapper != "auto":
+        mappers = [mapping.mapper]
+    else:
+        # The global mapper needs the focal length, and a zoom misleads its estimate.
+        mappers = ["incremental"] if found_before.guessed else ["global", "incremental"]
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     hangs = links.num_between or reasons & {"contradicted", "few tracks"}
     start_tracks = None if hangs else START_TRACKS
     tolerance = TOLERANCE if mapping.adjust and not hangs else None
-    how = MapOptions(
-        mapper=mapper,
-        forward_motion=forward and mapper == "incremental",
-        refine_intrinsics=refines_intrinsics(options),
-        seed=options.match.run.seed,
-        num_threads=mapping.mapper_threads,
-    )
+    hows = [
+        MapOptions(
+            mapper=mapper,
+            forward_motion=forward and mapper == "incremental",
+            refine_intrinsics=refines_intrinsics(options),
+            seed=options.match.run.seed,
+            num_threads=mapping.mapper_threads,
+        )
+        for mapper in mappers
+    ]
+
+    def map_with(how: MapOptions, database: Path) -> list[PosedModel]:
+        with tempfile.TemporaryDirectory() as models:
+            sizes = map_poses(
+                database,
+                Path(models),
+                how,
+                image_path=None,
+                log=run.stages / "mapper.log",
+                num_images=len(keyed.images.names),
+                progress=progress,
+                start_tracks=start_tracks,
+                tolerance=tolerance,
+            )
+            return [
+                posed_model(read_model(Path(models) / str(number)))
+                for number, size in enumerate(sizes)
+                if size >= LEAST_IMAGES
+            ]
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
             # pycolmap brings a database to its own layout.
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
-            with tempfile.TemporaryDirectory() as models:
-                sizes = map_poses(
-                    copy,
-                    Path(models),
-                    how,
-                    image_path=None,
-                    log=run.stages / "mapper.log",
-                    num_images=len(keyed.images.names),
-                    progress=progress,
-                    start_tracks=start_tracks,
-                    tolerance=tolerance,
-                )
-                found = [
-                    posed_model(read_model(Path(models) / str(number)))
-                    for number, size in enumerate(sizes)
-                    if size >= LEAST_IMAGES
-                ]
+            for how in hows:
+                found = map_with(how, copy)
+                if found:
+                    break
         if not found:
-            raise ModelError(_why_no_start(found_before, mapper))
+            raise ModelError(_why_no_start(found_before, how.mapper))
         found = _largest_first(found, image_set, keyed)
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
@@ -171,14 +185,14 @@ def pose_stage(
             poses=files[0],
             num_registered=len(found[0].images),
             registered=registered_by_video(found[0].by_name, keyed),
-            mapper=mapper,
+            mapper=how.mapper,
             other_models=tuple(files[1:]),
         )
 
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, how, start_tracks, tolerance, pycolmap.__version__],
+        [matched.digest, hows, start_tracks, tolerance, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],
@@ -293,9 +307,9 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
             np.array([known.images[i].cam_from_world for i in own]), frames, left
         )
         found = resect(
-            sightings_of(points, seen, spread, left, camera),
+            sightings_of(points, seen, spread, left, [camera] * len(left)),
             guesses,
-            float(camera.mean_focal_length()),
+            np.full(len(left), camera.mean_focal_length()),
             seed=run_options.seed,
             num_threads=run_options.num_threads,
             progress=progress_in(run.progress, "resection", len(left)),
@@ -376,6 +390,8 @@ def adjustment_stage(
         result = posed_model(adjusted, with_points=True)
         # Point ids count from 1, in the order of the points.
         is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
+        with run.clock.measure("adjustment"):
+            result = with_own_cameras(run, result, LOSS_SCALES, refine_intrinsics=refine)
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
@@ -393,10 +409,11 @@ def adjustment_stage(
     how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
     kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
     given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, LOSS_SCALES, FEW_SEEN, refine, *how)
+    single_camera = options.match.camera.single_camera
     return run_stage(
         run.stages,
         f"adjustment{suffix}",
-        [posed.digest, given, moved],
+        [posed.digest, given, moved, single_camera],
         AdjustedResult,
         into=run.stages,
         products=[f"adjusted{suffix}.npz"],

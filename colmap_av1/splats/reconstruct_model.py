@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,12 +87,19 @@ def _tracked_points(
     return take_points(tracked, np.flatnonzero(fit)), agreeing
 
 
-def _undistortions(
-    placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]
-) -> list[Undistortion | None]:
-    """What undistorts the picture of each image; None: it is written as it is."""
-    of_camera = {i: undistortion(camera, cameras[i]) for i, camera in placed.cameras.items()}
-    return [of_camera[image.camera_id] for image in placed.images]
+# What undistorts the picture of an image, by its index; None: it is written as it is.
+_Undistort = Callable[[int], Undistortion | None]
+
+
+def _undistortions(placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]) -> _Undistort:
+    """What undistorts the pictures, with the cameras of the written images by their ids."""
+
+    # Images of a camera follow one another, and a map of each of many cameras takes much memory.
+    @functools.lru_cache(maxsize=1)
+    def of_camera(camera_id: int) -> Undistortion | None:
+        return undistortion(placed.cameras[camera_id], cameras[camera_id])
+
+    return lambda index: of_camera(placed.images[index].camera_id)
 
 
 def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:
@@ -103,7 +110,7 @@ def _written_images(
     run: Run,
     folder: Path,
     placed: PosedImages,
-    undistort: Sequence[Undistortion | None],
+    undistort: _Undistort,
     look: Look,
 ) -> None:
     """Write the images and look at those of videos on the way."""
@@ -113,7 +120,7 @@ def _written_images(
 
     def change(first: int, frame: int, picture: _Image) -> _Image:
         index = index_of_frame[first + frame]
-        shown = _undistorted(picture, undistort[index])
+        shown = _undistorted(picture, undistort(index))
         look(index, shown)
         return shown
 
@@ -133,14 +140,14 @@ def _written_images(
                 (placed.frames[own] - first).tolist(),
                 num_threads=options.match.run.num_threads,
                 operating_point=options.match.read.operating_point,
-                change=partial(change, first),
+                change=functools.partial(change, first),
                 kept=run.sources[sequence].kept,
                 progress=report,
             )
         else:
             photo = run.inputs.photos[sequence - len(run.sources)]
             (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
-            shown = _undistorted(read_image(photo.path), undistort[int(own[0])])
+            shown = _undistorted(read_image(photo.path), undistort(int(own[0])))
             write_image(folder / photo.name, shown)
             report(1)
         done += len(own)
@@ -153,7 +160,7 @@ def _written_cloud(
     views: Sequence[PosedCamera],
     tracked: ModelPoints,
     *,
-    undistort: Sequence[Undistortion | None],
+    undistort: _Undistort,
 ) -> ModelPoints:
     """Write the images; returns the points, in black, that `points` of the options requests."""
     options, clock = run.options.triangulate, run.clock
@@ -183,7 +190,7 @@ def _coloured(
     views: Sequence[PosedCamera],
     cloud: ModelPoints,
     *,
-    undistort: Sequence[Undistortion | None],
+    undistort: _Undistort,
 ) -> ModelPoints:
     """Colour the points from the decoded video.
 
@@ -195,7 +202,7 @@ def _coloured(
     with run.clock.measure("colours"):
         for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
             index = index_of[place]
-            colours.add(index, picture, undistort[index])
+            colours.add(index, picture, undistort(index))
             run.progress("colours", done, len(views))
         return replace(cloud, rgb=colours.rgb())
 
@@ -229,7 +236,7 @@ class ModelResult:
         num_observations: number of observations of all points.
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean reprojection error of the points in pixels.
-        focal_length: focal length of the first camera in pixels.
+        focal_lengths: the shortest and the longest of the cameras in pixels.
         agreeing: share of the tracks that agree with the poses.
     """
 
@@ -237,7 +244,7 @@ class ModelResult:
     num_observations: int
     coverage: float
     mean_error: float
-    focal_length: float
+    focal_lengths: tuple[float, float]
     agreeing: float
 
 
@@ -272,8 +279,7 @@ def model_stage(
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_moving = np.array([image.name in moving for image in images])
             tracked = take_points(tracked, surely_still(tracked, shows_moving))
-        with clock.measure("images"):
-            undistort = _undistortions(placed, cameras)
+        undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)
         with clock.measure("coverage"):
@@ -286,12 +292,13 @@ def model_stage(
             if masked:
                 shown = counting if options.moving == "mask" else given
                 _write_masks(partial / _MASKS, images, cameras, shown)
+        focal = [camera.mean_focal_length() for camera in cameras.values()]
         return ModelResult(
             num_points=len(cloud.xyz),
             num_observations=len(cloud.image),
             coverage=covered,
             mean_error=mean_error(cloud),
-            focal_length=float(views[0].camera.params[0]),
+            focal_lengths=(min(focal), max(focal)),
             agreeing=agreeing,
         )
 

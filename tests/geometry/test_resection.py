@@ -37,7 +37,7 @@ def test_poses_are_found_from_near_and_from_wrong_guesses() -> None:
     near = np.array([pose((0.0, 0.0, 0.0), (0.1 * i, 0.0, 0.0)) for i in range(8)])
     far = np.array([pose((1.0, 2.0, 0.5), (30.0, -9.0, 2.0))] * 8)
     for guesses in (near, far):
-        found = resect(seen, guesses, _FOCAL, num_threads=1)
+        found = resect(seen, guesses, np.full(len(guesses), _FOCAL), num_threads=1)
         for one, true in zip(found, poses, strict=True):
             assert one is not None
             assert np.degrees(np.arccos((np.trace(one[:, :3] @ true[:, :3].T) - 1) / 2)) < 0.05
@@ -48,13 +48,15 @@ def test_threads_change_nothing() -> None:
     poses = [pose((0.0, 0.01 * i, 0.0), (0.1 * i, 0.0, 0.0)) for i in range(12)]
     seen = sightings(poses, [100] * 12, noise=0.5)
     guesses = np.array(poses[:1] * 12)
-    one, four = (resect(seen, guesses, _FOCAL, num_threads=n) for n in (1, 4))
+    one, four = (
+        resect(seen, guesses, np.full(len(guesses), _FOCAL), num_threads=n) for n in (1, 4)
+    )
     np.testing.assert_array_equal(np.array(one), np.array(four))
 
 
 def test_too_few_points_give_no_pose() -> None:
     poses = [pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))] * 3
-    found = resect(sightings(poses, [0, 29, 200], noise=0.3), np.array(poses), _FOCAL)
+    found = resect(sightings(poses, [0, 29, 200], noise=0.3), np.array(poses), np.full(3, _FOCAL))
     assert [one is not None for one in found] == [False, False, True]
 
 
@@ -82,7 +84,7 @@ def test_sightings_are_those_of_the_tracks_that_have_points(wanted: tuple[int, .
         np.array([[1.0, 2, 3], [4, 5, 6]]), np.zeros(2), np.array([0, 3, 5]), np.arange(5), 2, 2
     )
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=80, params=[50.0, 0, 0])
-    found = sightings_of(points, seen, tracks, np.array(wanted, np.int32), camera)
+    found = sightings_of(points, seen, tracks, np.array(wanted, np.int32), [camera] * len(wanted))
     rows = {1: [1, 7], 3: [3, 9]}
     np.testing.assert_array_equal(found.bounds, 2 * np.arange(len(wanted) + 1))
     expected = [row for f in wanted for row in rows[f]]

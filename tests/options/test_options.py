@@ -207,15 +207,9 @@ def test_values_that_cannot_work_are_refused_when_made(kind: type, given: dict[s
         replace(kind(), **given)
 
 
-@pytest.mark.parametrize(
-    ("name", "match"),
-    [
-        ("single_camera", MatchOptions(camera=CameraOptions(single_camera=False))),
-        ("image_name", MatchOptions(images=ImageOptions(image_name="a.b_%d.png"))),
-    ],
-)
-def test_what_trainers_cannot_use_is_refused(name: str, match: MatchOptions) -> None:
-    with pytest.raises(OptionError, match=name):
+def test_what_trainers_cannot_use_is_refused() -> None:
+    match = MatchOptions(images=ImageOptions(image_name="a.b_%d.png"))
+    with pytest.raises(OptionError, match="image_name"):
         ReconstructOptions(match=match)
 
 

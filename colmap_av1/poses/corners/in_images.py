@@ -128,24 +128,22 @@ def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
         return placed
     images = list(placed.images)
     how = run.options.match.run
-    for camera_id, camera in sorted(placed.cameras.items()):
-        own = [i for i, image in enumerate(images) if image.camera_id == camera_id]
-        sightings = sightings_of(points, seen, seen, placed.frames[own], camera)
-        guesses = np.array([images[i].cam_from_world for i in own])
-        focal = float(camera.mean_focal_length())
-        found = resect(
-            sightings,
-            guesses,
-            focal,
-            loss_scale=_LOSS_SCALE,
-            seed=how.seed,
-            num_threads=how.num_threads,
-        )
-        bounds = zip(sightings.bounds[:-1].tolist(), sightings.bounds[1:].tolist(), strict=True)
-        for i, pose, (first, last) in zip(own, found, bounds, strict=True):
-            shown = sightings.rays[first:last] * focal, sightings.xyz[first:last], focal
-            if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
-                images[i] = replace(images[i], cam_from_world=pose)
+    cameras = placed.camera_of_image
+    sightings = sightings_of(points, seen, seen, placed.frames, cameras)
+    focal = np.array([camera.mean_focal_length() for camera in cameras])
+    found = resect(
+        sightings,
+        np.array([image.cam_from_world for image in images]),
+        focal,
+        loss_scale=_LOSS_SCALE,
+        seed=how.seed,
+        num_threads=how.num_threads,
+    )
+    for i, pose in enumerate(found):
+        own = slice(int(sightings.bounds[i]), int(sightings.bounds[i + 1]))
+        shown = sightings.rays[own] * focal[i], sightings.xyz[own], float(focal[i])
+        if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
+            images[i] = replace(images[i], cam_from_world=pose)
     return replace(placed, images=images)
 
 

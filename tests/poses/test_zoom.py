@@ -1,0 +1,79 @@
+"""A video whose focal length changes gets a camera for each image, and so does one on request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from dense_scene import NUM_IMAGES, OPTIONS, SCENE, Truth
+
+from colmap_av1.cli.reports import reconstruct_rows
+from colmap_av1.errors import OptionError
+from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.options import CameraOptions, MapperOptions, MatchOptions, ReconstructOptions
+from colmap_av1.reconstruct import reconstruct
+from colmap_av1.video.decoding import decode_frames
+
+ZOOM = 1.2
+
+
+def zooming(encode: Callable[..., Path], output: Path) -> Path:
+    """The rendered clip with a steady zoom."""
+    frames = [picture for _, picture in decode_frames(SCENE)]
+    height, width = frames[0].shape[:2]
+    centre = np.array([width - 1, height - 1]) / 2
+    for i, zoom in enumerate(np.linspace(1, ZOOM, len(frames))):
+        crop = np.column_stack([zoom * np.eye(2), (1 - zoom) * centre])
+        frames[i] = cv2.warpAffine(frames[i], crop, (width, height), flags=cv2.INTER_CUBIC)
+    return encode(np.stack(frames), output)
+
+
+def with_camera(camera: CameraOptions) -> ReconstructOptions:
+    return replace(OPTIONS, match=replace(OPTIONS.match, camera=camera))
+
+
+def test_a_zoom_is_found(encode: Callable[..., Path], truth: Truth, tmp_path: Path) -> None:
+    """With one camera the path would be off by thirty times as much."""
+    report = reconstruct(zooming(encode, tmp_path / "zoom.mp4"), tmp_path / "out")
+    model = read_model(report.output / "sparse" / "0")
+    errors = pose_errors(model_poses(model, 60), truth.cam_from_world)
+    assert errors.num_poses > 50
+    assert errors.ate < 0.001 * errors.extent
+    assert len(model.cameras) == model.num_reg_images()
+    for image in model.images.values():
+        zoom = 1 + (ZOOM - 1) * int(image.name[-10:-4]) / 59
+        expected = zoom * truth.camera.focal_length_x
+        assert image.camera.focal_length_x == pytest.approx(expected, rel=0.01)
+        assert image.camera.model_name == "PINHOLE"
+    shortest, longest = report.focal_lengths
+    assert longest / shortest == pytest.approx(ZOOM, rel=0.02)
+    assert dict(reconstruct_rows(report))["focal lengths"] == f"{shortest:.2f} to {longest:.2f} px"
+
+
+def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> None:
+    options = with_camera(CameraOptions(single_camera=False))
+    report = reconstruct(SCENE, tmp_path / "out", options=options)
+    model = read_model(report.output / "sparse" / "0")
+    errors = pose_errors(model_poses(model, 60), truth.cam_from_world)
+    assert errors.num_poses == len(model.cameras) == NUM_IMAGES
+    assert errors.ate < 0.01 * errors.extent
+    assert report.focal_lengths == pytest.approx([truth.camera.focal_length_x] * 2, rel=0.03)
+
+
+def test_given_intrinsics_stay(tmp_path: Path) -> None:
+    camera = CameraOptions("PINHOLE", "520,520,320,180", single_camera=False)
+    report = reconstruct(SCENE, tmp_path / "out", options=with_camera(camera))
+    model = read_model(report.output / "sparse" / "0")
+    assert len(model.cameras) == NUM_IMAGES
+    assert {tuple(camera.params) for camera in model.cameras.values()} == {(520, 520, 320, 180)}
+
+
+def test_without_an_adjustment_nothing_estimates_the_cameras() -> None:
+    match = MatchOptions(camera=CameraOptions(single_camera=False))
+    with pytest.raises(OptionError, match="--adjust 0"):
+        ReconstructOptions(match=match, mapping=MapperOptions(adjust=False))
