@@ -29,9 +29,9 @@ _ENOUGH = 100
 # Share of the points of usual seams that images before a seam share with those after it, however
 # far apart, from which on it is not weak: parts of a cut video may see each other elsewhere.
 _ELSEWHERE = 0.5
-# A point has depth where it is seen under this angle in degrees: many times what its error and that
-# of the poses come to.
-_LEAST_ANGLE = 0.2
+# A point has depth if its parallax exceeds this many pixels: several times the error of an
+# observation.
+_LEAST_PARALLAX = 2.0
 # The scale of a model is lost at a seam that less than this share of the usual points carry it
 # across, though so many points have depth on either side. Where a camera stands still and turns by
 # as much as it sees at once few do: bent models had 5 % at most, others 8 % and more.
@@ -176,9 +176,11 @@ def model_seams(reconstruction: Any) -> Seams:
     end = views[np.append(starts[1:], True)] if len(views) else views
     # The first view that gives a visit depth beside its first one, and the last beside its last.
     deep_from, deep_to = (np.full(len(begin), fill) for fill in (num_images, -1))
+    focal = [reconstruction.cameras[image.camera_id].mean_focal_length() for image in images]
+    least_angle = np.degrees(_LEAST_PARALLAX / np.median(focal)) if focal else 0.0
     centres = camera_centres(np.array([image.cam_from_world for image in images]).reshape(-1, 3, 4))
-    from_first = _angle(centres[views], centres[begin[visit]], xyz[point]) >= _LEAST_ANGLE
-    from_last = _angle(centres[views], centres[end[visit]], xyz[point]) >= _LEAST_ANGLE
+    from_first = _angle(centres[views], centres[begin[visit]], xyz[point]) >= least_angle
+    from_last = _angle(centres[views], centres[end[visit]], xyz[point]) >= least_angle
     np.minimum.at(deep_from, visit[from_first], views[from_first])
     np.maximum.at(deep_to, visit[from_last], views[from_last])
 
