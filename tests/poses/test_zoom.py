@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from dense_scene import NUM_IMAGES, OPTIONS, SCENE, Truth
+from sequences import model_poses
 
 from colmap_av1.cli.reports import reconstruct_rows
 from colmap_av1.errors import OptionError
-from colmap_av1.evaluate.metrics.poses import model_poses, pose_errors
+from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import CameraOptions, MapperOptions, MatchOptions, ReconstructOptions
 from colmap_av1.reconstruct import reconstruct
