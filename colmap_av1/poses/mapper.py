@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
@@ -21,6 +21,9 @@ from colmap_av1.util.cpus import BLAS_THREADS, threads_or_cpus
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
+
+if TYPE_CHECKING:
+    import pycolmap
 
 # The robust loss makes progress slow: steps that each lower the error by less than a thousandth
 # still bring far views of one place together.
@@ -190,7 +193,7 @@ def adjust_model(
     _check_whole(model)
 
 
-def without_unseen_images(model: Path) -> Any:
+def without_unseen_images(model: Path) -> pycolmap.Reconstruction:
     """Leave out of a model the images that hardly any of its points are seen in; read it.
 
     Args:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
@@ -58,11 +58,11 @@ class PosedImages:
     frames: NDArray[np.int32]
     sequence: NDArray[np.int32]
     first_frame: NDArray[np.int64]
-    cameras: dict[int, Any]
+    cameras: dict[int, pycolmap.Camera]
     masks: tuple[Mask | None, ...]
 
     @property
-    def camera_of_image(self) -> list[Any]:
+    def camera_of_image(self) -> list[pycolmap.Camera]:
         """The camera of each image."""
         return [self.cameras[image.camera_id] for image in self.images]
 
@@ -98,7 +98,7 @@ def triangulate_in(
     view: NDArray[np.int64],
     *,
     options: TriangulateOptions,
-    pinholes: Sequence[Any] | None = None,
+    pinholes: Sequence[pycolmap.Camera] | None = None,
     rays: NDArray[np.float64] | None = None,
     progress: Progress = no_progress,
 ) -> TriangulatedPoints:
