@@ -166,10 +166,10 @@ def reconstruct(
 
     The poses come from COLMAP's mapper on a spread selection of long, accurate tracks; then every
     track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one PINHOLE
-    camera, undistorted and of the video's size, or with `undistort` off the original pictures and
-    the estimated camera; beside them `database.db` and `report.json`. A run that was stopped is
-    resumed after its last finished stage; a changed option redoes what depends on it, and what is
-    damaged or gone is made again.
+    camera, or one for each image of a zoom, undistorted and of the video's size, or with
+    `undistort` off the original pictures and the estimated camera; beside them `database.db` and
+    `report.json`. A run that was stopped is resumed after its last finished stage; a changed option
+    redoes what depends on it, and what is damaged or gone is made again.
 
     Several videos have a camera each, and their images a folder each in `images/`, named like the
     video; what their pictures show in common connects them, and photos with them.
