@@ -34,8 +34,8 @@ _ELSEWHERE = 0.5
 _LEAST_PARALLAX = 2.0
 # The scale of a model is lost at a seam that less than this share of the usual points carry it
 # across, though so many points have depth on either side. Where a camera stands still and turns by
-# as much as it sees at once few do: bent models had 5 % at most, others 8 % and more.
-_LOST = 0.06
+# as much as it sees at once few do: bent models had 7 % at most, others 11 % and more.
+_LOST = 0.08
 _DEEP = 100
 
 
