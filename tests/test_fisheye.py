@@ -123,7 +123,7 @@ def test_points_project_with_the_distortion(
     model = read_model(original.output / "sparse" / "0")
     (camera,) = model.cameras.values()
     assert camera.model_name == MODEL
-    assert original.focal_length == pytest.approx(FOCAL, rel=0.02)
+    assert original.focal_lengths[0] == pytest.approx(FOCAL, rel=0.02)
     assert error(original.output / "sparse" / "0", clip) < 0.01
     num_cut = 0
     for point in model.points3D.values():
