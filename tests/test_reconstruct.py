@@ -148,6 +148,15 @@ def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: Reconstr
     assert found == {"images", "sparse"}
 
 
+def test_models_among_the_stages_of_an_earlier_version_go(copy: Path) -> None:
+    """Such folders had a model with as many images as the finished one, and a smaller path."""
+    for name in ("poses/0", "placed", "adjusted"):
+        shutil.copytree(copy / "sparse" / "0", copy / ".stages" / name)
+    assert brush(copy).model == copy / ".stages" / "adjusted"
+    reconstruct(SCENE, copy, options=OPTIONS)
+    check_taken(brush(copy), copy)
+
+
 def test_masks_are_those_of_the_model(copy: Path) -> None:
     masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():
