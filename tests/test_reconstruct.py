@@ -522,9 +522,9 @@ def test_camera_that_stands_still(encode: Encode, tmp_path: Path, walker: bool) 
 
 
 def test_command_line(
-    made: ReconstructReport, truth: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: ReconstructReport, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["reconstruct", "--video", str(SCENE), "--output", str(made.output)]
+    words = ["reconstruct", "--video", str(SCENE), "--output", str(copy)]
     words += ["--every", str(EVERY), "--pose_tracks_per_image", "300", "--pose-spacing", "24"]
     words += ["--points", "survey", "--gaussians", str(tmp_path / "init.ply")]
     assert main(words) == 0
@@ -532,7 +532,7 @@ def test_command_line(
     told = capsys.readouterr()
     assert f"points\t{made.num_points}, " in told.out
     assert "finished before\ttracks, " in told.out
-    model = made.output / "sparse" / "0"
+    model = copy / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
         "".join(f"{f} frame_{f:06d}.jpg\n" for f in range(0, 60, EVERY))

@@ -284,11 +284,10 @@ def info_rows(report: StreamReport) -> Rows:
     )
     if report.num_cut:
         frames += f", {report.num_cut} hidden by an edit list"
-    longer = max(report.width, report.height)
-    share = report.median_motion / longer
-    motion = f"{report.median_motion:.2f} px per frame, {share:.1%} of the longer side"
-    if math.isnan(report.median_motion):
-        motion = "none"
+    motion = "none"
+    if not math.isnan(report.median_motion):
+        share = report.median_motion / max(report.width, report.height)
+        motion = f"{report.median_motion:.2f} px per frame, {share:.1%} of the longer side"
     display = report.display
     cropped = any(display.crop)
     return [

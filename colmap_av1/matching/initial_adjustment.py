@@ -257,7 +257,7 @@ def _look(
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
     rotations, certain = list[_Floats](), list[bool]()
-    for rows, pose, angle in _poses(geometry, inliers):
+    for rows, pose, angle in _poses(inliers):
         # Another search may take what this one leaves.
         if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
             continue
@@ -308,9 +308,7 @@ def _is_wide(pose: _Floats, angle: float, margin: float) -> bool:
     return bool(angle >= margin * INITIAL_MIN_ANGLE and abs(pose[2, 3]) <= most)
 
 
-def _poses(
-    geometry: TwoViewGeometry, inliers: PairInliers
-) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:
+def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:
     """Poses that the mapper may begin with: rows of their inliers, [R | t], angle in degrees."""
     own = np.arange(len(inliers.xy[0]), dtype=np.uint32)
     # A focal length that is a guess counts as known: COLMAP 4.2 would estimate it with the pose, by

@@ -248,7 +248,10 @@ def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None
     counts = _Counts()
     for frame in motion:
         counts.structure.add(frame)
-        counts.num_hidden += frame.display_index < 0
+        if frame.display_index < 0:
+            counts.num_hidden += 1
+        else:
+            counts.first_of_size.setdefault((frame.width, frame.height), frame.display_index)
         _count_references(frame, counts)
         if progress is not None:
             progress(counts.structure.num_coded)
@@ -258,7 +261,6 @@ def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None
 def _count_references(frame: FrameMotion, counts: _Counts) -> None:
     if frame.display_index < 0:
         return
-    counts.first_of_size.setdefault((frame.width, frame.height), frame.display_index)
     inter = frame.use_intrabc == 0
     for list_index in (0, 1):
         reference = frame.ref_frame[..., list_index]

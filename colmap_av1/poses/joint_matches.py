@@ -56,8 +56,8 @@ _NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
 _MOST_PAIRS = 16
 _FEW = 3
 # Most keypoints per image of tracks with three observations, by the density preset: this share of
-# the SIFT features of a picture, and this number. As many points come about as from SIFT and some
-# more, since a mapper makes 7 to 12 points an image of 100 features.
+# the SIFT features of a picture, and this number. A mapper makes 7 to 12 points per image from 100
+# SIFT features. The shares give about as many points, and some more with the default preset.
 _MOTION = {"sparse": (0.2, 450), "default": (0.4, 950)}
 # Pictures whose features are counted.
 _NUM_SAMPLED = 5

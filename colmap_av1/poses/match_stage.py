@@ -1,7 +1,4 @@
-"""The second stage of `reconstruct`: a database of the images matched along their tracks.
-
-Each stage leaves what the next one, and a later run, resume from.
-"""
+"""The stage that matches the key images along their tracks and writes a database of them."""
 
 from __future__ import annotations
 

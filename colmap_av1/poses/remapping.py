@@ -22,6 +22,7 @@ from colmap_av1.geometry.posed_model import (
     posed_model,
     read_posed_model,
     reprojection_errors,
+    robust_costs,
     write_posed_model,
 )
 from colmap_av1.geometry.track_points import seen_in, to_model_points
@@ -187,4 +188,4 @@ def _costs(
 
 def _mean_cost(errors: NDArray[np.float64]) -> float:
     """Mean of the robust loss (Cauchy) that adjustments use last, of errors in pixels."""
-    return float(np.log1p((errors / LOSS_SCALES[-1]) ** 2).mean())
+    return float(robust_costs(errors, LOSS_SCALES[-1]).mean())

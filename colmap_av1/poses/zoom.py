@@ -17,7 +17,12 @@ from pathlib import Path
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 
 from colmap_av1.geometry.colmap_model import read_model, write_model
-from colmap_av1.geometry.posed_model import PosedModel, posed_model, reprojection_errors
+from colmap_av1.geometry.posed_model import (
+    PosedModel,
+    posed_model,
+    reprojection_errors,
+    robust_costs,
+)
 from colmap_av1.poses.mapper import adjust_model
 from colmap_av1.poses.run import Run
 
@@ -74,7 +79,7 @@ def _zooming_cameras(run: Run, model: PosedModel, loss_scale: float) -> set[int]
     focal = np.array([trial.cameras[image.camera_id].mean_focal_length() for image in trial.images])
     camera_of_image = np.array([image.camera_id for image in model.images])
     camera_of_observation = camera_of_image[model.points.image]
-    before, after = (np.log1p((reprojection_errors(m) / loss_scale) ** 2) for m in (model, trial))
+    before, after = (robust_costs(reprojection_errors(m), loss_scale) for m in (model, trial))
     zooming = set()
     for number in np.unique(camera_of_image).tolist():
         own = focal[camera_of_image == number]

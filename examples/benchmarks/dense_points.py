@@ -145,9 +145,9 @@ def depth_differences(
 ) -> NDArray[np.float64]:
     """Relative differences between a model's depths and those of nearby reference points.
 
-    Each point is projected into the middle image of its track. Of the three nearest reference
-    points there with four or more observations, the one with the most similar depth counts, because
-    at an occlusion boundary others lie on the background.
+    Each point is projected into the middle image of its track and compared with the three nearest
+    reference points there that have four or more observations. The one with the most similar depth
+    counts, because others may lie on the background at an occlusion boundary.
 
     Args:
         model: a pycolmap.Reconstruction.

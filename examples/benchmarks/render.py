@@ -20,6 +20,7 @@ from pathlib import Path
 BENCHMARKS = Path(__file__).resolve().parent
 DOCUMENTS = tuple(BENCHMARKS.parents[1] / name for name in ("README.md", "docs/benchmarks.md"))
 MARKED = re.compile(r"(<!-- table ([^\n]+) -->\n).*?(<!-- end of table -->\n)", re.DOTALL)
+# Distances in frames at which errors of tracks are measured.
 SPANS = (1, 2, 4, 8, 16)
 LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
 REFERENCE = "sift-exhaustive"

@@ -22,8 +22,6 @@ from colmap_av1.evaluate.metrics.poses import frame_number
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.util.graphs import connected_components
 
-# Distances in frames at which errors are measured.
-SPANS = (1, 2, 4, 8, 16)
 # Lower bounds of the classes that track lengths are counted in.
 LENGTHS = (2, 4, 8, 16, 32)
 CELL = 16

@@ -42,7 +42,6 @@ from results import Value, add_results, read_rows, save
 from rich.console import Console
 from sequences import FRONTENDS, measure_frontend, model_poses
 from track_metrics import (
-    SPANS,
     TrackStatistics,
     database_tracks,
     epipolar_errors,
@@ -236,7 +235,7 @@ def measure_row(
     tracks = database_tracks(run.database, material.num_frames)
     epipolar = None
     if truth.geometry is not None:
-        epipolar = {s: median(epipolar_errors(tracks, *truth.geometry, s)) for s in SPANS}
+        epipolar = {s: median(epipolar_errors(tracks, *truth.geometry, s)) for s in render.SPANS}
     model = figures = errors = None
     if mapper is not None and mapper.model is not None:
         model = read_model(mapper.model)
@@ -264,7 +263,7 @@ def exact_by_span(
     if transfer is None:
         return None
     by_span = {}
-    for span in SPANS:
+    for span in render.SPANS:
         distance = np.linalg.norm(exact_errors(tracks, transfer, span), axis=1)
         by_span[span] = (median(distance), quantile(distance, 0.9))
     return by_span

@@ -20,6 +20,7 @@ from existing_database import CAMERA, LAYOUTS, make_layout, query
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from track_metrics import database_tracks
 
 from colmap_av1.check.database import check
 from colmap_av1.database.file import copy_database
@@ -200,6 +201,7 @@ class Databases(RuleBasedStateMachine):
         self.attempt(lambda: read_cameras(self.path))
         self.attempt(lambda: export_hloc(self.path, self.folder / "hloc"))
         self.attempt(lambda: view_database(self.path, self.folder))
+        self.attempt(lambda: database_tracks(self.path, len(NAMES)))
         (self.folder / "copy.db").unlink(missing_ok=True)
         self.attempt(lambda: copy_database(self.path, self.folder / "copy.db"))
 

@@ -24,6 +24,7 @@ from existing_database import (
     make_layout,
     sift_keypoints,
 )
+from track_metrics import database_tracks
 
 from colmap_av1.check.database import check
 from colmap_av1.cli import main
@@ -214,6 +215,7 @@ def opened_by_all(path: Path, folder: Path) -> list[tuple[str, Callable[[], obje
         ("export", lambda: export_hloc(path, folder / "hloc")),
         ("view", lambda: view_database(path, folder)),
         ("copy", lambda: copy_database(path, folder / "copy.db")),
+        ("tracks", lambda: database_tracks(path, NUM_IMAGES)),
     ]
 
 
