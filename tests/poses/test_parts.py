@@ -96,7 +96,7 @@ def test_short_parts_are_left_out() -> None:
 
 @pytest.mark.slow
 def test_a_walk_through_rooms_with_fast_turns(tmp_path: Path) -> None:
-    """No model is bent, whatever the turns leave of it."""
+    """No model is bent, and most images are in one, whatever the turns leave."""
     walks.make_clip(tmp_path / "walk.mp4", seed=0)
     truth = walks.walk(0)
     report = reconstruct(tmp_path / "walk.mp4", tmp_path / "output")
@@ -108,4 +108,4 @@ def test_a_walk_through_rooms_with_fast_turns(tmp_path: Path) -> None:
         assert errors is not None
         assert errors.ate < walks.BENT * errors.extent
         registered += int(np.isfinite(found[:, 0, 0]).sum())
-    assert registered > 0.8 * report.num_images
+    assert registered > 0.7 * report.num_images
