@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -30,6 +29,7 @@ from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import FarViews
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.placing.placement import (
+    Place,
     Placement,
     Surroundings,
     find_placement,
@@ -63,7 +63,7 @@ class MapReport:
     mapper: str
     num_images: int
     num_registered: tuple[int, ...]
-    place: dict[str, Any]
+    place: Place
     figures: ModelFigures
     far_views: FarViews | None
     seconds: dict[str, float]
@@ -163,7 +163,7 @@ def map_database(
         mapper=options.mapper,
         num_images=checked.num_images,
         num_registered=num_registered,
-        place=placement.facts,
+        place=placement.place,
         figures=found.figures,
         far_views=found.far_views,
         seconds=clock.seconds,

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cattrs
 import numpy as np
@@ -26,6 +25,7 @@ from colmap_av1.images.preparing import check_fit
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.placing.placement import Place
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import (
     encoding_for_pictures,
@@ -138,7 +138,7 @@ class ReconstructReport:
     far_views: float | None
     far_views_largest: float | None
     read_outs: tuple[float | None, ...]
-    place: dict[str, Any]
+    place: Place
     focal_lengths: tuple[float, float]
     mapper: str
     forward_motion: bool

@@ -171,7 +171,7 @@ def test_marks_of_a_scale_are_in_the_original_pictures(
     options = replace(OPTIONS, undistort=False, place=place)
     placed = reconstruct(clip.video, output, options=options)
     apart = float(np.linalg.norm(one.xyz - two.xyz))
-    assert apart * placed.place["scale"] == pytest.approx(2, rel=0.05)
+    assert apart * placed.place.scale == pytest.approx(2, rel=0.05)
 
 
 def test_camera_stays_what_it_is(clip: Clip, tmp_path: Path) -> None:

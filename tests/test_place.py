@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from telemetry import gps5, grav, with_gpmf
 from colmap_av1 import MapOptions, OptionError, PlaceOptions, map_database, reconstruct
 from colmap_av1.database.reading import read_pose_priors
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images, read_model
+from colmap_av1.poses.placing.placement import Origin
 from colmap_av1.reconstruct import ReconstructReport
 
 ORIGIN = (59.33, 18.07, 20.0)
@@ -37,13 +38,14 @@ def frame_of(name: str) -> int:
     return int(Path(name).stem.rsplit("_", 1)[1])
 
 
-def away(model: Path, truth: Truth, origin: dict[str, float]) -> tuple[float, float, float]:
+def away(model: Path, truth: Truth, origin: Origin | None) -> tuple[float, float, float]:
     """Largest distance in metres of the cameras from the truth, scale, and degrees off level."""
     images = posed_images(read_model(model))
     frames = [frame_of(name) for name in images]
     poses = np.array([image.cam_from_world for image in images.values()])
     exact = truth.cam_from_world[frames]
-    here = np.array([[origin[k] for k in ("latitude", "longitude", "altitude")]])
+    assert origin is not None
+    here = np.array([[origin.latitude, origin.longitude, origin.altitude]])
     to_ellipsoid = pycolmap.GPSTransform().enu_to_ellipsoid
     at = np.asarray(to_ellipsoid(LARGER * camera_centres(exact), *ORIGIN))
     ecef = pycolmap.GPSTransform().ellipsoid_to_ecef
@@ -69,16 +71,17 @@ def placed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Reconstruc
 
 
 def test_model_in_metres_by_a_gopro(placed: ReconstructReport, truth: Truth) -> None:
-    assert placed.place["units"] == "metres"
-    assert placed.place["axes"] == "x east, y north, z up"
-    assert json.loads((placed.output / "place.json").read_text()) == placed.place
+    assert placed.place.units == "metres"
+    assert placed.place.axes == "x east, y north, z up"
+    written = json.loads((placed.output / "place.json").read_text())
+    assert written == json.loads(json.dumps(asdict(placed.place)))
     assert placed.warnings == ()
-    distance, scale, tilt = away(placed.output / "sparse" / "0", truth, placed.place["origin"])
+    distance, scale, tilt = away(placed.output / "sparse" / "0", truth, placed.place.origin)
     assert distance < 1.0
     assert scale == pytest.approx(1, abs=0.03)
     assert tilt < 1.5
     points = np.array([p.xyz for p in read_model(placed.output / "sparse" / "0").points3D.values()])
-    ground = np.quantile(points[:, 2], 0.02) + placed.place["origin"]["altitude"] - ORIGIN[2]
+    ground = np.quantile(points[:, 2], 0.02) + placed.place.origin.altitude - ORIGIN[2]
     assert abs(ground) < 2  # of a scene 10 times as large
 
 
@@ -96,7 +99,7 @@ def test_database_says_where_images_were_taken(
         tmp_path / "model",
         options=MapOptions(mapper="global"),
     )
-    distance, scale, _ = away(report.model, truth, report.place["origin"])
+    distance, scale, _ = away(report.model, truth, report.place.origin)
     assert distance < 1.5
     assert scale == pytest.approx(1, abs=0.04)
     copy = tmp_path / "copy.db"
@@ -121,9 +124,9 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     again = reconstruct(video, placed.output, options=options)
     assert "adjustment" in again.resumed
     assert "place" not in again.resumed
-    assert again.place["units"] == "metres"
-    assert again.place["origin"] is None
-    assert "gravity" in again.place["how"][0]
+    assert again.place.units == "metres"
+    assert again.place.origin is None
+    assert "gravity" in again.place.how[0]
     images = posed_images(read_model(again.output / "sparse" / "0"))
     ends = camera_centres(np.array([images[f"frame_{k:06}.jpg"].cam_from_world for k in (3, 48)]))
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(metres, rel=1e-6)
@@ -148,6 +151,6 @@ def test_positions_that_stand_still_are_told(
         tmp_path / "model",
         options=MapOptions(mapper="global"),
     )
-    assert report.place["units"] == "arbitrary"
+    assert report.place.units == "arbitrary"
     (warning,) = report.warnings
     assert "--scale" in warning

@@ -31,7 +31,7 @@ from colmap_av1.check.findings import (
 from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
-from colmap_av1.images.names import video_of
+from colmap_av1.images.names import videos_of
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_match_gaps
 from colmap_av1.matching.two_view_geometry import config_name
@@ -138,7 +138,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
     sizes = [
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
-    videos = list(map(video_of, images.camera_ids, images.names))
+    videos = videos_of(images.camera_ids, images.names)
     thin = few_match_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
     findings = [
         *image_findings(images, cameras),

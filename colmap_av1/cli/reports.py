@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # each is slow to import
     from colmap_av1.batch.run import BatchReport
@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # each is slow to import
     from colmap_av1.matching.shutter.of_video import VideoReadOut
     from colmap_av1.motion.info import StreamReport
     from colmap_av1.poses.joint_matches import JointEstimate
+    from colmap_av1.poses.placing.placement import Place
     from colmap_av1.reconstruct import ReconstructReport
 
 Rows = list[tuple[str, str]]
@@ -147,14 +148,13 @@ def _shutter_row(read_outs: Sequence[float | None]) -> Rows:
     return [("rolling shutter", f"{', '.join(words)} from the first row to the last")]
 
 
-def _place_rows(place: Mapping[str, Any]) -> Rows:
+def _place_rows(place: Place) -> Rows:
     """Where a model lies in the world, and what said so."""
-    origin = place["origin"]
     at = ""
-    if origin is not None:
-        at = " of {latitude:.7f}, {longitude:.7f}, {altitude:.2f} m".format(**origin)
-    rows = [("coordinates", f"units {place['units']}, axes {place['axes']}{at}")]
-    return rows + ([("placed by", "; ".join(place["how"]))] if place["how"] else [])
+    if (origin := place.origin) is not None:
+        at = f" of {origin.latitude:.7f}, {origin.longitude:.7f}, {origin.altitude:.2f} m"
+    rows = [("coordinates", f"units {place.units}, axes {place.axes}{at}")]
+    return rows + ([("placed by", "; ".join(place.how))] if place.how else [])
 
 
 def _far_view_rows(median: float | None, largest: float | None) -> Rows:

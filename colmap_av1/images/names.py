@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -116,12 +117,18 @@ def natural_order(names: Sequence[str]) -> list[int]:
     return sorted(range(len(names)), key=lambda i: natural_key(names[i]))
 
 
-def video_of(camera_id: int, name: str) -> tuple[int, PurePosixPath]:
-    """What tells the video that an image is of: one camera took all of its images into one folder.
+def videos_of(
+    camera_ids: Sequence[int], names: Sequence[str]
+) -> list[tuple[PurePosixPath, int | None]]:
+    """The video of each image, as a key: its folder, and its camera if other images share it.
 
-    Of these, neighbours in their natural order are neighbours in time.
+    In the natural order of their names, neighbours that have the same key are neighbours in time.
     """
-    return camera_id, PurePosixPath(name).parent
+    num_images = Counter(camera_ids)
+    return [
+        (PurePosixPath(name).parent, camera_id if num_images[camera_id] > 1 else None)
+        for camera_id, name in zip(camera_ids, names, strict=True)
+    ]
 
 
 def last_number(name: str) -> int | None:

@@ -263,7 +263,7 @@ def few_match_gaps(
         pairs: integers [m, 2] indices of images, of the pairs that mappers use.
         num_inliers: integers [m] their verified matches.
         names: names of the images; their natural order is the order in time.
-        videos: for each image what identifies its video, see `video_of`.
+        videos: for each image what identifies its video, see `videos_of`.
     """
     rows: dict[Hashable, list[int]] = {}
     for i in natural_order(names):

@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
-import numpy as np
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
-from colmap_av1.images.names import natural_order, video_of
+from colmap_av1.images.names import natural_order, videos_of
 
 # Two views of a point say nothing of how far one of them is from a third.
 _FEWEST_VIEWS = 3
@@ -149,14 +149,11 @@ class Seams:
         )
 
 
-def model_seams(reconstruction: Any) -> Seams:
+def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
     """What joins neighbouring images in a model.
 
     Images that are neighbours in the order of their names, as frames of a video are named, have a
     seam where one camera took both into one folder.
-
-    Args:
-        reconstruction: pycolmap.Reconstruction.
     """
     images, seams = images_in_time(reconstruction)
     views, point, xyz = _seen_points(reconstruction, images)
@@ -203,21 +200,21 @@ def model_seams(reconstruction: Any) -> Seams:
     )
 
 
-def images_in_time(reconstruction: Any) -> tuple[list[ModelImage], list[int]]:
-    """The images of a pycolmap.Reconstruction with a pose, in the natural order of their names.
+def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelImage], list[int]]:
+    """The images of a model with a pose, in the natural order of their names.
 
     Returns:
-        The images, and indices of those whose next one is a neighbour in time, see `video_of`.
+        The images, and indices of those whose next one is a neighbour in time, see `videos_of`.
     """
     posed = posed_images(reconstruction)
     names = list(posed)
     images = [posed[names[k]] for k in natural_order(names)]
-    videos = [video_of(image.camera_id, image.name) for image in images]
+    videos = videos_of([i.camera_id for i in images], [i.name for i in images])
     return images, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
 
 
 def _seen_points(
-    reconstruction: Any, images: Sequence[ModelImage]
+    reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Places [m] of the images that see a point, number [m] of that point, and positions [n, 3].
 

@@ -139,7 +139,7 @@ def write_model_page(
     """
     check_page(output, overwrite=overwrite)
     folder = Path(model)
-    is_placed = report is not None and "z up" in report.place["axes"]
+    is_placed = report is not None and "z up" in report.place.axes
     scene = read_scene(folder, up=np.array([0.0, 0.0, 1.0]) if is_placed else None)
     view = _View.of(scene)
     images = Path(image_path) if image_path is not None else _images_beside(folder)

@@ -73,19 +73,28 @@ def test_a_cut_is_no_weak_seam_where_its_sides_see_each_other_elsewhere(tmp_path
     assert model_seams(read_model(tmp_path)).weak == []
 
 
-def write_row(folder: Path, views: list[list[int]], again: int) -> None:
+def test_images_with_cameras_of_their_own_have_seams(tmp_path: Path) -> None:
+    views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
+    write_row(tmp_path, views, 0, num_cameras=30)
+    assert model_seams(read_model(tmp_path)).weak == [14]
+
+
+def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: int = 1) -> None:
     """Write a model of thirty images in a row.
 
     Args:
         folder: gets the model.
         views: for points, which images see them.
         again: further points, that the first two and the last two see.
+        num_cameras: 1 or 30.
     """
-    camera = make_camera(CameraOptions(), 640, 480)
+    cameras = {}
+    for camera_id in range(1, num_cameras + 1):
+        cameras[camera_id] = make_camera(CameraOptions(), 640, 480)
+        cameras[camera_id].camera_id = camera_id
     poses = [np.column_stack([np.eye(3), [-0.1 * k, 0.0, 0.0]]) for k in range(30)]
     images = [
-        ModelImage(k + 1, f"{k:03}.png", int(camera.camera_id), pose)
-        for k, pose in enumerate(poses)
+        ModelImage(k + 1, f"{k:03}.png", k % num_cameras + 1, pose) for k, pose in enumerate(poses)
     ]
     views = [*views, *[[0, 1, 28, 29]] * again]
     count = len(views)
@@ -97,7 +106,7 @@ def write_row(folder: Path, views: list[list[int]], again: int) -> None:
         image=np.concatenate(views),
         xy=np.zeros((sum(map(len, views)), 2)),
     )
-    write_model(folder, {int(camera.camera_id): camera}, images, points)
+    write_model(folder, cameras, images, points)
 
 
 def test_parts_that_are_joined_wrongly(

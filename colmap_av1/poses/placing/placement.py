@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
@@ -34,6 +34,38 @@ _NOWHERE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
+class Origin:
+    """A position on the Earth (WGS 84): degrees, degrees and metres."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a model lies in the world, as `place.json` holds it.
+
+    Attributes:
+        units: "metres" or "arbitrary".
+        axes: directions of the axes, in words.
+        origin: position of the origin on the Earth; None if it is unknown.
+        how: sources of the placement, in words.
+        scale: scale of the similarity from the mapper's coordinates to the model's.
+        rotation: its rotation matrix, [3][3].
+        translation: its translation, [3].
+    """
+
+    units: str
+    axes: str
+    origin: Origin | None
+    how: tuple[str, ...]
+    scale: float
+    rotation: tuple[tuple[float, ...], ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Placement:
     """Where a model lies in the world.
 
@@ -41,16 +73,15 @@ class Placement:
         similarity: from the mapper's coordinates to those of the model.
         units: "metres", or "arbitrary".
         axes: what the axes are, in words.
-        origin: latitude and longitude in degrees and altitude in metres (WGS 84) of the origin;
-            None: unknown.
-        how: what said so, in words.
+        origin: position of the origin on the Earth; None if it is unknown.
+        how: sources of the placement, in words.
         warnings: what the user should know.
     """
 
     similarity: Similarity = _NOWHERE
     units: str = "arbitrary"
     axes: str = "as the mapper chose them"
-    origin: tuple[float, float, float] | None = None
+    origin: Origin | None = None
     how: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -60,18 +91,17 @@ class Placement:
         return self.similarity is not _NOWHERE
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """The same, as JSON holds it."""
-        origin = dict(zip(("latitude", "longitude", "altitude"), self.origin or (), strict=False))
-        return {
-            "units": self.units,
-            "axes": self.axes,
-            "origin": origin or None,
-            "how": list(self.how),
-            "scale": self.similarity.scale,
-            "rotation": self.similarity.rotation.tolist(),
-            "translation": self.similarity.translation.tolist(),
-        }
+    def place(self) -> Place:
+        """Where the model lies, in plain numbers."""
+        return Place(
+            units=self.units,
+            axes=self.axes,
+            origin=self.origin,
+            how=self.how,
+            scale=float(self.similarity.scale),
+            rotation=tuple(tuple(row) for row in self.similarity.rotation.tolist()),
+            translation=tuple(self.similarity.translation.tolist()),
+        )
 
 
 @dataclass(frozen=True)
@@ -94,7 +124,7 @@ class Surroundings:
 
 def find_placement(
     images: Sequence[ModelImage],
-    cameras: Mapping[int, Any],
+    cameras: Mapping[int, pycolmap.Camera],
     known: Surroundings,
     options: PlaceOptions,
     seed: int,
@@ -103,7 +133,7 @@ def find_placement(
 
     Args:
         images: the images that have a pose.
-        cameras: the pycolmap.Cameras of their pictures, by id.
+        cameras: cameras of their pictures, by id.
         known: what is known of where they were taken.
         options: what is wanted.
         seed: of the random samples.
@@ -139,11 +169,11 @@ def _by_positions(
     kind = cartesian * 2 > len(priors)
     at = [i for i, prior in zip(at, priors, strict=True) if prior.is_cartesian == kind]
     positions = np.array([prior.position for prior in priors if prior.is_cartesian == kind])
-    origin: tuple[float, float, float] | None = None
+    origin: Origin | None = None
     if not kind:
         latitude, longitude, altitude = np.median(positions, axis=0).tolist()
-        origin = latitude, longitude, altitude
-        positions = east_north_up(positions, origin)
+        origin = Origin(latitude, longitude, altitude)
+        positions = east_north_up(positions, (latitude, longitude, altitude))
     path = camera_centres(poses[at])
     gravity = known.gravity[at] if known.gravity is not None else None
     fits = [fit_path(path, positions, up, seed) for up in _rough_ups(poses[at], gravity)]
@@ -186,7 +216,10 @@ def _up(poses: _Floats, known: Surroundings) -> tuple[_Floats, str]:
 
 
 def _with_distance(
-    found: Placement, images: Sequence[ModelImage], cameras: Mapping[int, Any], text: str
+    found: Placement,
+    images: Sequence[ModelImage],
+    cameras: Mapping[int, pycolmap.Camera],
+    text: str,
 ) -> Placement:
     """The placement with a scale by which a distance is as it is known to be."""
     known = parse_distance(text)
@@ -210,4 +243,4 @@ def write_place(folder: Path, placement: Placement) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    (folder / PLACE_FILE).write_text(json.dumps(placement.facts, indent=1) + "\n")
+    (folder / PLACE_FILE).write_text(json.dumps(asdict(placement.place), indent=1) + "\n")

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
-from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.undistortion import output_cameras
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.poses.placing.placement import (
     PLACE_FILE,
+    Place,
     Surroundings,
     find_placement,
     write_place,
@@ -33,11 +31,11 @@ class PlaceResult(PosesResult):
     """What `place_stage` found.
 
     Attributes:
-        place: where the model lies in the world, as in `place.json`.
+        place: where the model lies in the world.
         place_warnings: what the user should know of it.
     """
 
-    place: dict[str, Any]
+    place: Place
     place_warnings: tuple[str, ...]
 
 
@@ -66,14 +64,18 @@ def place_stage(
         write_place(partial, found)
         images = placed.images
         if found.is_moved:
-            images = _moved_images(images, found.similarity.apply_to_poses)
+            poses = np.array([image.cam_from_world for image in images])
+            images = [
+                replace(image, cam_from_world=pose)
+                for image, pose in zip(images, found.similarity.apply_to_poses(poses), strict=True)
+            ]
         (partial / file).parent.mkdir()
         write_posed_model(partial / file, PosedModel(placed.cameras, images))
         return PlaceResult(
             poses=Path(file).name,
             num_registered=posed.result.num_registered,
             registered=posed.result.registered,
-            place=found.facts,
+            place=found.place,
             place_warnings=tuple(found.warnings),
         )
 
@@ -86,12 +88,6 @@ def place_stage(
         products=[PLACE_FILE, file],
         make=make,
     )
-
-
-def _moved_images(images: Sequence[ModelImage], move: Any) -> list[ModelImage]:
-    """The images with their poses moved, all at once."""
-    poses = move(np.array([image.cam_from_world for image in images]))
-    return [replace(image, cam_from_world=pose) for image, pose in zip(images, poses, strict=True)]
 
 
 def _surroundings(
