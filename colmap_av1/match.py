@@ -265,8 +265,8 @@ def match(
     notes += (*positions.warnings, *found.warnings)
     doubts = (found.depth.warning, focal_length_warning(found.cameras))
     notes += tuple(doubt for doubt in doubts if doubt is not None)
-    # Existing matches of the database may connect the images, too, and joint matches omit pairs
-    # that only repeat tracks of other pairs: few new matches are no gap in either case.
+    # Few matches do not mean a gap if existing matches of the database may connect the images, or
+    # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
         notes += matching_warnings(written, images.image_set)
     return MatchReport(
