@@ -1,7 +1,7 @@
 """Dense COLMAP matches read from the motion vectors of an AV1 video.
 
-The public names are imported when they are first used: the package itself imports nothing else,
-and installs nothing.
+Public names are imported when they are first used, so that importing the package is fast and
+has no side effects.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ __all__ = [
     "write_page",
 ]
 
-# The modules of the names that are neither errors nor options.
+# Modules of the public names, except errors and options.
 _MODULES = {
     "BatchReport": "batch.run",
     "CheckReport": "check.database",
@@ -171,7 +171,7 @@ def __getattr__(name: str) -> Any:
     if module is None:
         module = "errors" if name.endswith("Error") else "options"
     else:
-        # pycolmap before NumPy breaks the writing of PNG files.
+        # PNG files cannot be written if pycolmap is imported before NumPy.
         importlib.import_module("numpy")
     value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
     globals()[name] = value
@@ -183,9 +183,9 @@ def __dir__() -> list[str]:
 
 
 class _Package(types.ModuleType):
-    """Keeps public names from submodules that are called the same.
+    """Protects public names from submodules of the same name.
 
-    The import of `colmap_av1.match` would put the module in the place of the function.
+    Otherwise, importing the module `colmap_av1.match` would replace the function.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

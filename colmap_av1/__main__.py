@@ -10,10 +10,10 @@ from colmap_av1.util.signals import ENDING, HEEDED, end_at_once
 
 
 def main() -> int:
-    """Run the command line with the words of this process; its exit status.
+    """Run the command line with this process's arguments, and return its exit status.
 
-    Until a command runs, a signal ends the process at once: Python would answer an interrupt
-    during the imports with a trace.
+    Until a command runs, a signal ends the process at once. Otherwise, Python would print a
+    traceback when it is interrupted during the imports.
     """
     for number in ENDING:
         if signal.getsignal(number) in HEEDED:
@@ -25,14 +25,14 @@ def main() -> int:
 
 
 def _open_closed_streams() -> None:
-    """Open standard streams that are closed, so that no file of a user gets their descriptors.
+    """Open closed standard streams, so that no file of the user gets their descriptors.
 
-    What libraries print would end in it. Output that is closed stays one that cannot be written,
-    messages go nowhere.
+    Libraries would print into such a file. Standard output still cannot be written, and messages
+    are discarded.
     """
     for name, how in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:
-            descriptor = os.open(os.devnull, how)  # the lowest that is free
+            descriptor = os.open(os.devnull, how)  # the lowest free descriptor
             os.set_inheritable(descriptor, True)
             mode = "r" if name == "stdin" else "w"
             stream = os.fdopen(descriptor, mode, encoding="utf-8", closefd=False)

@@ -332,7 +332,7 @@ def _read_reference(path: Path, footage: Footage) -> _Reference:
 
 
 def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footage) -> _Reference:
-    """The reference, completed by SIFT's model.
+    """The reference, completed by the model of SIFT.
 
     If poses are given, a SIFT model provides the cloud only if its poses agree with them.
     """

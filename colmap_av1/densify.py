@@ -1,4 +1,4 @@
-"""From a model and its video to a dense model on the same poses."""
+"""Triangulate the tracks of videos on the poses of an existing model."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ class DensifyReport:
 
     Attributes:
         output: folder of the dense model.
-        model: the model whose poses it has.
-        conversion: how the video was converted, in words; None where it is AV1.
+        model: the given model.
+        conversion: how the video was converted, in words; None if it is AV1.
         num_images: images of the model.
-        masked: share of the images' pixels that masks leave out; None without masks.
-        num_tracks: tracks of the video that its images see often enough.
+        masked: share of the images' pixels that masks exclude; None without masks.
+        num_tracks: tracks of the video with enough observations.
         agreeing: share of these that agree with the poses.
         num_points: 3D points.
-        num_model_points: those of the given model.
+        num_model_points: 3D points of the given model.
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
-        model_coverage: that of the given model's points.
+        model_coverage: the same for the points of the given model.
         mean_error: mean reprojection error of the points in pixels.
-        gaussians: file of initial Gaussians, where one was wanted.
+        gaussians: file of initial Gaussians; None if not requested.
         seconds: wall time of each stage.
         warnings: what the user should know.
     """
@@ -108,30 +108,31 @@ def densify(
 ) -> DensifyReport:
     """Triangulate the tracks of videos on the poses of an existing model.
 
-    Poses, cameras and image names stay as they are; the points are new. Images of several videos
-    are told apart by their folders, see `match`.
+    Poses, cameras and image names are unchanged; the points are new. With several videos, the
+    folder of an image determines its video, see `match`.
 
     Args:
-        model: folder of a COLMAP model of these videos' frames, from whatever mapper.
-        video: a video, or several; one that is not AV1 is converted first, see `match`.
+        model: folder of a COLMAP model of frames of these videos, from any mapper.
+        video: a video or several. A video that is not AV1 is converted first, see `match`.
         output: new or empty folder for the dense model.
-        photos: folder of the photos among the model's images, which see no point of a track; None:
-            there are none.
-        image_path: folder of the model's images, to recognise by their content which frames
-            they are where their names leave doubt.
-        gaussians: file, .ply, for initial Gaussians of the points.
+        photos: folder of the photos among the model's images, which observe no tracks; None: no
+            photos.
+        image_path: folder of the model's images, to find the frame of an image by its content if
+            names are ambiguous.
+        gaussians: .ply file for initial Gaussians of the points.
         options: options of every stage.
-        progress: called with a stage's name, what is done, and of how much where known.
-        overwrite: replace an output that holds a model and nothing else, and a file of Gaussians.
+        progress: called with a stage's name, the amount of work done, and the total if known.
+        overwrite: replace an output that holds only a model, and a file of Gaussians.
 
     Raises:
-        ModelError: there is no readable model with poses, it is not of these videos, or the
-            dense one cannot be written.
-        VideoError: a video cannot be read, is given twice, or changes meanwhile.
-        BitstreamError: a stream is damaged, and strict or before its second frame.
-        ImageError: the model's images do not say which frames they are.
-        OptionError: an option does not go with the images, the folder is not empty, or the file
-            for Gaussians cannot be made.
+        ModelError: the model is not readable, has no poses, or is not of these videos, or the
+            dense model cannot be written.
+        VideoError: a video cannot be read, is given twice, or changes during the run.
+        BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
+            second frame.
+        ImageError: the frames of the model's images cannot be determined.
+        OptionError: an option does not fit the images, the folder is not empty, or the file for
+            Gaussians cannot be made.
     """
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress
@@ -139,7 +140,7 @@ def densify(
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
     read = [model, *paths_of(video), photos, folder, *options.match.files]
-    # What can be refused is refused before the long work.
+    # Check the outputs before the long work.
     check_new_folder(output, MODEL_FILES, read, overwrite=overwrite)
     check_gaussians_path(gaussians, read, overwrite=overwrite)
     reconstruction = read_model(model)
@@ -214,7 +215,7 @@ def _track(
     """Track a video in pixels of its images.
 
     Returns:
-        The tracks, in the frames that are images only, and a description of the conversion.
+        The tracks, only in the frames that are images, and a description of the conversion.
     """
     matching = options.match
 
@@ -254,7 +255,7 @@ def _pictures(
     scratch: Path,
     options: DensifyOptions,
 ) -> Pictures:
-    """What gives the pictures of images; a folder keeps those of videos."""
+    """A source of the images' pictures, which keeps those of videos in the scratch folder."""
     kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
     shown = list(map(ShownVideo.as_played, inputs.videos, kept))
     return pictures_of(image_set, shown, [photo.path for photo in photos], options.match.reading)
@@ -270,7 +271,7 @@ def _coloured_cloud(
     clock: Clock,
     progress: Progress,
 ) -> ModelPoints:
-    """The points that are written, in the colours of the pictures."""
+    """The points to write, with colours from the pictures."""
 
     def show(stage: str, look: Look) -> None:
         with clock.measure(stage):
@@ -315,7 +316,7 @@ def _write_gaussians(
     views: Sequence[PosedCamera],
     clock: Clock,
 ) -> Path | None:
-    """Write initial Gaussians where they are wanted; where they are."""
+    """Write initial Gaussians if a path is given, and return the path."""
     if path is None:
         return None
     with clock.measure("gaussians"):
@@ -324,13 +325,17 @@ def _write_gaussians(
 
 
 def _agreement(model: Path, points: TriangulatedPoints) -> float:
-    """Share of the tracks that agree with the poses; refuses a model of another video."""
+    """Share of the tracks that agree with the poses.
+
+    Raises:
+        ModelError: the model is of another video.
+    """
     agreeing = points.num_agreeing / max(points.num_tracks, 1)
     if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
         raise ModelError(
-            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses and "
-            f"{len(points.xyz)} give a point: give the video that the model's images come from, "
-            "and see that their names count its frames (--first_number, --frame_list)"
+            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses, "
+            f"{len(points.xyz)} points are triangulated: give the video that the model's images "
+            "come from, and check that their names are frame numbers (--first_number, --frame_list)"
         )
     return agreeing
 
@@ -341,9 +346,9 @@ def _read_inputs(
     options: DensifyOptions,
     names: Collection[str],
 ) -> Inputs:
-    """The videos and photos; these by their names in a model that `match` or `reconstruct` led to.
+    """Read the videos, and the photos under the names of a model from `match` or `reconstruct`.
 
-    `reconstruct` changes names.
+    `reconstruct` gives photos flat names.
     """
     inputs = read_inputs(video, photos, options.match)
     if any(photo.name in names for photo in inputs.photos):

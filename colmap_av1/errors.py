@@ -1,8 +1,7 @@
-"""Errors of input: one class each, one base class.
+"""Errors for bad input, with one base class.
 
-Every message is one line that says what to do. The command line prints it and
-exits with status 2; anything that is not a `ColmapAv1Error` is a defect of this
-package.
+Every message is one line, "cause: remedy". The command line prints it and exits with status 2.
+Any other exception is a defect of this package.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ class ColmapAv1Error(Exception):
 
 
 class VideoError(ColmapAv1Error):
-    """The video file is missing, unreadable, or holds no video stream."""
+    """The video file is missing, unreadable, or has no video stream."""
 
 
 class NotAv1Error(VideoError):
-    """The video stream is not AV1; the message says how to convert it."""
+    """The video stream is not AV1; the message gives the command that converts it."""
 
 
 class BitstreamError(ColmapAv1Error):
@@ -31,15 +30,15 @@ class LimitError(ColmapAv1Error):
 
 
 class ImageError(ColmapAv1Error):
-    """The image folder does not fit the video (count, names, size, content)."""
+    """The images do not match the video (count, names, size, content)."""
 
 
 class DatabaseError(ColmapAv1Error):
-    """The database is locked, not a COLMAP database, or does not fit the video."""
+    """The database is locked, not a COLMAP database, or does not match the video."""
 
 
 class HlocError(ColmapAv1Error):
-    """A file of hloc's features or matches is missing, unreadable, or contradicts itself."""
+    """A file of hloc's features or matches is missing, unreadable, or inconsistent."""
 
 
 class EncodeError(ColmapAv1Error):
@@ -51,14 +50,14 @@ class ModelError(ColmapAv1Error):
 
 
 class OptionError(ColmapAv1Error):
-    """An option has a value that cannot work."""
+    """An option has an invalid value."""
 
 
 class EvaluationError(ColmapAv1Error):
-    """A front-end or a mapper that is compared failed; the message says where its log is."""
+    """A compared front-end or a mapper failed; the message names its log."""
 
 
 def cannot_write(path: Path, error: Exception) -> str:
-    """The message where the system refuses to write a file or folder."""
+    """Message for a file or folder that the system refuses to write."""
     reason = getattr(error, "strerror", None) or error
     return f"{path}: cannot be written: {reason}: fix that, or give another path"

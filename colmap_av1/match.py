@@ -1,4 +1,4 @@
-"""From a video to the rows of a COLMAP database."""
+"""Match the images of videos along motion vectors, and write a COLMAP database."""
 
 from __future__ import annotations
 
@@ -62,37 +62,38 @@ class MatchReport:
     Attributes:
         database: the database file.
         videos: the video files.
-        streams: for each, the AV1 file whose motion was read: the video, or what it was converted
-            to; None where that was not kept.
-        conversion: how the streams were made of the videos, in words; None where they are these.
-        photos: folder of the photos; None where none was given.
-        image_path: folder of the images; None where none was given.
+        streams: for each video, the AV1 file whose motion was read: the video or its conversion;
+            None if the conversion was not kept.
+        conversion: how videos were converted, in words; None if all are AV1.
+        photos: folder of the photos; None if none was given.
+        image_path: folder of the images; None if none was given.
         num_frames: shown frames of the videos.
-        num_coded_frames: frames with block data, hidden ones included.
+        num_coded_frames: coded frames, including hidden ones.
         num_images: images of the database.
-        num_written_images: image files written; others were there or not asked for.
-        masked: share of the images' pixels that masks leave out; None without masks.
-        num_tracks: tracks of the videos that images are matched along.
-        track_lengths: quantiles of the number of images that see a track, from 0 (shortest)
-            to 1 (longest); empty without a track.
+        num_written_images: image files written; the others existed or were not requested.
+        masked: share of the images' pixels that masks exclude; None without masks.
+        num_tracks: tracks of the videos used for matching.
+        track_lengths: quantiles of the number of images that observe a track, from 0 (shortest)
+            to 1 (longest); empty without tracks.
         num_observations: keypoints of all images.
-        focal_length: of the first video, in heights of a pixel, where it was estimated from the
-            tracks; None where it was given, or the motion does not determine it and the camera has
-            COLMAP's first guess.
-        read_outs: of each video, the time in milliseconds in which the shutter reads the rows of a
-            picture, where keypoints were corrected for it; None: they were not.
+        focal_length: focal length of the first video in pixel heights, if it was estimated from
+            the tracks; None if it was given, or if it is not observable and the camera has
+            COLMAP's default.
+        read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
+            to the last; None if the keypoints were not corrected for it.
         num_pairs: image pairs written.
-        num_verified_pairs: those with a two-view geometry.
+        num_verified_pairs: pairs with a two-view geometry.
         num_matches: matches of all pairs.
         num_inliers: inlier matches of all pairs.
         configs: number of pairs by COLMAP's name of their two-view configuration.
-        forward_motion: the camera moves along its axis, as in a driving car: the mapper starts
-            with no pair unless its options allow that, and the focal length cannot be found.
-        links: what connects images where motion does not.
+        forward_motion: the camera moves along its optical axis, as in a driving car: the mapper
+            finds no initial pair unless its options allow this, and the focal length is not
+            observable.
+        links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
-            None: they were verified pair by pair.
+            None if they were verified pair by pair.
         seconds: wall time of each stage.
-        warnings: what the user should know, such as damage of the stream.
+        warnings: what the user should know, such as a damaged stream.
     """
 
     database: Path
@@ -124,13 +125,13 @@ class MatchReport:
 
     @property
     def next_commands(self) -> tuple[str, str, str]:
-        """Shell lines: two that map the database, with COLMAP and with this package; one after.
+        """Shell commands: map the database with COLMAP, or with this package; then densify.
 
-        The last one makes the cloud that training of Gaussian splats starts from.
+        The last command makes the point cloud for training Gaussian splats.
         """
-        database = _no_option(self.database)
-        output = _no_option(self.database.with_name(f"{self.database.stem}_model"))
-        images = _no_option(self.image_path) if self.image_path is not None else "IMAGES"
+        database = _path_word(self.database)
+        output = _path_word(self.database.with_name(f"{self.database.stem}_model"))
+        images = _path_word(self.image_path) if self.image_path is not None else "IMAGES"
         # fmt: off
         mapper = [
             "colmap", "mapper",
@@ -154,10 +155,10 @@ class MatchReport:
         densify = [
             "colmap-av1", "densify",
             "--model", f"{output}/0",
-            *(word for video in self.videos for word in ("--video", _no_option(video))),
-            *(("--photos", _no_option(self.photos)) if self.photos is not None else ()),
+            *(word for video in self.videos for word in ("--video", _path_word(video))),
+            *(("--photos", _path_word(self.photos)) if self.photos is not None else ()),
             *(("--image_path", images) if self.image_path is not None else ()),
-            "--output", _no_option(self.database.with_name(f"{self.database.stem}_splats")),
+            "--output", _path_word(self.database.with_name(f"{self.database.stem}_splats")),
         ]
         # fmt: on
         with_colmap = f"mkdir -p {shlex.quote(output)} && {shlex.join(mapper)}"
@@ -176,34 +177,34 @@ def match(
 ) -> MatchReport:
     """Fill a COLMAP database with keypoints and verified matches from the motion of videos.
 
-    A database that lists images gets rows for these, see `frames_of_images`; a new or empty
-    one gets images of its own. The database is written last and in one transaction: any
-    error or interrupt leaves it as it was.
+    If the database lists images, keypoints and matches are added to these, see
+    `frames_of_images`; a new or empty database gets new images. The database is written last, in
+    one transaction: an error or interrupt leaves it unchanged.
 
-    Images of several videos lie in a folder for each, named like it, and have a camera each; what
-    their pictures show in common connects them, and photos with them.
+    With several videos, the images of each are in a folder named after it and have their own
+    camera. SIFT links connect the videos and the photos.
 
     Args:
-        database: the database file; made where it is missing.
-        video: a video, or several; one that is not AV1 is converted first, to a file beside the
-            database that is there as long as it is read, or to one that is kept
-            (`options.keep_stream`).
+        database: the database file; created if it is missing.
+        video: a video or several. A video that is not AV1 is converted first, to a temporary file
+            beside the database or to a file that is kept (`options.keep_stream`).
         photos: folder of photos that become images, too, named by the folder and their path in it;
-            None: there are none.
-        image_path: folder to write the images to, for the mapper's colours and for
-            training; existing images of the right size are kept, photos are copied to it. None:
-            none are written.
+            None: no photos.
+        image_path: folder to write the images to, for the mapper's colours and for training.
+            Existing images of the right size are kept, and photos are copied to it. None: no
+            images are written.
         options: options of every stage.
-        progress: called with a stage's name, what is done, and of how much where known.
+        progress: called with a stage's name, the amount of work done, and the total if known.
 
     Raises:
-        VideoError: a video cannot be read, is given twice, changes meanwhile, or has no motion to
-            match.
-        BitstreamError: a stream is damaged, and strict or before its second frame.
-        ImageError: images or names do not fit the video, or a photo cannot be read.
-        DatabaseError: the database is locked, no COLMAP database, has features of its
-            images and must not (`options.on_existing`), or does not fit the video.
-        OptionError: an option does not fit the videos, their images or another option.
+        VideoError: a video cannot be read, is given twice, changes during the run, or has no motion
+            to match.
+        BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
+            second frame.
+        ImageError: images or names do not match the video, or a photo cannot be read.
+        DatabaseError: the database is locked, is not a COLMAP database, does not match the video,
+            or has features of its images, which `options.on_existing` does not allow.
+        OptionError: an option conflicts with the videos, their images or another option.
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress
@@ -241,7 +242,7 @@ def match(
         if folder is not None:
             check_videos()
             with clock.measure("images"), alone_in(folder):
-                _check_images_of_others(images, folder, before, options)
+                _check_images_of_other_runs(images, folder, before, options)
                 num_written = place_photos(inputs.photos, folder)
                 labelled = zip(inputs.labels, images.videos, strict=True)
                 of_videos, blurred = write_all_prepared(labelled, folder, options.reading, progress)
@@ -264,8 +265,8 @@ def match(
     notes += (*positions.warnings, *found.warnings)
     doubts = (found.depth.warning, focal_length_warning(found.cameras))
     notes += tuple(doubt for doubt in doubts if doubt is not None)
-    # What a database holds already may join the images, too, and joint matches are fewer where all
-    # others are the same tracks in more images.
+    # Few matches do not mean a gap if existing matches of the database may connect the images, or
+    # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
         notes += matching_warnings(written, images.image_set)
     return MatchReport(
@@ -298,19 +299,19 @@ def match(
     )
 
 
-def _check_images_of_others(
+def _check_images_of_other_runs(
     images: _Images, folder: Path, before: set[Path], options: MatchOptions
 ) -> None:
-    """Refuse images that another run has written since this one began, if of another video.
+    """Refuse images of another video that another run has written since this one began.
 
     Args:
         images: the images of this run.
-        folder: where they are to be written.
-        before: files that were there when this run began.
-        options: those of reading are used.
+        folder: folder that they will be written to.
+        before: files that existed when this run began.
+        options: only the options for reading are used.
 
     Raises:
-        ImageError: an image shows something else than the frame it should.
+        ImageError: an image does not show its frame.
     """
     for label, own in zip(images.inputs.labels, images.videos, strict=True):
         for name, frame in zip(
@@ -327,13 +328,13 @@ def _check_images_of_others(
 
 @dataclass(frozen=True)
 class _Images:
-    """The images of all videos and photos, before any are matched.
+    """The images of all videos and photos, before they are matched.
 
     Attributes:
         inputs: the videos and photos.
-        videos: the images of each video, with its tracks in their pixels.
-        fast: of each video, where the camera moves fast: bool [num_frames], see `fast_frames`.
-        image_set: all images, counted through.
+        videos: the images of each video, and its tracks in pixels of these images.
+        fast: for each video, bool [num_frames]: frames with fast camera motion, see `fast_frames`.
+        image_set: all images, numbered consecutively.
     """
 
     inputs: Inputs
@@ -343,7 +344,7 @@ class _Images:
 
     @property
     def shown(self) -> tuple[ShownVideo, ...]:
-        """The videos, as their pictures are looked at."""
+        """The videos, whose pictures are shown in the size of the images."""
         return tuple(
             ShownVideo(v.source.pictures, v.size, v.pixel_aspect, v.display, v.source.kept)
             for v in self.videos
@@ -351,7 +352,7 @@ class _Images:
 
 
 def _is_joint(folder: Path | None, options: MatchOptions) -> bool:
-    """Whether matches are to agree with a joint estimate, which has one camera for a video."""
+    """Whether to verify matches against a joint estimate, which has one camera per video."""
     verify, pairs = options.verify.verify, PairOptions(min_matches=options.pairs.min_matches)
     each = options.camera.single_camera is False
     if verify == "joint" and each:
@@ -379,17 +380,17 @@ def _prepare(
     scratch: Path | None,
     context: RunContext,
 ) -> _Images:
-    """Find or choose the images of each video, and count them through.
+    """Find or choose the images of each video, and number them consecutively.
 
     Args:
         inputs: the videos and photos.
-        listed: (width, height) of the images of each video that a database lists, by name.
-        folder: folder of the images; None: none are wanted.
+        listed: for each video, (width, height) by name of the images that the database lists.
+        folder: folder to write the images to; None: no images are written.
         options: all options.
         beside: the database.
-        scratch: folder that keeps decoded pictures for a joint estimate; None: there is none, and
-            only tracks that are matched are kept.
-        context: gets the stages.
+        scratch: folder that keeps decoded pictures for a joint estimate; None: no joint estimate
+            follows, and only the tracks selected for matching are kept.
+        context: state of the run.
     """
     videos, fast = [], []
     for number, (video, label, masks, existing) in enumerate(
@@ -410,7 +411,7 @@ def _prepare(
             kept = KeptPictures(scratch / f"{number}.raw")
             prepared = replace(prepared, source=replace(prepared.source, kept=kept))
         else:
-            # All tracks of a video are its largest arrays: they make room for the next.
+            # The tracks of a video are its largest arrays: free those that are not matched.
             prepared = _with_selected_tracks(prepared, options, context)
         videos.append(prepared)
     image_set = inputs.image_set(
@@ -426,18 +427,18 @@ def _match_images(
     options: MatchOptions,
     context: RunContext,
 ) -> ImageMatches:
-    """Match the images, by a joint estimate if there is a folder for it and it succeeds.
+    """Match the images with a joint estimate, or pair by pair if it fails or is not wanted.
 
     Args:
         images: the images.
-        cameras: those of a database that lists the images; None: they are made anew.
-        scratch: the folder.
+        cameras: cameras of a database that lists the images; None: new ones are made.
+        scratch: folder for the joint estimate; None: match pair by pair.
         options: all options.
-        context: gets the stages.
+        context: state of the run.
 
     Raises:
-        ModelError: the joint estimate fails, and `options.verify` asks for one.
-        VideoError: nothing connects any two images.
+        ModelError: the joint estimate fails, and `options.verify` requires it.
+        VideoError: no two images are connected.
     """
     if scratch is None:
         return _match_pairs(images, cameras, options, context)
@@ -472,10 +473,10 @@ def _match_jointly(
     options: MatchOptions,
     context: RunContext,
 ) -> JointMatches:
-    """Match the images by what agrees with an estimate of all poses."""
+    """Match the images by the observations that agree with an estimate of all poses."""
     stages = scratch / ".stages"
     stages.mkdir()
-    # The images are chosen.
+    # The images are already chosen.
     chosen = replace(options, images=ImageOptions())
     run = Run(
         images.inputs,
@@ -544,7 +545,7 @@ def _match_pairs(
 def _without_shutter(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
 ) -> PreparedImages:
-    """The images with their tracks corrected for the shutter's read-out, if that is wanted."""
+    """The images with their tracks corrected for the rolling shutter, if requested."""
     tracked = prepared.tracked
     tracks, read_out = without_shutter(
         tracked.tracks,
@@ -560,7 +561,7 @@ def _without_shutter(
 def _with_selected_tracks(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
 ) -> PreparedImages:
-    """The images with the tracks that are matched, in place of all."""
+    """The images with only the tracks selected for matching."""
     tracked = prepared.tracked
     with context.clock.measure("pairs"):
         tracks = select_tracks(tracked.tracks.keep_frames(tracked.chosen.frames), options.density)
@@ -568,20 +569,20 @@ def _with_selected_tracks(
 
 
 def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
-    """Quantiles of the lengths of tracks; empty without a track."""
+    """Quantiles of the lengths of tracks; empty without tracks."""
     if len(lengths) == 0:
         return {}
     found = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     return dict(zip(_LENGTH_QUANTILES, map(int, found), strict=True))
 
 
-def _no_option(path: Path) -> str:
-    """The path, spelled so that programs do not take it for an option."""
+def _path_word(path: Path) -> str:
+    """The path as a shell word that programs do not take for an option."""
     return f"./{path}" if str(path).startswith("-") else str(path)
 
 
 def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseImage]:
-    """The images of the database, after a look at whether it can be written."""
+    """Read the images of the database, and check that it can be written."""
     listed = read_images(database)
     filled = next((i for i in listed if i.num_keypoints or i.num_matches), None)
     if filled is not None and options.on_existing == "error":
@@ -592,7 +593,7 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     if listed:
         check_no_camera(database, options.camera)
     if database.exists() and database.stat().st_size:
-        # Nothing is written, but the write lock is taken.
+        # Writes nothing, but fails if the database is locked.
         write_matches(database, (), (), (), pairs=_NO_PAIRS, matches=(), geometries=())
     elif not os.access(database.resolve().parent, os.W_OK | os.X_OK):
         raise DatabaseError(

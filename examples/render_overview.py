@@ -1,9 +1,9 @@
-"""Draw README's animated picture from the example clip: motion, tracks and the point cloud.
+"""Draw the animated picture of the README from the example clip: motion, tracks, point cloud.
 
 ``python examples/render_overview.py`` reconstructs ``scene.mp4`` in a temporary folder and writes
 ``docs/images/overview.webp``. ``--model`` takes the output of an earlier
-``colmap-av1 reconstruct --points survey --seeding 2`` of the clip. Needs Pillow, which comes with
-the extra ``evaluate``.
+``colmap-av1 reconstruct --points survey --seeding 2`` of the clip. Needs Pillow, which the extra
+``evaluate`` installs.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GAP = 6
 CLOUD = (524, 2 * PANEL[1] + GAP)
 BACKGROUND = (22, 24, 28)
 CAMERA = (255, 196, 64)
-SWING = np.radians(26)  # of the virtual camera to either side
+SWING = np.radians(26)  # amplitude of the virtual camera's swing
 SUPERSAMPLE = 2
 MILLISECONDS = 80
 
@@ -45,11 +45,11 @@ Points = NDArray[np.float64]
 
 
 def main() -> None:
-    """Make the picture."""
+    """Draw and save the picture."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", type=Path, help="output of colmap-av1 reconstruct of the clip")
     parser.add_argument("--output", type=Path, default=OUTPUT)
-    parser.add_argument("--quality", type=int, default=40, help="of WebP, 0 to 100")
+    parser.add_argument("--quality", type=int, default=40, help="WebP quality, 0 to 100")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         model = arguments.model
@@ -91,7 +91,7 @@ def read_panels(path: Path) -> tuple[Picture, Picture]:
 
 
 class Scene:
-    """The point cloud and the cameras, as a virtual camera that swings around them sees them."""
+    """The point cloud and the cameras, drawn from a virtual camera that swings around them."""
 
     def __init__(self, model: pycolmap.Reconstruction, num_frames: int) -> None:
         """Take points, colours and camera poses from a model."""

@@ -90,7 +90,7 @@ class Output:
         with only_run(lock) as alone:
             if not alone:
                 raise OptionError(
-                    f"{self._root}: another batch is at work in it: wait until it ends, or give "
+                    f"{self._root}: another batch is writing to it: wait until it ends, or give "
                     "another output"
                 )
             yield

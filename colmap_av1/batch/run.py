@@ -205,7 +205,7 @@ def _refuse_another_task(output: Output, place: str, task: str) -> None:
     """Refuse an output that has the batch of another task.
 
     Raises:
-        OptionError: it has.
+        OptionError: the output has such a batch.
     """
     for name in batch_files(output):
         found: object = None
@@ -276,10 +276,10 @@ def _write_rows(
 
 
 def _work_of(task: Options, output: str, models: str | None, options: BatchOptions) -> Work:
-    """The work for each video; refuses options that contradict each other.
+    """The work for each video.
 
     Raises:
-        OptionError: they do.
+        OptionError: the options conflict.
     """
     name = next((name for name, kind in TASK_OPTIONS.items() if type(task) is kind), None)
     if name is None:

@@ -1,4 +1,4 @@
-"""Videos that are given by a URL: fetched before a command, gone after it."""
+"""Videos given by a URL: downloaded before a command and deleted after it."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from colmap_av1.util.remote import absolute, fetch, is_url, without_secrets
 
 @contextmanager
 def videos_at_hand(namespace: argparse.Namespace) -> Iterator[None]:
-    """Put files in place of URLs among the videos of a command.
+    """Download videos given by a URL, and replace the URLs by the files.
 
-    fsspec reads the URLs; it is no dependency of the package, but comes with an extra.
+    URLs are read with fsspec, which the extra "remote" installs.
 
     Raises:
-        OptionError: fsspec, or what it needs for such a URL, is missing; or it knows none such.
+        OptionError: fsspec, or a package it needs for such a URL, is missing, or fsspec does not
+            support the protocol.
         VideoError: there is no such file.
-        OSError: it cannot be read, or stands still, or there is no room for it.
+        OSError: the file cannot be read, the transfer stalls, or the disk is full.
     """
     given = getattr(namespace, "video", None)
     videos = given if isinstance(given, list) else [given]
-    if not any(_is_elsewhere(video) for video in videos):
+    if not any(_is_remote(video) for video in videos):
         yield
         return
     with tempfile.TemporaryDirectory(prefix="colmap-av1-") as folder:
         found = [
             _fetched(video, Path(folder) / str(number), namespace.quiet)
-            if _is_elsewhere(video)
+            if _is_remote(video)
             else video
             for number, video in enumerate(videos)
         ]
@@ -42,12 +43,12 @@ def videos_at_hand(namespace: argparse.Namespace) -> Iterator[None]:
         yield
 
 
-def _is_elsewhere(video: str | None) -> bool:
+def _is_remote(video: str | None) -> bool:
     return video is not None and is_url(video) and not Path(video).exists()
 
 
 def _fetched(url: str, folder: Path, quiet: bool) -> str:
-    """A copy of a video under the name it has there, by which its images may be named."""
+    """A copy of a video with its remote file name, by which its images may be named."""
     address = absolute(url)
     if not is_url(address):
         return address
@@ -57,6 +58,6 @@ def _fetched(url: str, folder: Path, quiet: bool) -> str:
     try:
         copy = fetch(address, folder, BatchOptions().stall)
     except OptionError as error:
-        raise OptionError(f"{error}; or fetch it first, and give its path") from error
+        raise OptionError(f"{error}; or download it first, and give its path") from error
     name = PurePosixPath(unquote(urlsplit(url).path)).name
     return str(copy.rename(folder / name) if name else copy)

@@ -25,28 +25,28 @@ def add_arguments(command: Parser) -> None:
         "--inputs",
         nargs="+",
         metavar="PATH",
-        help="lists (a path or URL on each line, and if wanted a tab and a name), quoted patterns, "
-        "folders and videos; paths or URLs",
+        help="paths or URLs of videos, folders, quoted patterns, or lists (on each line a path or "
+        "URL, optionally followed by a tab and a name)",
     )
     command.add_argument(
         "--output",
         "--output_path",
         required=True,
         metavar="PATH",
-        help="folder or URL for a folder of each video, batch.csv and batch.json",
+        help="folder or URL for batch.csv, batch.json and a folder for each video",
     )
-    command.add_argument("--task", choices=tuple(TASK_OPTIONS), help="what is done with each video")
+    command.add_argument("--task", choices=tuple(TASK_OPTIONS), help="the task for each video")
     command.add_argument(
         "--models",
         metavar="PATH",
-        help="of densify: folder or URL with a model for each video, under its name",
+        help="densify: folder or URL that contains a model for each video, under its name",
     )
     add_options(command, BatchOptions)
     add_options_of_any(command, *TASK_OPTIONS.values())
 
 
 def run(namespace: argparse.Namespace) -> int | None:
-    """Run a batch, or make its page; the exit status."""
+    """Run a batch or make its page, and return the exit status."""
     if namespace.verb == "report":
         print_result(namespace, [("report", colmap_av1.write_page(namespace.output))])
         return None

@@ -1,4 +1,4 @@
-"""Progress of a batch: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a batch: a bar on a terminal, otherwise a line from time to time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from colmap_av1.batch.run import Counts, Watch
 from colmap_av1.cli.terminal import PROGRAM, print_warning
 
 _LINE_EVERY = 30.0  # seconds
-# Further failures are counted; batch.csv has them all.
+# Largest number of failures that are printed; batch.csv lists all.
 _MOST_LINES = 20
 
 
 @contextmanager
 def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]:
-    """What `run_batch` tells how far it is; failures are warnings, quiet or not."""
+    """Callbacks for `run_batch` that print progress; failures are printed even if quiet."""
     if quiet or not sys.stderr.isatty():
         lines = _Lines(quiet)
         yield lines.hear, lines.watch
@@ -71,7 +71,7 @@ class _Failures:
 
 
 class _Lines:
-    """Prints lines, as logs of queues keep them."""
+    """Prints progress as lines, for log files."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
@@ -92,7 +92,7 @@ class _Lines:
         rate = counts.ended / (now - self._start)
         if rate > 0:
             minutes = (counts.total - counts.ended) / rate / 60
-            words += f", {rate:.2g} a second, {minutes:.0f} minutes left"
+            words += f", {rate:.2g} per second, {minutes:.0f} minutes left"
         failed = _failed(counts)
         print(f"{PROGRAM}: {words}{failed and f', {failed}'}", file=sys.stderr)
 

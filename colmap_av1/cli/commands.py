@@ -1,6 +1,7 @@
-"""The commands: the options of each, the function that it calls, what it prints.
+"""The commands: their options, the functions they call, and what they print.
 
-What a command alone needs is imported when it runs, so that help and short commands start fast.
+Imports that only one command needs are made when it runs, so that help and short commands start
+fast.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from colmap_av1.options import (
 from colmap_av1.options.fields import Options
 
 _FAILED_CHECK = 1
-# A model was made, but a trainer failed on one.
+# A trainer failed on a model.
 _FAILED_TRAINING = 3
 
 
@@ -53,7 +54,7 @@ class Argument:
     Attributes:
         names: its spellings.
         how: further arguments of `add_argument`.
-        rare: where there is --help-all, --help leaves it out.
+        rare: --help omits it if there is --help-all.
     """
 
     names: tuple[str, ...]
@@ -66,14 +67,14 @@ class Command:
     """A command.
 
     Attributes:
-        run: does what the command is for; returns the exit status, None for 0.
-        summary: what that is.
-        needed: the options that its usage names.
-        arguments: its arguments, besides --quiet.
+        run: runs the command and returns the exit status, None for 0.
+        summary: what the command does.
+        needed: the options shown in its usage.
+        arguments: its arguments, except --quiet.
         options: the dataclasses whose fields are its options.
-        full_help: leave the help of rare options to --help-all.
-        pycolmap: it needs pycolmap.
-        add_more: adds the arguments that the list cannot describe, before these.
+        full_help: show the help of rare options only with --help-all.
+        pycolmap: whether it needs pycolmap.
+        add_more: adds further arguments before `arguments`.
     """
 
     run: Callable[[argparse.Namespace], int | None]
@@ -98,7 +99,7 @@ class Command:
 
 
 def _path(name: str, what: str, *, required: bool = True, **how: Any) -> Argument:
-    """A path, with COLMAP's spelling of its name."""
+    """A path option, also with COLMAP's spelling of its name."""
     how = {"required": required, "metavar": "PATH", "help": what, **how}
     return Argument((f"--{name}", f"--{name}_path"), how)
 
@@ -112,19 +113,19 @@ def _flag(name: str, what: str) -> Argument:
 
 
 def _videos(what: str) -> tuple[Argument, ...]:
-    """Several videos, and photos; --images is another spelling that help does not show."""
+    """Options for videos and photos; help does not show --images, another name of --photos."""
     return (
-        _path("video", f"{what}; several videos: give it for each", action="append"),
-        _optional_path("photos", "folder of photos of the same scene, which are added"),
+        _path("video", f"{what}; repeat for several videos", action="append"),
+        _optional_path("photos", "folder of photos of the same scene to add"),
         Argument(("--images",), {"dest": "photos", "help": argparse.SUPPRESS}),
     )
 
 
-_ANY_VIDEO = "a video; one that is not AV1 is converted first"
+_ANY_VIDEO = "a video; converted first if it is not AV1"
 _VIDEO = _path("video", "an AV1 video")
 _DATABASE = _path("database", "a COLMAP database")
-_OVERWRITE = _flag("overwrite", "replace an output that exists")
-_OVERWRITE_MODELS = _flag("overwrite", "replace an output that exists and holds nothing but models")
+_OVERWRITE = _flag("overwrite", "replace an existing output")
+_OVERWRITE_MODELS = _flag("overwrite", "replace an existing output that contains only models")
 _GAUSSIANS = _optional_path(
     "gaussians", "also write initial Gaussians to this .ply, for trainers that start from them"
 )
@@ -132,7 +133,7 @@ _REPORT_JSON = Argument(
     ("--report_json",),
     {
         "metavar": "PATH",
-        "help": "also write the report to this file as JSON; after a failure its reason",
+        "help": "also write the report, or the reason of a failure, to this file as JSON",
     },
     rare=True,
 )
@@ -235,10 +236,10 @@ def _compare(namespace: argparse.Namespace) -> int:
         if column.error:
             print_warning(f"{column.name}: {column.error}")
         if column.training_error:
-            print_warning(f"{column.name}: nothing is trained: {column.training_error}")
+            print_warning(f"{column.name}: training failed: {column.training_error}")
     print_result(namespace, reports.compare_rows(result), result.warnings)
     if all(column.model is None for column in result.columns):
-        raise EvaluationError(f"{result.output}: no front-end gave a model: see report.html there")
+        raise EvaluationError(f"{result.output}: no front-end made a model: see report.html there")
     return _FAILED_TRAINING if any(column.training_error for column in result.columns) else 0
 
 
@@ -275,7 +276,7 @@ def _check(namespace: argparse.Namespace) -> int:
     if namespace.database is None and namespace.model is None:
         raise OptionError("nothing to check: give --database, or --model with --image_path")
     if (namespace.model is None) != (namespace.image_path is None):
-        raise OptionError("a model is checked by its pictures: give both --model and --image_path")
+        raise OptionError("a model is checked with its images: give both --model and --image_path")
     good = True
     if namespace.database is not None:
         result = colmap_av1.check(namespace.database)
@@ -287,7 +288,7 @@ def _check(namespace: argparse.Namespace) -> int:
 
 
 def _check_model(namespace: argparse.Namespace) -> bool:
-    """Print the diagnosis of a model, and return whether it holds together."""
+    """Print the diagnosis of a model, and return whether it is consistent."""
     from colmap_av1.check.model import check_model
     from colmap_av1.geometry.colmap_model import read_model
 
@@ -330,7 +331,7 @@ def _export(namespace: argparse.Namespace) -> None:
 
 
 def _add_subject(parser: Parser) -> None:
-    """Add what `view` draws."""
+    """Add the options for the subject that `view` draws."""
     subject = parser.add_mutually_exclusive_group(required=True)
     for name, what in (
         ("video", "draw motion and tracks of an AV1 video"),
@@ -350,7 +351,7 @@ def _view(namespace: argparse.Namespace) -> None:
         _serve(namespace)
         return
     if namespace.output is None:
-        raise OptionError("nowhere to draw: give --output")
+        raise OptionError("no output to draw to: give --output")
     output, overwrite = namespace.output, namespace.overwrite
     if namespace.model is not None and Path(output).suffix.lower() == ".html":
         _view_page(namespace)
@@ -361,7 +362,7 @@ def _view(namespace: argparse.Namespace) -> None:
         return
     if namespace.database is not None:
         if namespace.image_path is None:
-            raise OptionError("nothing to draw the matches on: give --image_path")
+            raise OptionError("no images to draw the matches on: give --image_path")
         inputs = [namespace.database, namespace.image_path]
         check_picture(output, inputs, overwrite=overwrite)
         picture = view_database(namespace.database, namespace.image_path, namespace.pair)
@@ -393,7 +394,7 @@ def _view_page(namespace: argparse.Namespace) -> None:
         try:
             report = read_report(folder)
         except ModelError as error:
-            print_warning(f"{error}; the page shows the model alone")
+            print_warning(f"{error}; the page shows only the model")
     if report is not None:
         rows = reports.reconstruct_rows(report)
     else:
@@ -429,7 +430,7 @@ COMMANDS = {
             *_videos(_ANY_VIDEO),
             _optional_path(
                 "image_path",
-                "folder to write the images to; existing ones of the right size are kept",
+                "folder to write the images to; existing images of the right size are kept",
             ),
             _REPORT_JSON,
         ),
@@ -438,7 +439,7 @@ COMMANDS = {
     ),
     "map": Command(
         _map,
-        "make a model of a COLMAP database with one of COLMAP's mappers",
+        "map a COLMAP database with one of COLMAP's mappers",
         "--database PATH --image_path PATH --output PATH",
         (
             _DATABASE,
@@ -446,7 +447,7 @@ COMMANDS = {
                 ("--image_path",),
                 {"required": True, "metavar": "PATH", "help": "folder of the database's images"},
             ),
-            _path("output", "new folder for the models; 0 is the one with the most images"),
+            _path("output", "new folder for the models; model 0 has the most images"),
             _OVERWRITE_MODELS,
         ),
         (MapOptions, PlaceOptions),
@@ -457,14 +458,14 @@ COMMANDS = {
         "--video PATH [--video PATH] [--photos PATH] --output PATH",
         (
             *_videos(_ANY_VIDEO),
-            _path("output", "folder for images/ and sparse/0/; that of an earlier run is resumed"),
+            _path("output", "folder for images/ and sparse/0/; an earlier run there is resumed"),
             _GAUSSIANS,
             _flag(
                 "report",
-                "also write a page to look at, OUTPUT.html, beside the folder (needs the viewer "
-                "extra)",
+                "also write the page OUTPUT.html, beside the folder, to view the model (needs the "
+                "viewer extra)",
             ),
-            _flag("overwrite", "replace a file of --gaussians or --report that exists"),
+            _flag("overwrite", "replace an existing file of --gaussians or --report"),
             _REPORT_JSON,
         ),
         (ReconstructOptions,),
@@ -480,7 +481,7 @@ COMMANDS = {
             _path("output", "new folder for the model"),
             _OVERWRITE_MODELS,
             _optional_path(
-                "image_path", "folder of its images, where their names do not determine the frames"
+                "image_path", "folder of its images, if their names do not determine the frames"
             ),
             _GAUSSIANS,
             _REPORT_JSON,
@@ -490,20 +491,20 @@ COMMANDS = {
     ),
     "batch": Command(
         batch.run,
-        "do one task on many videos, on this machine or a cluster; 'batch report' makes a page",
+        "run one task on many videos, on this machine or a cluster; 'batch report' makes a page",
         "[report] --inputs PATH ... --output PATH --task TASK",
         full_help=True,
         add_more=batch.add_arguments,
     ),
     "compare": Command(
         _compare,
-        "compare with SIFT and others on a video, with a report",
+        "compare with SIFT and other front-ends on a video, and write a report",
         "--video PATH --output PATH [--reference PATH]",
         (
             _path("video", _ANY_VIDEO),
-            _path("output", "folder for the report; that of an earlier run is resumed"),
+            _path("output", "folder for the report; an earlier run there is resumed"),
             _optional_path(
-                "image_path", "folder of existing images, or for new ones [within the output]"
+                "image_path", "folder of existing images, or for new images [within the output]"
             ),
             _optional_path(
                 "reference",
@@ -541,8 +542,8 @@ COMMANDS = {
                 {
                     "choices": ("none", "estimate"),
                     "default": "none",
-                    "help": "estimate: also the time in which the shutter reads the rows of a "
-                    "picture, from the tracks, which takes as long as to match them",
+                    "help": "estimate: also estimate the rolling-shutter read-out time from the "
+                    "tracks, which takes as long as matching",
                 },
             ),
             _REPORT_JSON,
@@ -552,21 +553,21 @@ COMMANDS = {
     ),
     "check": Command(
         _check,
-        "report what COLMAP's mappers will make of a database, or whether a model holds together",
+        "report whether COLMAP's mappers can use a database, or whether a model is consistent",
         "{--database PATH | --model PATH --image_path PATH}",
         (
             _path("database", "a COLMAP database", required=False),
             _path(
                 "model",
-                "folder of a COLMAP model: pictures of places seen again are held against its "
-                "poses, and with --database the matches it was mapped from",
+                "folder of a COLMAP model: images far apart in time are matched and compared with "
+                "its poses; with --database also the matches that it was mapped from",
                 required=False,
             ),
             _optional_path("image_path", "folder of the model's images"),
             _flag(
                 "strict",
                 "exit with status 1 if the mappers cannot use the database, it is damaged, or the "
-                "model bends",
+                "model is bent",
             ),
         ),
     ),
@@ -597,7 +598,7 @@ COMMANDS = {
                 required=False,
             ),
             _OVERWRITE,
-            _optional_path("image_path", "folder of the images of the database, or of the model"),
+            _optional_path("image_path", "folder of the images of the database or model"),
             Argument(
                 ("--pair",),
                 {

@@ -16,22 +16,22 @@ from colmap_av1.options.fields import Options, declared_of, field_types, is_path
 _Options = TypeVar("_Options", bound=Options)
 _Number = TypeVar("_Number", int, float)
 
-# Starts the names, in a namespace, of options that several dataclasses share.
+# Prefix in a namespace for options that several dataclasses share.
 _ANY = "any."
 
 
 def add_options(command: Parser, *kinds: type[Options]) -> None:
-    """Add an option for each field of some options dataclasses and of those they hold.
+    """Add an option for each field of options dataclasses and of the dataclasses they contain.
 
-    Each dataclass is a group with its title; those of its fields that are not common are left to
-    --help-all. What is not given on the command line does not appear in the namespace.
+    Each dataclass is a group with its title; only --help-all shows fields that are not common.
+    Options that are not given on the command line do not appear in the namespace.
 
     Args:
         command: the subcommand.
         kinds: the dataclasses.
 
     Raises:
-        argparse.ArgumentError: two fields have one name.
+        argparse.ArgumentError: two fields have the same name.
     """
     for kind in kinds:
         for options, path in _parts(kind(), kind.__name__, frozenset()):
@@ -41,16 +41,16 @@ def add_options(command: Parser, *kinds: type[Options]) -> None:
 
 
 def given(namespace: argparse.Namespace, kind: type[_Options]) -> _Options:
-    """The options of a kind, with those given on the command line in place of defaults.
+    """The options of a kind: those given on the command line, and defaults.
 
     Raises:
-        OptionError: a value cannot work.
+        OptionError: a value is invalid.
     """
     return _with_given(kind(), kind.__name__, vars(namespace))
 
 
 def add_options_of_any(command: Parser, *kinds: type[Options]) -> None:
-    """Add the options of several dataclasses of which one is used; what they share once.
+    """Add the options of several dataclasses, of which one is used; shared options are added once.
 
     See `given_of_any`.
 
@@ -70,15 +70,15 @@ def add_options_of_any(command: Parser, *kinds: type[Options]) -> None:
 
 
 def given_of_any(namespace: argparse.Namespace, kind: type[_Options], what: str) -> _Options:
-    """The same as `given`, of options that `add_options_of_any` has added.
+    """Like `given`, for options added by `add_options_of_any`.
 
     Args:
-        namespace: the parsed words.
+        namespace: the parsed arguments.
         kind: the dataclass that is used.
-        what: what it is for, for messages.
+        what: name of its use, for messages.
 
     Raises:
-        OptionError: a value cannot work, or an option is of another dataclass.
+        OptionError: a value is invalid, or an option belongs to another dataclass.
     """
     options = kind()
     left = {k.removeprefix(_ANY): v for k, v in vars(namespace).items() if k.startswith(_ANY)}
@@ -89,12 +89,12 @@ def given_of_any(namespace: argparse.Namespace, kind: type[_Options], what: str)
         if field.name in left
     }
     if left:
-        raise OptionError(f"{next(iter(left))} is no option of {what}: leave it out")
+        raise OptionError(f"{what} has no option '{next(iter(left))}': leave it out")
     return _with_given(options, kind.__name__, values)
 
 
 def underscored(word: str) -> str:
-    """The word with '_' for '-' in an option's name; its value stays as it is."""
+    """The word with '-' replaced by '_' in an option's name, but not in its value."""
     if not word.startswith("--") or word == "--":
         return word
     name, equals, value = word[2:].partition("=")
@@ -103,14 +103,14 @@ def underscored(word: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Path:
-    """Where options are found in those of the command, and which of their fields it offers."""
+    """The path of options within those of the command, and the fields that the command has."""
 
     name: str
     fields: list[dataclasses.Field[Any]]
 
 
 def _parts(options: Options, name: str, unused: Collection[str]) -> Iterator[tuple[Options, _Path]]:
-    """The options and all that they hold, but for unused ones; first what holds others."""
+    """The options and all options that they contain, except unused ones; the outer ones first."""
     used = [f for f in dataclasses.fields(typing.cast(Any, options)) if f.name not in unused]
     parts = [f for f in used if isinstance(getattr(options, f.name), Options)]
     yield options, _Path(name, [f for f in used if f not in parts])
@@ -136,7 +136,7 @@ def _add_option(
     )
     if not declared.common:
         command.rare.append(action)
-    if options.colmap_prefix:  # accepted, but no reading for help
+    if options.colmap_prefix:  # accepted, but not shown in help
         prefixed = (f"--{options.colmap_prefix}.{name}" for name in names)
         command.add_argument(*prefixed, help=argparse.SUPPRESS, **how)
 
@@ -153,7 +153,7 @@ def _with_given(options: _Options, name: str, values: dict[str, Any]) -> _Option
 
 
 def _value_parser(hint: Any) -> tuple[Callable[[str], Any], str]:
-    """Parser and placeholder for the values of a field's type."""
+    """Parser and placeholder of values of a field's type."""
     members = [member for member in members_of(hint) if member is not type(None)]
     if type(None) in members_of(hint):
         parse, metavar = _value_parser(typing.Union[tuple(members)])  # noqa: UP007 - made here
@@ -180,7 +180,7 @@ def _parse_number(kind: type[_Number], what: str, word: str) -> _Number:
     try:
         return kind(word)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{word}' is no {what}") from None
+        raise argparse.ArgumentTypeError(f"'{word}' is not a {what}") from None
 
 
 def _parse_bool(word: str) -> bool:

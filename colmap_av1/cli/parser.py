@@ -1,4 +1,4 @@
-"""The parser of a command: short and full help, and errors that name the nearest option."""
+"""The parser of a command: short and full help, and errors that suggest the nearest option."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any, NoReturn
 from colmap_av1.cli.terminal import print_error, print_text
 
 BAD_INPUT = 2
-# The negative ones that argparse knows.
+# The negative numbers that argparse does not take for options.
 _NUMBER = re.compile(r"-\d+|-\d*\.\d+")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, and whose help may leave out what few users need.
+    """A parser with errors of one line, and with short help that omits rare options.
 
     Attributes:
-        rare: options that --help leaves out where there is --help-all.
+        rare: options that --help omits if there is --help-all.
     """
 
     def __init__(self, *, full_help: bool = False, **how: Any) -> None:
@@ -27,14 +27,14 @@ class Parser(argparse.ArgumentParser):
         self.rare: list[argparse.Action] = []
         self._full_help = full_help
         self.add_argument("-h", "--help", action=_Help, nargs=0, help="show this help and exit")
-        # Where --help shows all options, it is taken, too, and not shown.
+        # A command without rare options accepts --help-all, but does not show it.
         text = "show the help of all options and exit" if full_help else argparse.SUPPRESS
         self.add_argument("--help-all", action=_FullHelp, nargs=0, help=text)
-        # As words come, with '_' for '-'.
+        # The command line replaces '-' in option names by '_' before parsing.
         self.add_argument("--help_all", action=_FullHelp, nargs=0, help=argparse.SUPPRESS)
 
     def short_help(self) -> str:
-        """Help without the rare options where there is --help-all."""
+        """Help, without the rare options if there is --help-all."""
         if self._full_help:
             for action in self.rare:
                 action.help = argparse.SUPPRESS
@@ -42,18 +42,18 @@ class Parser(argparse.ArgumentParser):
         return self.format_help()
 
     def error(self, message: str) -> NoReturn:
-        """Exit with a line that says what is wrong."""
+        """Exit with a message of one line."""
         print_error(f"{message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
 
     def refuse_unknown(self, words: Sequence[str]) -> None:
-        """Exit on an unknown option, and name the one nearest to it, or on a value like one."""
+        """Exit on an unknown option, with the nearest one, or on a value that looks like one."""
         known = self._option_string_actions
         for word, following in zip(words, [*words, ""][1:], strict=True):
             name = word.partition("=")[0]
             takes_one = word in known and known[word].nargs is None
             if takes_one and _like_an_option(following) and following not in known:
-                self.error(f"a value that begins with '-' follows '=': give {word}={following}")
+                self.error(f"a value that begins with '-' needs '=': give {word}={following}")
             if name.startswith("--") and name != "--" and name not in known:
                 near = difflib.get_close_matches(name, known, n=1)
                 meant = f": did you mean {near[0]}?" if near else ""
@@ -61,7 +61,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _like_an_option(word: str) -> bool:
-    """Whether argparse takes a word for an option, and so for no value."""
+    """Whether argparse takes a word for an option, not for a value."""
     return word.startswith("-") and not word.startswith("--") and not _NUMBER.fullmatch(word)
 
 

@@ -1,4 +1,4 @@
-"""The command line: parses words and runs a command."""
+"""The command line: parses arguments and runs a command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from colmap_av1.util.cpus import BLAS_THREADS
 from colmap_av1.util.signals import ending_in_order, handlers_kept, held_back
 
 _ABOUT_NAMES = (
-    "'-' and '_' are alike in option names. COLMAP's spellings are accepted, such as "
+    "'-' and '_' are equivalent in option names. COLMAP's spellings are accepted, such as "
     "--ImageReader.camera_model."
 )
 _INTERRUPTED = 130
@@ -38,11 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: words after the program's name; None: those of this process.
+        arguments: arguments after the program's name; None: those of this process.
 
     Returns:
-        Exit status: 0, 1 where a check or a video of a batch fails, 2 for bad input and output that
-        cannot be written, 130 when interrupted, 141 where nobody reads the output to its end.
+        Exit status: 0; 1 if a check or a video of a batch fails; 2 for bad input or output that
+        cannot be written; 3 if a trainer fails; 130 if interrupted; 141 if the reader of the output
+        closes it early.
 
     Raises:
         SystemExit: a signal ends the process.
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(error)
         return BAD_INPUT
     except StreamError as error:
-        if isinstance(error.__cause__, BrokenPipeError):  # as before `head`, which has read enough
+        if isinstance(error.__cause__, BrokenPipeError):  # the reader, such as `head`, ended
             return _BROKEN_PIPE
         print_error(f"standard output: cannot be written: {_reason(error.__cause__)}")
         return BAD_INPUT
@@ -79,10 +80,11 @@ def _reason(error: BaseException | None) -> str:
 
 
 def _import_libraries(*, with_pycolmap: bool) -> None:
-    """Import NumPy, before pycolmap where that is needed, too.
+    """Import NumPy, and then pycolmap if it is needed.
 
-    NumPy's matrix products get one thread: others would wait for work in a loop. pycolmap installs
-    a handler of its own for SIGTERM, which prints a stack trace of C++ and may hang: it is undone.
+    NumPy's matrix products get one thread, because further threads would wait for work in a busy
+    loop. pycolmap installs a handler for SIGTERM that prints a C++ stack trace and may hang, so the
+    previous handlers are restored.
     """
     given = os.environ.get(BLAS_THREADS)
     with held_back(), handlers_kept():
@@ -90,13 +92,13 @@ def _import_libraries(*, with_pycolmap: bool) -> None:
         import numpy as np  # noqa: F401
 
         if given is None:
-            del os.environ[BLAS_THREADS]  # programs that are started have their own
+            del os.environ[BLAS_THREADS]  # child processes are not limited
         if with_pycolmap:
             import pycolmap  # noqa: F401
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
-    """The words as a namespace; argparse exits by itself, with status 2, on what it refuses."""
+    """Parse the arguments; argparse exits with status 2 on errors."""
     name = words[0] if words and words[0] in COMMANDS else None
     parser, commands = make_parser([name] if name else [])
     if name is None:
@@ -117,7 +119,7 @@ class _Version(argparse.Action):
 
 
 def make_parser(names: Collection[str]) -> tuple[Parser, Mapping[str, Parser]]:
-    """The program's parser, and those of its commands, of which the named ones know arguments."""
+    """The program's parser, and those of its commands; only the named ones get arguments."""
     parser = Parser(
         prog=PROGRAM,
         description="Dense COLMAP matches read from the motion vectors of an AV1 video.",

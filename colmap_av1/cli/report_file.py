@@ -1,4 +1,4 @@
-"""The report of a command, or its error, as a JSON file that other programs read."""
+"""The report of a command, or its error, as a JSON file for other programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from colmap_av1.util.plain import plain
 
 
 def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
-    """Write the report of a command on videos, if it is wanted."""
+    """Write the report of a command on videos, if requested."""
     if namespace.report_json is None:
         return
     from colmap_av1.video.container import read_file
@@ -34,7 +34,7 @@ def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
 
 @contextmanager
 def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
-    """Write why the body failed, if it is wanted."""
+    """Write the reason if the body fails, if requested."""
     try:
         yield
     except Exception as error:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # each is slow to import
+if TYPE_CHECKING:  # these modules are slow to import
     from colmap_av1.batch.run import BatchReport
     from colmap_av1.check.database import CheckReport
     from colmap_av1.check.model import ModelCheck
@@ -24,10 +24,10 @@ if TYPE_CHECKING:  # each is slow to import
 
 Rows = list[tuple[str, str]]
 
-# Rarer reference distances are summed up.
+# Reference distances with a smaller share are printed as one sum.
 _LEAST_LISTED_SHARE = 0.005
 _NUM_LISTED_GAPS = 4
-# Focal lengths that differ by a smaller share are stated as one.
+# Focal lengths with a smaller relative difference are printed as one.
 _SAME_FOCAL_LENGTH = 1e-4
 
 
@@ -38,10 +38,7 @@ def match_rows(report: MatchReport) -> Rows:
     inlier_share = report.num_inliers / max(report.num_matches, 1)
     rows = [
         ("database", str(report.database)),
-        *(
-            ("stream", str(s or "converted and not kept, see --keep_stream"))
-            for s in report.streams
-        ),
+        *(("stream", str(s or "converted, not kept (see --keep_stream)")) for s in report.streams),
         *_conversion_row(report.conversion),
         ("frames", f"{report.num_frames} shown, {report.num_coded_frames} coded"),
         ("images", f"{report.num_images}, {report.num_written_images} written"),
@@ -51,7 +48,7 @@ def match_rows(report: MatchReport) -> Rows:
         ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
         (
             "keypoints",
-            f"{report.num_observations}, {report.num_observations / images:.0f} an image",
+            f"{report.num_observations}, {report.num_observations / images:.0f} per image",
         ),
         ("pairs", f"{report.num_pairs}, {report.num_verified_pairs} verified"),
         ("matches", str(report.num_matches)),
@@ -69,12 +66,11 @@ def match_rows(report: MatchReport) -> Rows:
 
 
 def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
-    """What the joint estimate says that matches agree with."""
-    poses = f"{estimate.num_registered} of {num_images} images with a pose"
+    """The joint estimate of all poses that matches were verified against."""
     return [
-        ("joint estimate", poses),
-        *_moving_row(estimate.moving),
-        *_far_view_rows(estimate.far_views, estimate.far_views_largest),
+        ("joint estimate", f"{estimate.num_registered} of {num_images} images registered"),
+        *_dynamic_row(estimate.moving),
+        *_long_range_rows(estimate.far_views, estimate.far_views_largest),
     ]
 
 
@@ -89,16 +85,16 @@ def map_rows(report: MapReport) -> Rows:
         _focal_length_row(figures.focal_lengths),
     ]
     if report.far_views is not None:
-        rows += _far_view_rows(report.far_views.median, report.far_views.largest)
+        rows += _long_range_rows(report.far_views.median, report.far_views.largest)
     rows += _place_rows(report.place)
     if len(report.num_registered) > 1:
         others = ", ".join(map(str, report.num_registered[1:]))
-        rows.append(("further models", f"of {others} images, beside it"))
+        rows.append(("further models", f"with {others} images"))
     return [*rows, ("model written to", str(report.model))]
 
 
 def _focal_length_row(focal_lengths: tuple[float, float]) -> tuple[str, str]:
-    """The focal length of a model, or the range where its cameras differ."""
+    """The focal length of a model, or the range if its cameras differ."""
     shortest, longest = focal_lengths
     if longest - shortest < _SAME_FOCAL_LENGTH * longest:
         return ("focal length", f"{(shortest + longest) / 2:.2f} px")
@@ -112,14 +108,14 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         *_conversion_row(report.conversion),
         (
             "images",
-            f"{report.num_registered} of {report.num_images} with a pose, {report.num_frames} "
+            f"{report.num_registered} of {report.num_images} registered, {report.num_frames} "
             "frames in the video",
         ),
         *_mask_row(report.masked),
-        *_moving_row(report.moving),
-        *((f"images of {name}", f"{n} with a pose") for name, n in report.registered.items()),
+        *_dynamic_row(report.moving),
+        *((f"images of {name}", f"{n} registered") for name, n in report.registered.items()),
         *(
-            (f"images of {model.output.name}", f"{model.num_registered} with a pose")
+            (f"images of {model.output.name}", f"{model.num_registered} registered")
             for model in report.other_models
         ),
         ("key images", str(report.num_key_images)),
@@ -128,7 +124,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
-        *_far_view_rows(report.far_views, report.far_views_largest),
+        *_long_range_rows(report.far_views, report.far_views_largest),
         _focal_length_row(report.focal_lengths),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
@@ -136,12 +132,12 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         *_gaussians_rows(report.gaussians),
     ]
     if report.resumed:
-        rows.append(("finished before", ", ".join(report.resumed)))
+        rows.append(("resumed stages", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
 
 
 def _shutter_row(read_outs: Sequence[float | None]) -> Rows:
-    """How long the shutter reads; none where nothing was corrected."""
+    """Read-out times of the shutter; no row if nothing was corrected."""
     if all(read_out is None for read_out in read_outs):
         return []
     words = (f"{r:.1f} ms" if r is not None else "none" for r in read_outs)
@@ -149,7 +145,7 @@ def _shutter_row(read_outs: Sequence[float | None]) -> Rows:
 
 
 def _place_rows(place: Place) -> Rows:
-    """Where a model lies in the world, and what said so."""
+    """Coordinate system of a model, and the data that determined it."""
     at = ""
     if (origin := place.origin) is not None:
         at = f" of {origin.latitude:.7f}, {origin.longitude:.7f}, {origin.altitude:.2f} m"
@@ -157,22 +153,23 @@ def _place_rows(place: Place) -> Rows:
     return rows + ([("placed by", "; ".join(place.how))] if place.how else [])
 
 
-def _far_view_rows(median: float | None, largest: float | None) -> Rows:
-    """How far views from far apart in time disagree; none where none see the same."""
+def _long_range_rows(median: float | None, largest: float | None) -> Rows:
+    """Long-range epipolar error; no row if no images far apart in time overlap."""
     if median is None:
         return []
-    return [("far views agree to", f"{median:.2f} px, {largest:.2f} px at 90 %")]
+    words = f"{median:.2f} px (median), {largest:.2f} px (90th percentile)"
+    return [("long-range epipolar error", words)]
 
 
 def model_rows(found: ModelCheck) -> Rows:
-    """Figures of a model, and whether it holds together."""
+    """Figures of a model and of its long-range check."""
     figures, far_views = found.figures, found.far_views
     return [
-        ("images", f"{figures.num_registered} with a pose"),
-        ("points", f"{figures.num_points}, in {figures.mean_track_length:.2f} images on average"),
+        ("images", f"{figures.num_registered} registered"),
+        ("points", f"{figures.num_points}, mean track length {figures.mean_track_length:.2f}"),
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
-        *(_far_view_rows(far_views.median, far_views.largest) if far_views else ()),
+        *(_long_range_rows(far_views.median, far_views.largest) if far_views else ()),
         _focal_length_row(figures.focal_lengths),
     ]
 
@@ -182,15 +179,15 @@ def _conversion_row(conversion: str | None) -> Rows:
 
 
 def _mask_row(masked: float | None) -> Rows:
-    return [] if masked is None else [("masks", f"{masked:.1%} of the images are left out")]
+    return [] if masked is None else [("masks", f"exclude {masked:.1%} of the pixels")]
 
 
-def _moving_row(moving: float | None) -> Rows:
-    return [] if moving is None else [("moving by itself", f"{moving:.1%} of the images")]
+def _dynamic_row(moving: float | None) -> Rows:
+    return [] if moving is None else [("dynamic pixels", f"{moving:.1%}")]
 
 
 def _link_rows(links: LinkReport) -> Rows:
-    """What connects images where motion does not; no row where no pictures were matched."""
+    """SIFT links and gaps; no row if no features were matched."""
     if links.num_images == 0:
         return []
     frames = links.frames_of_gaps()
@@ -198,15 +195,15 @@ def _link_rows(links: LinkReport) -> Rows:
     more = ", ..." if len(frames) > _NUM_LISTED_GAPS else ""
     gaps = f", gaps at frames {shown}{more}" if frames else ""
     pairs = (
-        f"{links.num_links} pairs linked by {links.num_images} pictures, "
-        f"{links.num_revisits} seen again"
+        f"{links.num_links} pairs from {links.num_images} images, "
+        f"{links.num_revisits} loop closures"
     )
-    between = f", {links.num_between} of different videos or photos" if links.num_between else ""
-    return [("links", f"{pairs}{between}{gaps}")]
+    between = f", {links.num_between} between videos or photos" if links.num_between else ""
+    return [("SIFT links", f"{pairs}{between}{gaps}")]
 
 
 def _named(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> str:
-    """The frames of a gap, counted in their own video where there are several."""
+    """The frames of a gap, counted from the start of their video, with its name if several."""
     from colmap_av1.matching.links import gap_in_video
 
     name, before, after = gap_in_video(gap, videos)
@@ -221,10 +218,10 @@ def densify_rows(report: DensifyReport) -> Rows:
         ("images", str(report.num_images)),
         *_mask_row(report.masked),
         ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
-        ("points", f"{report.num_points}, the model had {report.num_model_points}"),
+        ("points", f"{report.num_points}, {report.num_model_points} in the given model"),
         (
             "coverage",
-            f"{report.coverage:.1%} of the images, the model had {report.model_coverage:.1%}",
+            f"{report.coverage:.1%} of the images, {report.model_coverage:.1%} in the given model",
         ),
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *_gaussians_rows(report.gaussians),
@@ -233,33 +230,33 @@ def densify_rows(report: DensifyReport) -> Rows:
 
 
 def batch_rows(report: BatchReport) -> Rows:
-    """What became of the videos of a batch."""
-    kept = f", {report.num_kept} of them before" if report.num_kept else ""
+    """Results and cost of a batch."""
+    kept = f", {report.num_kept} of them in earlier runs" if report.num_kept else ""
     rows = [
         ("output", report.output),
         ("videos", str(report.num_videos)),
         ("done", f"{report.num_done}{kept}"),
         ("failed", ", ".join(f"{n} {reason}" for reason, n in report.failed.items()) or "0"),
-        ("tried again", str(report.num_retried)),
+        ("retried", str(report.num_retried)),
         ("seconds", f"{report.seconds:.2f}"),
         ("CPU seconds", f"{report.cpu_seconds:.2f}"),
     ]
     if report.video_seconds > 0:
         minutes = report.video_seconds / 60
         hours = report.cpu_seconds / 3600 / minutes * 1000
-        rows.append(("cost", f"{hours:.1f} CPU hours for 1,000 minutes of video"))
+        rows.append(("cost", f"{hours:.1f} CPU hours per 1,000 minutes of video"))
     return rows
 
 
 def compare_rows(report: CompareReport) -> Rows:
-    """What `compare` found, a row for each front-end."""
+    """Results of `compare`, a row for each front-end."""
     rows = []
     for column in report.columns:
         words = "no model"
         if column.model is not None:
             words = (
                 f"{column.model.num_registered} of {report.num_images} images, "
-                f"{column.model.num_points} points, {column.model.coverage:.1%} of the images, "
+                f"{column.model.num_points} points, {column.model.coverage:.1%} coverage, "
                 f"{column.model.mean_error:.3f} px, "
                 f"{sum(column.cpu_seconds.values()):.1f} s of CPU time"
             )
@@ -310,17 +307,17 @@ def info_rows(report: StreamReport) -> Rows:
 
 
 def read_out_rows(found: VideoReadOut | str | None) -> Rows:
-    """How long the shutter reads, or why that cannot be told; None: it was not asked for."""
+    """The read-out time of the shutter, or why it is not observable; None: not requested."""
     if found is None:
         return []
     if isinstance(found, str):
-        return [("rolling shutter", f"cannot be told: {found}")]
-    told = f"{found.milliseconds:.1f} +- {found.error:.1f} ms from the first row to the last"
-    return [("rolling shutter", told)]
+        return [("rolling shutter", f"not observable: {found}")]
+    words = f"{found.milliseconds:.1f} +- {found.error:.1f} ms from the first row to the last"
+    return [("rolling shutter", words)]
 
 
 def check_rows(report: CheckReport) -> Rows:
-    """What a database holds, and what the mappers will make of it."""
+    """Contents of a database, and whether the mappers can use it."""
     sizes = [f"{w}x{h} {n}" for (w, h), n in report.image_sizes.items()]
     shapes = [f"{n} with {c} columns" for c, n in report.keypoint_columns.items()]
     share = report.num_matched_keypoints / max(report.num_keypoints, 1)
@@ -333,7 +330,7 @@ def check_rows(report: CheckReport) -> Rows:
         ("cameras", f"{report.num_cameras}, {report.num_priors} with a known focal length"),
         ("keypoints", f"{report.num_keypoints}, {share:.1%} matched"),
         ("keypoint rows", ", ".join(shapes) or "none"),
-        ("descriptors", f"of {report.num_described_images} images"),
+        ("descriptors", f"in {report.num_described_images} images"),
         (
             "pairs",
             f"{report.num_pairs} with inliers, {report.num_used_pairs} used, "
@@ -344,13 +341,13 @@ def check_rows(report: CheckReport) -> Rows:
     ]
     if report.parallax is not None:
         wide = report.parallax
-        how = "" if wide.focal_known else " for a guessed focal length"
+        how = "" if wide.focal_known else " for a default focal length"
         angle = "unknown" if wide.angle is None else f"{wide.angle:.1f} degrees{how}"
         pair = f"widest pair {wide.displacement:.0f} px ({' - '.join(wide.names)})"
         rows.append(("parallax", f"{angle}, {pair}"))
     rows += [(finding.severity, finding.text) for finding in report.findings]
     warned = any(finding.severity == "warning" for finding in report.findings)
-    ready = "usable, but for the warnings" if warned else "good"
+    ready = "usable, see the warnings" if warned else "good"
     rows.append(("for mapping", ready if report.mappable else "not ready"))
     return rows
 
@@ -365,5 +362,5 @@ def _seconds_rows(seconds: dict[str, float]) -> Rows:
 
 
 def without_seconds(rows: Rows) -> Rows:
-    """The rows that describe a result, without the time it took."""
+    """The rows without the times of stages."""
     return [row for row in rows if not row[0].startswith("seconds")]

@@ -23,12 +23,12 @@ PROGRAM = "colmap-av1"
 
 
 class StreamError(Exception):
-    """Standard output takes nothing more, for the reason that is its cause."""
+    """Standard output cannot be written; the cause is the system's error."""
 
 
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Progress]:
-    """Progress bars on standard error where it is a terminal, one for each stage."""
+    """Progress bars on standard error if it is a terminal, one for each stage."""
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
         return
@@ -57,7 +57,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 
 def print_summary(rows: Rows) -> None:
-    """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
+    """Print rows as a table on a terminal, and otherwise as lines of name, tab and value."""
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
@@ -67,13 +67,13 @@ def print_summary(rows: Rows) -> None:
 
     table = Table(show_header=False)
     for name, value in rows:
-        table.add_row(Text(name), Text(value))  # as they are: in brackets is no markup
+        table.add_row(Text(name), Text(value))  # brackets are not markup
     with _writing():
         Console().print(table)
 
 
 def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ()) -> None:
-    """Print the warnings, and a summary unless it is not wanted."""
+    """Print the warnings, and a summary unless --quiet is given."""
     for warning in warnings:
         print_warning(warning)
     if not namespace.quiet:
@@ -84,7 +84,7 @@ def print_next(report: MatchReport) -> None:
     """Print the commands that map what `match` wrote."""
     with_colmap, with_ours, densify = report.next_commands
     if sys.stdout.isatty():
-        # Printed bare, so that they can be copied from any terminal.
+        # Printed without markup, so that they can be copied from any terminal.
         print_text(
             f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}\n"
             f"Then, to train Gaussian splats:\n  {densify}\n"
@@ -99,7 +99,7 @@ def print_text(text: str) -> None:
     """Write to standard output.
 
     Raises:
-        StreamError: it cannot be written, or nobody reads it any more.
+        StreamError: it cannot be written, or its reader has closed it.
     """
     with _writing():
         sys.stdout.write(text)
@@ -116,39 +116,39 @@ def _writing() -> Iterator[None]:
 
 
 def print_note(message: object) -> None:
-    """Print a line of standard error."""
+    """Print a line to standard error."""
     _print_line(f"{PROGRAM}: {message}")
 
 
 def print_warning(message: object) -> None:
-    """Print a warning on a line of standard error."""
+    """Print a warning as a line to standard error."""
     _print_line(f"{PROGRAM}: warning: {message}")
 
 
 def print_error(message: object) -> None:
-    """Print an error on a line of standard error."""
+    """Print an error as a line to standard error."""
     _print_line(f"{PROGRAM}: error: {message}")
 
 
 def _print_line(text: str) -> None:
     try:
-        # Names of files may hold ends of lines.
+        # File names may contain line breaks.
         print(without_secrets(text).replace("\n", "\\n"), file=sys.stderr, flush=True)
-    except OSError:  # there is nowhere left to say so
+    except OSError:  # nowhere left to report it
         _silence(sys.stderr)
 
 
 def _silence(stream: Any) -> None:
-    """Let what a stream holds back go nowhere: Python would fail on it at its end."""
+    """Discard what a stream has buffered, which Python would fail to write at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def allow_any_file_name() -> None:
-    """Let standard output take any file name, those that are no valid text as their bytes."""
+    """Let standard output take any file name; names that are not valid text as their bytes."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        holds_all = sys.stdout.encoding.lower().startswith("utf")
-        sys.stdout.reconfigure(errors="surrogateescape" if holds_all else "backslashreplace")
+        is_unicode = sys.stdout.encoding.lower().startswith("utf")
+        sys.stdout.reconfigure(errors="surrogateescape" if is_unicode else "backslashreplace")
 
 
 @contextmanager

@@ -28,8 +28,8 @@ def listed_of_videos(
         For each video, the sizes by image name relative to the video's folder.
 
     Raises:
-        DatabaseError: the database lists images, but none of a video, not every photo, images of no
-            given video, or an image whose camera is missing.
+        DatabaseError: the database lists images, but none of a video, or not every photo, or images
+            outside the videos' folders, or an image whose camera is missing.
     """
     lone = next((image for image in listed if 0 in {image.width, image.height}), None)
     if lone is not None:

@@ -113,7 +113,7 @@ def write_matches(
     Raises:
         DatabaseError: the file is locked, not a COLMAP database, lists other images, already
             has keypoints or matches of these images although `on_existing` is "error", already has
-            these very keypoints, or cannot be written (no space, no permission). The file is then
+            the same keypoints, or cannot be written (no space, no permission). The file is then
             unchanged.
     """
     path = Path(database)
@@ -232,11 +232,11 @@ def _check_nothing_lost(
     connection: sqlite3.Connection, path: Path, name_of_id: dict[int, str]
 ) -> None:
     """Refuse images that already have keypoints or matches."""
-    way_out = "use a database without them, or on_existing append or replace"
+    remedy = "use a database without them, or on_existing append or replace"
     for (image_id,) in connection.execute("SELECT image_id FROM keypoints WHERE rows > 0"):
         if image_id in name_of_id:
             raise DatabaseError(
-                f"{path} already has keypoints of image {name_of_id[image_id]!r}: {way_out}"
+                f"{path} already has keypoints of image {name_of_id[image_id]!r}: {remedy}"
             )
     for (pair_id,) in connection.execute(
         "SELECT pair_id FROM matches WHERE rows > 0 "
@@ -245,7 +245,7 @@ def _check_nothing_lost(
         for image_id in image_ids_from_pair_id(pair_id):
             if image_id in name_of_id:
                 raise DatabaseError(
-                    f"{path} already has matches of image {name_of_id[image_id]!r}: {way_out}"
+                    f"{path} already has matches of image {name_of_id[image_id]!r}: {remedy}"
                 )
 
 
@@ -287,7 +287,7 @@ def _append_keypoints(
         _append_descriptors(connection, image_id, len(present), len(xy))
     if all_present:
         raise DatabaseError(
-            f"{path} already has these very keypoints, from an earlier run: there is nothing to "
+            f"{path} already has the same keypoints, from an earlier run: there is nothing to "
             "append, or use on_existing replace to write them again"
         )
     return firsts
@@ -385,10 +385,12 @@ def _append_pairs(
             inliers = inliers[:0]
         keeps_models = False
         if pair_id in present:
-            their_matches, their_inliers, their_support = _read_pair(connection, path, pair_id)
-            pair_matches = np.concatenate([their_matches, pair_matches])
-            keeps_models = len(their_inliers) > 0 and their_support >= len(inliers)
-            inliers = np.concatenate([their_inliers, inliers])
+            existing_matches, existing_inliers, existing_support = _read_pair(
+                connection, path, pair_id
+            )
+            pair_matches = np.concatenate([existing_matches, pair_matches])
+            keeps_models = len(existing_inliers) > 0 and existing_support >= len(inliers)
+            inliers = np.concatenate([existing_inliers, inliers])
         connection.execute(
             "INSERT OR REPLACE INTO matches (pair_id, rows, cols, data) VALUES (?, ?, 2, ?)",
             (pair_id, len(pair_matches), pair_matches.astype("<u4").tobytes()),

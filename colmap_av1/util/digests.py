@@ -114,7 +114,7 @@ def code_digest(*folders: str) -> str:
     """
     missing = next((f for f in folders if not (PACKAGE / f).is_dir()), None)
     if missing is not None:
-        raise ValueError(f"{missing}: no folder of {PACKAGE}")
+        raise ValueError(f"{missing}: is not a folder of {PACKAGE}")
     files = {p for folder in folders for p in (PACKAGE / folder).rglob("*") if p.suffix in _CODE}
     digest = hashlib.sha256()
     for path in sorted(files):

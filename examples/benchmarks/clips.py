@@ -30,6 +30,7 @@ SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
 # External tool that compares SIFT matches between images far apart with the poses.
 FAR_VIEWS = SEQUENCES.parent / "tools" / "loop_consistency.py"
+# Smallest number of images between the images of a pair.
 FAR = 10
 # The settings of `colmap-av1 encode --encoder libaom --speed 6`.
 ENCODING = (
@@ -251,7 +252,7 @@ def reference_model(footage: Footage, folder: Path, settings: MapOptions, consol
     where = folder / f"{REFERENCE}-model"
     mapper = measure_mapper(run.database, footage.image_path, where, settings)
     if mapper.model is None:
-        raise ColmapAv1Error(f"{REFERENCE} gives no model, so there is no reference: see {where}")
+        raise ColmapAv1Error(f"{REFERENCE} made no model, so there is no reference: see {where}")
     return read_model(mapper.model)
 
 

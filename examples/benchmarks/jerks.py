@@ -176,7 +176,7 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
     settings = MapOptions(refine_intrinsics=not known, forward_motion=case.forward_motion)
     mapped = measure_mapper(database, footage.image_path, folder / "model", settings)
     if mapped.model is None:
-        raise ColmapAv1Error(f"{name}: SIFT gives no model: see {folder / 'model'}")
+        raise ColmapAv1Error(f"{name}: SIFT made no model: see {folder / 'model'}")
     model = read_model(mapped.model)
     poses = sequence.cam_from_world
     if poses is None:

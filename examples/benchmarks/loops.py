@@ -118,7 +118,7 @@ def rounds() -> tuple[Any, dict[int, int]]:
 
 
 def fronts() -> tuple[Any, dict[int, int]]:
-    """The street of identical fronts, and for each surface its equal in the first front."""
+    """The street of identical fronts, and the index of each surface's copy in the first front."""
     length = 8.0
     surfaces = [ground((-12, 6), (70, 16), 60.0)]
     surfaces += [wall((56, -10), (56, 6), "rubble"), wall((-8, 6), (-8, -10), "ivy")]
@@ -191,7 +191,7 @@ def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[
         database = matched.database
         mapped = measure_mapper(database, footage.image_path, folder / "sift-model")
         if mapped.model is None:
-            raise RuntimeError(f"{clip}: SIFT gives no model: see {folder / 'sift-model'}")
+            raise RuntimeError(f"{clip}: SIFT made no model: see {folder / 'sift-model'}")
         model, cpu = mapped.model, (matched.cpu_seconds or 0.0) + (mapped.cpu_seconds or 0.0)
         facts: dict[str, Any] = {"images": len(footage.names), "revisits": None}
     else:

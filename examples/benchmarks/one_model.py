@@ -5,8 +5,8 @@ python examples/benchmarks/one_model.py --cache benchmark_one_model
 Cases: `cut video`, log_building's frames 60 to 84 and then 0 to 29 and 46 to 59; `two halves`, its
 frames 0 to 42 and 43 to 84 as two videos; `two scenes`, ditch and log_building; `fast drone`, all
 of drone_park; `long walk`, all of kitchen_long, which returns to its start. Camera centres of each
-model are compared with those of SIFT's model of the whole sequence, and loop closures with the tool
-that matches images far apart.
+model are compared with those of SIFT's model of the whole sequence, and the long-range epipolar
+error is measured by an external tool.
 """
 
 from __future__ import annotations

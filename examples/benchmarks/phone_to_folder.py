@@ -1,15 +1,14 @@
-"""Measure the way from the original video to a model, compared with SIFT.
+"""Measure the ways from the original video to a model, compared with SIFT.
 
 python examples/benchmarks/phone_to_folder.py --cache benchmark_phone
 
-For each clip `reconstruct` makes a folder for trainers from the file: conversion, and all that
-follows on the AV1 stream. `match` makes a database from the same file with its defaults, which is
-mapped by the command that `match` prints, which is `colmap mapper` of the COLMAP that is installed,
-and by pycolmap's incremental mapper with the same options. Folder 0 counts: it is what users open,
-whether it is the largest model or not. Then ffmpeg writes the same images of the same file, and
-pycolmap extracts SIFT features, matches them sequentially and maps them, with its defaults.
-Intrinsics are given where they are known. Every step runs in a process of its own. What is measured
-stays in the cache, so a run that was stopped is resumed.
+For each clip, `reconstruct` creates a folder for trainers from the original file; the conversion is
+measured separately. `match` fills a database from the same file with its defaults, which is mapped
+by the printed `colmap mapper` command, with the installed COLMAP, and by pycolmap's incremental
+mapper with the same options. Model 0 is measured even if it is not the largest, because it is the
+one that users open. For comparison, ffmpeg writes the same images, and pycolmap extracts SIFT
+features, matches them sequentially and maps them, with its defaults. Intrinsics are given if known.
+Every step runs in a separate process. Results stay in the cache: an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -104,12 +103,12 @@ class Row:
     far_views_90: float | None = None
 
 
-# Which frames become images, where that is not left to `reconstruct`.
+# Options of images, for clips whose images `reconstruct` does not choose itself.
 IMAGES = {"kitchen": ImageOptions(every=2), "kitchen_long": ImageOptions(num_images=322)}
 
 
 def main() -> int:
-    """Measure both ways on every clip, and save and print the table."""
+    """Measure all ways on every clip, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -122,7 +121,7 @@ def main() -> int:
         help="sequences of ../shared, or phone_10s for a rendered clip of 10 seconds",
     )
     parser.add_argument(
-        "--ours", action="store_true", help="measure this package alone; rows of SIFT stay"
+        "--ours", action="store_true", help="measure only this package, and keep the rows of SIFT"
     )
     parser.add_argument(
         "--without_mapper",
@@ -189,7 +188,7 @@ def measure_ours(clip: Clip, folder: Path) -> tuple[list[Row], list[str]]:
 
 
 def measure_match(clip: Clip, folder: Path) -> list[Row]:
-    """Rows of `match`, of the mappers on its database, and of both together."""
+    """Rows of `match`, of the mappers on its database, and of the totals."""
     database = folder / "database" / "a.db"
     images = database.parent / "images"
     log = folder / "log"
@@ -208,7 +207,7 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
     rows = [matched]
     printed = database.with_name("a_model")
     shutil.rmtree(printed, ignore_errors=True)
-    # `colmap mapper` is run as printed; pycolmap would bring the database to its own layout.
+    # pycolmap gets a copy: it migrates a database to its own layout.
     copy, output = folder / "copy.db", folder / "pycolmap"
     shutil.copyfile(database, copy)
     shutil.rmtree(output, ignore_errors=True)
@@ -426,7 +425,7 @@ def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) ->
 
 
 def undistorted(model: Path, images: Path, folder: Path) -> tuple[Path, Path]:
-    """A model with straight lines and its images, to be measured; none of the time counts."""
+    """An undistorted model and its images, for the long-range check; its time is not counted."""
     shutil.rmtree(folder, ignore_errors=True)
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     pycolmap.undistort_images(folder, model, images)

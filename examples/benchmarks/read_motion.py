@@ -256,7 +256,7 @@ def decode(path: Path, threads: int) -> int:
 
 
 def count(items: Iterator[object]) -> int:
-    """Number of items of an iterator, which are not kept."""
+    """Number of items of an iterator."""
     return sum(1 for _ in items)
 
 

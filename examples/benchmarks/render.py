@@ -1,10 +1,10 @@
-"""Put the tables of `results/*.csv` into the documents that ask for them.
+"""Insert the tables of `results/*.csv` into the documents.
 
 python examples/benchmarks/render.py
 python examples/benchmarks/render.py --check
 
-A document asks by the lines `<!-- table NAME WORDS -->` and `<!-- end of table -->`; what stands
-between them is replaced. `--check` changes nothing and fails where a document is not up to date.
+In a document, the text between `<!-- table NAME WORDS -->` and `<!-- end of table -->` is replaced
+by a table. `--check` changes nothing, and fails if a document is not up to date.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from pathlib import Path
 BENCHMARKS = Path(__file__).resolve().parent
 DOCUMENTS = tuple(BENCHMARKS.parents[1] / name for name in ("README.md", "docs/benchmarks.md"))
 MARKED = re.compile(r"(<!-- table ([^\n]+) -->\n).*?(<!-- end of table -->\n)", re.DOTALL)
-# Distances in frames at which errors of tracks are measured.
+# Numbers of frames between two observations at which errors of tracks are measured.
 SPANS = (1, 2, 4, 8, 16)
 LENGTHS = ("2-3", "4-7", "8-15", "16-31", "32+")
 REFERENCE = "sift-exhaustive"
 
-# Ways whose renderings are compared, the one first that the others are held against.
+# The ways to start training whose renderings are compared; the first is the baseline.
 SPLAT_WAYS = (
     *("SIFT sequential", "reconstruct"),
     *("reconstruct --gaussians", "reconstruct --gaussians, none added"),
@@ -38,28 +38,30 @@ Row = dict[str, str]
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its heading, and its cell made of a row."""
+    """A column: its heading, and a function that returns its cell of a row."""
 
     heading: str
     cell: Callable[[Row], str]
 
 
 def main() -> int:
-    """Bring the documents up to date, or say which are not."""
-    parser = argparse.ArgumentParser(description="Put tables of results into the documents.")
-    parser.add_argument("--check", action="store_true", help="change nothing, fail where needed")
+    """Update the documents, or list those that are not up to date."""
+    parser = argparse.ArgumentParser(description="Insert tables of results into the documents.")
+    parser.add_argument("--check", action="store_true", help="fail instead of changing documents")
     check = parser.parse_args().check
     stale = [path for path in DOCUMENTS if rendered(path.read_text()) != path.read_text()]
     for path in stale:
         if check:
-            print(f"{path}: not up to date: python examples/benchmarks/render.py", file=sys.stderr)
+            print(
+                f"{path}: not up to date: run python examples/benchmarks/render.py", file=sys.stderr
+            )
         else:
             path.write_text(rendered(path.read_text()))
     return 1 if check and stale else 0
 
 
 def rendered(document: str) -> str:
-    """A document with its tables made anew."""
+    """A document with its tables replaced by current ones."""
 
     def fill(found: re.Match[str]) -> str:
         name, *words = found[2].split()
@@ -71,7 +73,7 @@ def rendered(document: str) -> str:
 
 
 def number(row: Row, name: str, spelling: str, unit: str = "") -> str:
-    """A cell of a figure; "-" where it was not measured."""
+    """A cell of a figure; "-" if it was not measured."""
     return f"{float(row[name]):{spelling}}{unit}" if row.get(name) else "-"
 
 
@@ -86,7 +88,7 @@ def words(heading: str, *names: str) -> Column:
 
 
 def as_written(name: str) -> Column:
-    """A column under its name in the file; large whole numbers get separators."""
+    """A column with the heading of the file; large integers get separators."""
 
     def cell(row: Row) -> str:
         value = row[name]
@@ -96,14 +98,14 @@ def as_written(name: str) -> Column:
 
 
 def share_of(row: Row, name: str, base: Row | None, spelling: str) -> str:
-    """A figure's ratio to that of another row, behind a comma; nothing where there is none."""
+    """A figure's ratio to that of another row, after a comma; empty if either is missing."""
     if not row.get(name) or base is None or not base.get(name):
         return ""
     return f", {float(row[name]) / float(base[name]):{spelling}}"
 
 
 def markdown(columns: Sequence[Column], rows: Iterable[Row], left: int = 1) -> str:
-    """A Markdown table, all but the first columns aligned to the right."""
+    """A Markdown table; columns after the first `left` are aligned to the right."""
     lines = [[column.heading for column in columns]]
     lines.append(["---"] * left + ["---:"] * (len(columns) - left))
     lines += [[column.cell(row) for column in columns] for row in rows]
@@ -111,7 +113,7 @@ def markdown(columns: Sequence[Column], rows: Iterable[Row], left: int = 1) -> s
 
 
 def measured_at(rows: Sequence[Row], name: str = "") -> str:
-    """Where the rows were measured, a line; with the rows' names where that differs."""
+    """A line with the commit and machine of the rows, by the rows' names if they differ."""
     places: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         places.setdefault((row["commit"], row["machine"]), []).append(row.get(name, ""))
@@ -137,7 +139,7 @@ def tracks(rows: list[Row], sequence: str) -> str:
 
 
 def by_span(row: Row, name: str) -> str:
-    """Pixels by frames between two observations, in one cell."""
+    """Errors in pixels at all spans, in one cell."""
     cells = [number(row, f"{name}_{span}", ".2f") for span in SPANS]
     return "-" if set(cells) == {"-"} else " / ".join(cells)
 
@@ -148,10 +150,10 @@ def track_columns(rows: Sequence[Row]) -> list[Column]:
     columns = [
         words("tracks", "frontend"),
         figure("tracks", "tracks", ",.0f"),
-        *(figure(f"of {length}", f"tracks_{length}", ",.0f") for length in LENGTHS),
-        figure("keypoints an image", "keypoints_per_image", ",.0f"),
+        *(figure(f"length {length}", f"tracks_{length}", ",.0f") for length in LENGTHS),
+        figure("keypoints per image", "keypoints_per_image", ",.0f"),
         Column(
-            "covered (least)",
+            "coverage (minimum)",
             lambda row: f"{number(row, 'covered', '.0%')} ({number(row, 'least_covered', '.0%')})",
         ),
         Column(f"epipolar px at {spans} frames", lambda row: by_span(row, "epipolar_px")),
@@ -164,7 +166,7 @@ def track_columns(rows: Sequence[Row]) -> list[Column]:
 
 
 def model_columns(rows: Sequence[Row]) -> list[Column]:
-    """The columns that describe models and their cost, compared with the reference's."""
+    """The columns that describe models and their cost, compared with those of the reference."""
     base = next((row for row in rows if row["frontend"] == REFERENCE), None)
 
     def took(row: Row, name: str) -> str:
@@ -219,9 +221,9 @@ def dense_points(rows: list[Row]) -> str:
     columns = [
         words("sequence, tracks", "sequence", "tracks"),
         Column("points", points),
-        figure("observations each", "observations_per_point", ".1f"),
+        figure("observations per point", "observations_per_point", ".1f"),
         figure("error px", "error_px", ".3f"),
-        figure("depth off by, median", "depth_error", ".2%"),
+        figure("depth error, median", "depth_error", ".2%"),
         figure("> 5 %", "above_5_percent", ".1%"),
         figure("> 10 %", "above_10_percent", ".1%"),
         figure("checked", "checked", ",.0f"),
@@ -230,9 +232,9 @@ def dense_points(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
 
 
-# Error of camera centres, in per cent of their extent, up to which a model is straight.
+# Largest error of camera centres, in per cent of their extent, of a model that is not bent.
 STRAIGHT = 0.5
-# The steps of `end_to_end.py`, and the one that each is compared with.
+# The steps of `end_to_end.py`, and the step of SIFT that each is compared with.
 SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
 SIFT_MODEL = "SIFT sequential: model"
 COMPARED_WITH = {
@@ -243,13 +245,13 @@ COMPARED_WITH = {
 }
 
 
-# Ways of `phone_to_folder.py`: as a whole, from the stream, and what both are compared with.
+# Ways of `phone_to_folder.py`: from the file, from the AV1 stream, and SIFT for comparison.
 FROM_FILE, FROM_STREAM, SIFT_FROM_FILE = "reconstruct", "reconstruct from AV1", "SIFT sequential"
 MATCH_PYCOLMAP, MATCH_COLMAP = "match, pycolmap", "match, COLMAP"
 
 
 def phone_to_folder(rows: list[Row]) -> str:
-    """Every way from a file to a model, as a whole; SIFT's is less than that if not mapped."""
+    """Cost and models of all ways; the cost of SIFT excludes mapping if it was not mapped."""
     by_way = {(row["clip"], row["way"]): row for row in rows}
     ways = {
         SIFT_FROM_FILE: "SIFT, pycolmap",
@@ -313,9 +315,9 @@ def phone_to_folder(rows: list[Row]) -> str:
 
 
 def summary(rows: list[Row], *clips: str) -> str:
-    """The clips in a row each: COLMAP's mapper and `reconstruct`, with SIFT's figures in brackets.
+    """A row for each clip: `match` and `reconstruct`, with SIFT's figures in parentheses.
 
-    Errors of camera centres are those against true poses.
+    Errors of camera centres are relative to true poses.
     """
     whole = {(row["clip"], row["way"]): row for row in rows}
 
@@ -358,13 +360,13 @@ def phone_to_folder_steps(rows: list[Row]) -> str:
 
 
 _WHOLE = (FROM_FILE, SIFT_FROM_FILE, MATCH_PYCOLMAP, MATCH_COLMAP)
-# What the ways that are stages of `reconstruct` begin with.
+# Prefix of ways that are stages of `reconstruct`.
 STAGE = "stage: "
-_NOTABLE = 0.05  # CPU seconds of a stage
+_NOTABLE = 0.05  # Smallest CPU time in seconds of a stage in the table.
 
 
 def phone_to_folder_stages(rows: list[Row]) -> str:
-    """CPU seconds of every stage of `reconstruct`, but for those that take next to nothing."""
+    """CPU seconds of every stage of `reconstruct` that takes a notable time."""
     staged = [row for row in rows if row["way"].startswith(STAGE)]
     clips = list(dict.fromkeys(row["clip"] for row in staged))
     by_way = {(row["clip"], row["way"]): row for row in rows}
@@ -382,10 +384,10 @@ def phone_to_folder_stages(rows: list[Row]) -> str:
 
 
 def end_to_end(rows: list[Row]) -> str:
-    """All steps from a video to a model, as factors of SIFT's."""
+    """All steps from a video to a model, with ratios to those of SIFT."""
     by_way = {(row["sequence"], row["way"]): row for row in rows}
 
-    def beside(heading: str, name: str, spelling: str) -> Column:
+    def with_ratio(heading: str, name: str, spelling: str) -> Column:
         def cell(row: Row) -> str:
             base = by_way.get((row["sequence"], COMPARED_WITH.get(row["way"], "")))
             times = share_of(row, name, base, ".2f").lstrip(", ")
@@ -395,12 +397,12 @@ def end_to_end(rows: list[Row]) -> str:
 
     columns = [
         words("sequence, way", "sequence", "way"),
-        beside("images", "images", ".0f"),
-        beside("points", "points", ",.0f"),
-        beside("error px", "error_px", ".3f"),
-        beside("ATE", "ate", ".4f"),
-        beside("seconds", "seconds", ".1f"),
-        beside("CPU seconds", "cpu_s", ".1f"),
+        with_ratio("images", "images", ".0f"),
+        with_ratio("points", "points", ",.0f"),
+        with_ratio("error px", "error_px", ".3f"),
+        with_ratio("ATE", "ate", ".4f"),
+        with_ratio("seconds", "seconds", ".1f"),
+        with_ratio("CPU seconds", "cpu_s", ".1f"),
         figure("peak memory", "peak_memory_mb", ".0f", " MB"),
     ]
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
@@ -450,7 +452,7 @@ def jerks(rows: list[Row]) -> str:
 
 
 def read_motion(rows: list[Row], threads: str) -> str:
-    """Times of reading motion and of decoding: CPU time of one thread, real time of more."""
+    """Times of reading motion and of decoding: CPU time of one thread, wall time of more."""
     rows = [row for row in rows if row["threads"] == threads]
     gain = [figure("gain", "gain", ".2f")] if threads != "1" else []
     parse = [figure("parse", "parse_ms", ".3f")] if threads == "1" else []
@@ -505,7 +507,7 @@ def verification(rows: list[Row]) -> str:
 
 
 def encoders(rows: list[Row]) -> str:
-    """What conversions cost, and the models made of them."""
+    """Cost of conversions, and the models made from the streams."""
 
     def pair(heading: str, first: str, second: str, spelling: str) -> Column:
         def cell(row: Row) -> str:
@@ -518,7 +520,7 @@ def encoders(rows: list[Row]) -> str:
         Column("encoder, speed", lambda row: f"{row['encoder']} {row['speed']}"),
         words("quality", "quality"),
         figure("CPU s", "cpu_per_megapixel", ".2f"),
-        figure("kB a frame", "kb_per_frame", ".1f"),
+        figure("kB per frame", "kb_per_frame", ".1f"),
         figure("tracks", "tracks_of_4", ",.0f"),
         pair("epipolar px at 1 / 8 frames", "epipolar_1", "epipolar_8", ".2f"),
         Column("registered", lambda row: f"{row['registered']} of {row['images']}"),
@@ -531,7 +533,7 @@ def encoders(rows: list[Row]) -> str:
 
 
 def rolling_shutter(rows: list[Row]) -> str:
-    """Models of rolling shutters, with and without the estimated read-out time."""
+    """Models of clips with a rolling shutter, with and without the estimated read-out time."""
 
     def both(heading: str, name: str, spelling: str) -> Column:
         def cell(row: Row) -> str:
@@ -598,7 +600,7 @@ def mean(rows: list[Row], name: str) -> float:
 
 
 def loops(rows: list[Row]) -> str:
-    """Models of clips that see places again, or that only seem to."""
+    """Models of a clip with loops, and of a clip that repeats itself without loops."""
     columns = [
         words("clip, way", "clip", "way"),
         words("images", "images"),
@@ -626,7 +628,7 @@ def walks(rows: list[Row]) -> str:
 
 
 def one_model(rows: list[Row]) -> str:
-    """Models of what is cut, in several videos, fast, or seen again."""
+    """Models of cut, several, fast and long videos."""
 
     def links_share(row: Row) -> str:
         return f"{float(row['links_cpu_s']) / float(row['cpu_s']):.0%}"
@@ -649,10 +651,10 @@ def one_model(rows: list[Row]) -> str:
 
 
 def splats(rows: list[Row]) -> str:
-    """Renderings of Gaussians trained from all ways' folders, means of the seeds.
+    """Renderings of Gaussians trained in all ways, means over the seeds.
 
-    Shares are of the CPU time that SIFT's training takes to its end, until its last figure is
-    reached: between two measurements along the line that joins them.
+    A share is the CPU time until the final quality of SIFT's training is reached, interpolated
+    linearly between milestones, divided by the CPU time of that training.
     """
     lines: list[Row] = []
     for clip in dict.fromkeys(row["clip"] for row in rows):
@@ -682,7 +684,7 @@ def splats(rows: list[Row]) -> str:
 
 
 def _curves(rows: list[Row]) -> list[Row]:
-    """Means of the seeds at each number of iterations, in order."""
+    """Means over the seeds at each number of iterations, in order."""
     counts = sorted({int(row["iterations"]) for row in rows})
     means: list[Row] = []
     for count in counts:
@@ -693,7 +695,7 @@ def _curves(rows: list[Row]) -> list[Row]:
 
 
 def _share_of_time(own: list[Row], base: list[Row], name: str) -> str:
-    """CPU time until the last figure of `base` is reached, as a share of its own."""
+    """CPU time until the final quality of `base` is reached, as a share of its CPU time."""
     if not base or own[0]["way"] == base[0]["way"]:
         return "-"
     aim, spent = float(base[-1][name]), float(base[-1]["cpu_s"])
@@ -710,7 +712,7 @@ def _share_of_time(own: list[Row], base: list[Row], name: str) -> str:
 
 
 def plain(rows: list[Row]) -> str:
-    """A table whose columns are those of the file, in its words."""
+    """A table with the columns of the file, under their names there."""
     names = [name for name in rows[0] if name not in ("commit", "machine")]
     columns = [as_written(name) for name in names]
     return f"{markdown(columns, rows)}\n{measured_at(rows, names[0])}"

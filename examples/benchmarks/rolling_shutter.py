@@ -81,7 +81,7 @@ def make_clip(path: Path, clip: str, read_out: float) -> None:
 
 
 def measure(video: Path, output: Path, clip: str, how: str) -> dict[str, Any]:
-    """Reconstruct a clip: estimated read-out time, reprojection error, centre error, CPU time."""
+    """Reconstruct a clip, and measure read-out time, reprojection and centre errors, CPU time."""
     words = ["--video", str(video), "--output", str(output), "--every", "2", "--points", "survey"]
     words += ["--camera_model", "SIMPLE_PINHOLE"]
     words += [f"--camera_params={FOCAL},{WIDTH / 2},{HEIGHT / 2}", "--rolling_shutter", how]

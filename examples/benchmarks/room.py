@@ -57,10 +57,10 @@ def render(
     Args:
         rays: rays from `rays_of`.
         cam_from_world: float64 [height, 3, 4] pose of each row.
-        textures: as `make_textures` gives them, for the faces across x, y and z of the room and
-            then of each box; they begin again if there are fewer.
-        walls: float64 [2, 3] least and largest corner of the room.
-        boxes: float64 [n, 2, 3] those of what stands in it.
+        textures: textures from `make_textures`: for the faces perpendicular to x, y and z, of the
+            room and then of each box; repeated if there are fewer.
+        walls: float64 [2, 3] smallest and largest corner of the room.
+        boxes: float64 [n, 2, 3] smallest and largest corners of the boxes in it.
     """
     rotation = cam_from_world[:, :, :3]
     origin = -np.einsum("nij,ni->nj", rotation, cam_from_world[:, :, 3])
@@ -111,7 +111,7 @@ def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
 
 
 def _leave(start: Any, step: Any, walls: Floats) -> tuple[Any, Any]:
-    """Where rays meet the room's walls from inside: distance along them, and the axis."""
+    """Intersections of rays with the room's walls, from inside: ray parameter and axis."""
     low, high = walls.astype(np.float32)
     far = np.maximum((low - start) * step, (high - start) * step)
     axis = far.argmin(axis=-1)

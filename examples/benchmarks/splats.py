@@ -103,7 +103,7 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     def map_sift() -> dict[str, Any]:
         _, found, pictures = phone_to_folder.sift_of(clip, folder / "sift", names)
         if found is None:
-            raise SystemExit(f"{clip.name}: SIFT gave no model")
+            raise SystemExit(f"{clip.name}: SIFT made no model")
         shutil.copytree(found, undistorted / "distorted")
         images.mkdir()
         undistort_images(found, pictures, images)
@@ -133,7 +133,7 @@ def undistort_images(model: Path, images: Path, output: Path) -> None:
 
 
 def undistort_model(model: Path, output: Path) -> None:
-    """Write a model with a single camera with its undistorted camera."""
+    """Write the undistorted version of a model with a single camera."""
     reconstruction = read_model(model)
     (camera,) = reconstruction.cameras.values()
     pinhole = pinhole_camera(camera)
@@ -148,7 +148,7 @@ def undistort_model(model: Path, output: Path) -> None:
 def train(
     images: Path, model: Path, folder: Path, seed: int, way: str
 ) -> Iterator[dict[str, Value]]:
-    """Train from a model's points, or from Gaussians of these; returns rows of the milestones."""
+    """Train from a model's points, or from Gaussians made from them; yields a row per milestone."""
     cloud, output = folder / "cloud.npz", folder / f"seed_{seed}"
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)

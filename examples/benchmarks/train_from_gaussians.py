@@ -42,7 +42,7 @@ def read_gaussians(path: Path) -> dict[str, _Floats]:
 
 
 def main() -> None:
-    """Train."""
+    """Run the trainer with the given Gaussians."""
     given, trainer = Path(sys.argv[1]), Path(sys.argv[2])
     sys.path.insert(0, str(trainer))
     train: Any = importlib.import_module("gs_train")

@@ -1,12 +1,12 @@
-"""Measure models of walks with fast turns: whole, in straight parts, or bent.
+"""Measure models of walks with fast turns: one model, several accurate models, or a bent model.
 
 python examples/benchmarks/walks.py --cache benchmark_walks
 
-Renders walks through three furnished rooms with plain walls, 320x240 at 25 frames a
-second. The camera turns by 8 to 12 degrees a frame at the doors, blurred by half a frame's motion.
-Each walk has its own furniture, turns and speed. The intrinsics are not given. Poses are exact.
-`reconstruct` runs with its defaults. A model is bent if its camera centres are off by more than 2 %
-of their extent.
+The script renders walks through three furnished rooms with plain walls, 320x240 at 25 frames per
+second. At the doors, the camera turns by 8 to 12 degrees per frame, with motion blur of half a
+frame. Each walk has its own furniture, turns and speed. True poses are known, intrinsics are not
+given. `reconstruct` runs with its defaults. A model is bent if its camera centres have an error of
+more than 2 % of their extent.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ WIDTH, HEIGHT, FOCAL, RATE = 320, 240, 240.0, 25
 WALLS = np.array([[-9.0, -3.0, 0.0], [9.0, 3.0, 2.7]])
 DOORS = (-3.0, 3.0)  # x of the walls between the rooms
 BENT = 0.02
-# Pictures that a blurred frame is the mean of.
+# Number of samples over the exposure of a blurred frame.
 NUM_BLURRED = 3
-NUM_FACES = 60  # with a texture of their own; cv2.remap takes pictures of up to 32767 rows
+# Number of different textures. They are stacked, and cv2.remap accepts at most 32767 rows.
+NUM_FACES = 60
 PLAIN = 3.0  # standard deviation of plain walls in grey levels
 
 
@@ -50,10 +51,10 @@ class Row:
 
     Attributes:
         walk: seed of the walk.
-        images: chosen for it.
-        registered: images of each model, the largest first.
+        images: number of chosen images.
+        registered: number of registered images of each model, the largest model first.
         errors: error of the camera centres of each model, as a share of their extent.
-        warnings: what `reconstruct` warned of.
+        warnings: warnings of `reconstruct`.
     """
 
     walk: str
@@ -64,7 +65,7 @@ class Row:
 
 
 def main() -> int:
-    """Reconstruct each walk, and keep and print the table."""
+    """Reconstruct each walk, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -110,12 +111,12 @@ def walk(seed: int) -> Floats:
 
 
 def _path(seed: int) -> tuple[Floats, Floats]:
-    """Where the camera is, float64 [n, 3] in metres, and its yaw, float64 [n] in degrees."""
+    """Camera centres, float64 [n, 3] in metres, and yaw, float64 [n] in degrees."""
     rng = np.random.default_rng(seed)
     speed = rng.uniform(0.03, 0.06)
     yaw, x = [0.0], [rng.uniform(-8.0, -7.0)]
 
-    def go(to: float, moving: float) -> None:
+    def turn(to: float, moving: float) -> None:
         frames = max(1, round(abs(to - yaw[-1]) / rng.uniform(8, 12)))
         start = yaw[-1]
         for k in range(1, frames + 1):
@@ -130,12 +131,12 @@ def _path(seed: int) -> tuple[Floats, Floats]:
     for _ in range(2):
         ahead(int(rng.integers(15, 30)))
         side = float(rng.choice([-90, 90]))
-        go(side, 0.3 * speed)
+        turn(side, 0.3 * speed)
         ahead(int(rng.integers(8, 16)))
         if rng.random() < 0.5:
-            go(-side, 0.3 * speed)
+            turn(-side, 0.3 * speed)
             ahead(int(rng.integers(8, 16)))
-        go(0.0, 0.3 * speed)
+        turn(0.0, 0.3 * speed)
     ahead(20)
     seconds = np.arange(len(x)) / RATE
     sway = [
@@ -153,7 +154,7 @@ def _poses(centre: Floats, yaw: Floats) -> Floats:
 
 
 def furniture(seed: int) -> Floats:
-    """What stands in the rooms, and the walls between them, float64 [n, 2, 3]."""
+    """Boxes of the furniture and of the walls between the rooms, float64 [n, 2, 3]."""
     rng = np.random.default_rng(1000 + seed)
     boxes = []
     for x in DOORS:
@@ -172,7 +173,7 @@ def furniture(seed: int) -> Floats:
 
 
 def textures() -> list[NDArray[np.float32]]:
-    """Textures of the faces, see `room.render`: the room and some furniture are plain."""
+    """Textures of the faces, see `room.render`: the outer walls and some boxes are plain."""
     made = room.make_textures(NUM_FACES)
     plain = [128 + (texture - 128) * np.float32(PLAIN / 38) for texture in made[:3]]
     return [*plain, *made[3:]]
@@ -204,7 +205,7 @@ def pictures(seed: int) -> Iterator[NDArray[np.uint8]]:
 
 
 def make_clip(path: Path, seed: int) -> None:
-    """Render a walk, and encode it as a phone does."""
+    """Render a walk, and encode it as H.264, as phones do."""
     raw = f"-f rawvideo -pix_fmt bgr24 -s {WIDTH}x{HEIGHT} -r {RATE} -i -".split()
     encoder = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"]
     subprocess.run(

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# COLMAP from a shell script; 'match' takes the place of cutting frames, extraction and matching.
+# COLMAP; 'match' replaces extracting frames, feature extraction and matching.
 #
 #   colmap.sh VIDEO WORKSPACE [options of colmap-av1 match]
 #
@@ -18,6 +18,6 @@ mkdir -p "$workspace/sparse"
 colmap-av1 match --database "$workspace/database.db" --video "$video" \
   --image_path "$workspace/images" "$@"
 
-# From here on nothing changes.
+# The rest is unchanged.
 colmap mapper --database_path "$workspace/database.db" --image_path "$workspace/images" \
   --output_path "$workspace/sparse"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# COLMAP alone makes the dense points, too: it triangulates all tracks on the mapper's poses.
+# COLMAP with dense points: its triangulator triangulates all tracks on the mapper's poses.
 #
 #   colmap_dense.sh VIDEO WORKSPACE [options of colmap-av1 match]
 #
@@ -11,7 +11,7 @@ video=$1
 workspace=$2
 shift 2
 
-# The tracks for the poses, and all of them in a second database of the same images.
+# Few tracks for the poses, and all tracks in a second database of the same images.
 mkdir -p "$workspace/sparse" "$workspace/poses" "$workspace/dense"
 colmap-av1 match --database "$workspace/database.db" --video "$video" \
   --image_path "$workspace/images" --keep_stream "$workspace/stream.mp4" "$@"
@@ -21,8 +21,8 @@ colmap-av1 match --database "$workspace/dense.db" --video "$video" \
 colmap mapper --database_path "$workspace/database.db" --image_path "$workspace/images" \
   --output_path "$workspace/sparse"
 
-# The poses without points: the triangulator refuses keypoints that are not its database's. The
-# mapper may leave smaller models before the real one.
+# Keep the poses of the largest model, which need not be model 0. Remove its points, because the
+# triangulator refuses keypoints that are not in its database.
 best=$(dirname "$(ls -S "$workspace/sparse"/*/images.bin | head -n 1)")
 colmap model_converter --input_path "$best" --output_path "$workspace/poses" --output_type TXT
 awk '!/^#/ { print ++n % 2 ? $0 : "" }' "$workspace/poses/images.txt" >"$workspace/poses/posed.txt"

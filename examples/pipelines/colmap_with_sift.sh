@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# COLMAP from a shell script that keeps its SIFT features; 'match' adds the motion to them.
+# COLMAP with SIFT features; 'match' appends keypoints and matches from motion.
 #
 #   colmap_with_sift.sh VIDEO WORKSPACE [options of colmap-av1 match]
 #
-# Before: the same without the line of colmap-av1. SIFT connects images that look alike far
-# apart in time, which motion does not; motion gives many more points. Without a GPU:
+# Before: the same without the line of colmap-av1. SIFT connects overlapping images far apart in
+# time, which motion does not; motion gives many more points. Without a GPU:
 #   export EXTRACTOR_OPTIONS='--SiftExtraction.use_gpu 0' MATCHER_OPTIONS='--SiftMatching.use_gpu 0'
 set -euo pipefail
 

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# The folder that graphdeco's 3D Gaussian Splatting trains on; its convert.py only undistorts.
+# A folder for graphdeco's 3D Gaussian Splatting; its convert.py only undistorts.
 #
 #   CONVERT=gaussian-splatting/convert.py gaussian_splatting.sh VIDEO SOURCE [options of match]
 #
-# Before, with the frames cut into SOURCE/input:
+# Before, with the frames in SOURCE/input:
 #   python convert.py -s SOURCE
 set -euo pipefail
 
@@ -17,12 +17,11 @@ colmap-av1 match --database "$source/distorted/database.db" --video "$video" \
   --keep_stream "$source/distorted/stream.mp4" \
   ${MASK_PATH:+--mask_path "$MASK_PATH"} "$@"
 
-# As convert.py calls it.
+# The options are those of convert.py.
 colmap mapper --database_path "$source/distorted/database.db" --image_path "$source/input" \
   --output_path "$source/distorted/sparse" --Mapper.ba_global_function_tolerance=0.000001
 
-# The points that training starts from are many more than the mapper's, on its poses. convert.py
-# takes model 0; the mapper may leave smaller ones before the real one.
+# Densify the largest model, which need not be model 0, and write it as model 0 for convert.py.
 best=$(ls -S "$source/distorted/sparse"/*/images.bin | head -n 1) || exit 1
 mv "$source/distorted/sparse" "$source/distorted/mapped"
 best=${best/#"$source/distorted/sparse"/"$source/distorted/mapped"}

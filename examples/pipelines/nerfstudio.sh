@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The folder that nerfstudio trains on; its ns-process-data does all but the matching.
+# A folder for nerfstudio; ns-process-data writes it without matching.
 #
 #   nerfstudio.sh VIDEO DATA [options of colmap-av1 match]
 #
@@ -19,14 +19,13 @@ colmap-av1 match --database "$data/colmap/database.db" --video "$video" \
 colmap mapper --database_path "$data/colmap/database.db" --image_path "$data/frames" \
   --output_path "$data/colmap/sparse" --Mapper.ba_global_function_tolerance=1e-6
 
-# The mapper may leave smaller models before the real one.
+# Use the largest model, which need not be model 0.
 best=$(ls -S "$data/colmap/sparse"/*/images.bin | head -n 1) || exit 1
 best=$(dirname "$best")
 colmap bundle_adjuster --input_path "$best" --output_path "$best" \
   --BundleAdjustment.refine_principal_point 1
 
-# The points that training starts from are many more than the mapper's, on its poses.
-# ns-process-data takes model 0.
+# Densify this model, and write it as model 0 for ns-process-data.
 mv "$data/colmap/sparse" "$data/colmap/mapped"
 best=${best/#"$data/colmap/sparse"/"$data/colmap/mapped"}
 mkdir "$data/colmap/sparse"

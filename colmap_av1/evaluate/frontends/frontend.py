@@ -112,8 +112,8 @@ def list_images(footage: Footage, database: Path) -> None:
     reader.camera_model = camera_model(footage)
     reader.camera_params = footage.camera.camera_params or ""
     pycolmap.Database.open(database).close()
-    # Imported first, for deterministic ids: the extraction inserts images in the order in which
-    # its threads finish.
+    # Import first, so that ids are deterministic: the extraction inserts images in the order in
+    # which its threads finish.
     mode = pycolmap.CameraMode.SINGLE
     pycolmap.import_images(
         database, footage.image_path, mode, image_names=footage.names, options=reader

@@ -287,8 +287,8 @@ def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
 
     Args:
         cloud: the cloud.
-        like: the cloud, in the same coordinates, whose cameras and extent say what is up and
-            what is shown.
+        like: a cloud in the same coordinates, whose cameras and extent determine the up direction
+            and the frame.
         size: (width, height) of the picture.
     """
     poses = like.cam_from_world[np.isfinite(like.cam_from_world).all((1, 2))]
@@ -317,7 +317,7 @@ def _splat(
     cloud: Cloud,
     shown: NDArray[np.bool_],
 ) -> None:
-    """Draw points as squares, near ones over far ones; those of assumed depth under the others."""
+    """Draw points as squares, near over far; those of assumed depth under all others."""
     height, width = picture.shape[:2]
     side = _OVERSAMPLING + 2
     shown = shown & (pixel >= 0).all(1) & (pixel < (width - side, height - side)).all(1)

@@ -80,9 +80,9 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     tables["lengths"] = lengths_table(report.columns)
     if any(column.training is not None for column in report.columns):
         tables["renderings"] = renderings_table(report.columns)
-    on_the_way = milestones_table(report.columns)
-    if on_the_way is not None:
-        tables["milestones"] = on_the_way
+    milestones = milestones_table(report.columns)
+    if milestones is not None:
+        tables["milestones"] = milestones
     _write(report.output / "report.html", _html(report, tables, figures).encode("utf-8", "replace"))
     _write(report.output / "results.json", _json(report).encode())
 

@@ -250,7 +250,7 @@ def main() -> int:
     """Train on the scene given by the command line."""
     if not torch.cuda.is_available():
         print(
-            "3D Gaussians are trained on an NVIDIA GPU with CUDA, and there is none",
+            "training 3D Gaussians needs an NVIDIA GPU with CUDA, which is missing",
             file=sys.stderr,
         )
         return _NOT_HERE

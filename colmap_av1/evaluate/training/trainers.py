@@ -96,7 +96,7 @@ def check_trainer(trainer: str) -> None:
     program = words_of_trainer(trainer)[0]
     if "{" not in program and shutil.which(program) is None:
         raise EvaluationError(
-            f"trainer '{trainer}': there is no program {program}: install it, or give its path"
+            f"trainer '{trainer}': program {program} not found: install it, or give its path"
         )
 
 
@@ -217,7 +217,7 @@ def _command(
     iterations: int,
     milestones: Sequence[int],
 ) -> list[str]:
-    """The words of a trainer's command, with its values in place; writes initial Gaussians."""
+    """A trainer's command with its placeholders filled in; writes initial Gaussians if needed."""
     gaussians = folder / "init.ply"
     if "{gaussians}" in trainer:
         write_model_gaussians(gaussians, split.train / "sparse" / "0")
