@@ -52,16 +52,16 @@ _REPORT = "report.json"
 
 @dataclass(frozen=True)
 class VideoTimeline:
-    """The images of a video along its frames.
+    """The images of a video in the order of its frames.
 
     Attributes:
-        name: the folder of its images; '' of a lone video.
-        num_frames: its shown frames.
-        frame_rate: frames per second; None where unknown.
+        name: the folder of its images; '' for a single video.
+        num_frames: number of shown frames.
+        frame_rate: frames per second; None if unknown.
         images: names of its images, in the order of their frames.
-        frames: the frame of each image, counted in the video from 0.
-        key_images: names of those that were mapped.
-        not_registered: names of those that have a pose in no model.
+        frames: frame number of each image in the video, from 0.
+        key_images: names of its key images, whose poses the mapper estimates.
+        not_registered: names of its images that are not registered in any model.
     """
 
     name: str
@@ -75,45 +75,45 @@ class VideoTimeline:
 
 @dataclass(frozen=True)
 class ReconstructReport:
-    """What `reconstruct` made.
+    """Result of `reconstruct`.
 
     Attributes:
-        output: the folder with `images/` and `sparse/0/`, as trainers open it.
+        output: the folder with `images/` and `sparse/0/`, which trainers open.
         videos: the videos.
-        conversion: how the videos were converted, in words; None where they are AV1.
-        database: COLMAP database of the tracks that the poses come from.
-        num_frames: shown frames of the videos.
-        num_images: frames chosen as images, and photos.
-        masked: share of the images' pixels that masks leave out; None without masks.
-        moving: share of the images' pixels that move by themselves and have no points; None where
-            that was not looked for.
-        num_key_images: those of them that were mapped; the others are placed between them.
-        num_registered: images with a pose; only these are written.
-        registered: those of each of several videos, by its name.
-        other_models: models of images that nothing connects with those of this one, each in a
-            folder `model_1`, ... of the output.
-        num_tracks: tracks of the videos.
-        num_pose_tracks: tracks that the poses come from.
-        num_points: 3D points.
-        num_observations: observations of all points.
-        coverage: share of the images' cells of 16x16 pixels that visible points project into.
-        mean_error: mean reprojection error of the points in pixels.
-        far_views: median distance in pixels of what the pictures of images ten and more apart show
-            in common from where the poses put it; None where no such images see the same.
-        far_views_largest: the 90 % quantile of it over such pairs of images.
-        read_outs: of each video, the time in milliseconds in which the shutter reads the rows of a
-            picture, where tracks were corrected for it; None: they were not.
-        place: where the model lies in the world: units, axes, origin and what said so, as in
-            `place.json`.
-        focal_lengths: the shortest and the longest of the output's cameras, in pixels.
-        mapper: which of COLMAP's mappers found the poses.
-        forward_motion: the camera moves along its axis, see `MatchReport`.
-        links: what connects images where motion does not, see `LinkReport`.
-        gaussians: file of initial Gaussians, where one was wanted.
-        resumed: stages that an earlier run had finished.
+        conversion: how the videos were converted, in words; None if all are AV1.
+        database: COLMAP database of the key images.
+        num_frames: number of shown frames of the videos.
+        num_images: number of frames chosen as images, plus photos.
+        masked: share of the images' pixels that masks exclude; None without masks.
+        moving: share of the images' pixels on dynamic objects, which get no points; None if these
+            were not looked for.
+        num_key_images: number of key images. COLMAP's mapper estimates their poses; the others are
+            registered by resection.
+        num_registered: number of registered images. Only these are written.
+        registered: number of registered images of each video, by name, if there are several.
+        other_models: further models of images that are not connected to the first model, in the
+            folders `model_1`, ... of the output.
+        num_tracks: number of tracks of the videos.
+        num_pose_tracks: number of tracks that the poses were estimated from.
+        num_points: number of 3D points.
+        num_observations: number of observations of all points.
+        coverage: share of the images' cells of 16x16 pixels that contain projected points.
+        mean_error: mean reprojection error in pixels.
+        far_views: long-range epipolar error in pixels: its median over pairs of images at least ten
+            images apart that see the same place; None if there are no such pairs.
+        far_views_largest: 90th percentile of the long-range epipolar error.
+        read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
+            to the last; None if the tracks were not corrected for it.
+        place: where the model lies in the world, as in `place.json`.
+        focal_lengths: the shortest and the longest focal length of the output's cameras, in pixels.
+        mapper: the mapper of COLMAP that estimated the poses.
+        forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
+        links: SIFT links between images that motion does not connect.
+        gaussians: file of initial Gaussians, if requested.
+        resumed: stages that an earlier run finished.
         seconds: wall time of each stage of this run.
-        cpu_seconds: processor time of each, of all threads and processes.
-        warnings: what the user should know.
+        cpu_seconds: CPU time of each stage, including all threads and processes.
+        warnings: warnings for the user.
         timelines: the images of each video.
     """
 
@@ -164,33 +164,34 @@ def reconstruct(
 ) -> ReconstructReport:
     """Make a dense model of videos, in a folder that trainers of Gaussian splats open.
 
-    The poses come from COLMAP's mapper on a spread selection of long, accurate tracks; then every
-    track is triangulated on them. The folder gets `images/` and `sparse/0/*.bin` with one PINHOLE
-    camera, or one for each image of a zoom, undistorted and of the video's size, or with
-    `undistort` off the original pictures and the estimated camera; beside them `database.db` and
-    `report.json`. A run that was stopped is resumed after its last finished stage; a changed option
-    redoes what depends on it, and what is damaged or gone is made again.
+    COLMAP's mapper and bundle adjustment estimate the poses from long, accurate tracks; then all
+    tracks are triangulated. The folder gets `images/` and `sparse/0/*.bin`: undistorted pictures
+    of the video's size and one PINHOLE camera, or one per image if the video zooms. With
+    `undistort` off it gets the original pictures and the estimated camera. It also gets
+    `database.db` and `report.json`. An interrupted run resumes after its last finished stage.
+    After a change of options, or if files are missing or damaged, the affected stages run again.
 
-    Several videos have a camera each, and their images a folder each in `images/`, named like the
-    video; what their pictures show in common connects them, and photos with them.
+    With several videos, the images of each are in a folder of `images/` named after it and have
+    their own camera. SIFT links connect the videos and the photos.
 
     Args:
-        video: a video, or several; one that is not AV1 is converted first, to a stream that a
-            resumed run uses again, in the folder or where `options.match.keep_stream` says.
-        output: the folder; new, empty, or that of an earlier run.
-        photos: folder of photos of the same scene; None: there are none.
-        gaussians: file, .ply, for initial Gaussians of the points.
-        overwrite: replace a file of Gaussians that exists.
-        options: options of every stage.
-        progress: called with a stage's name, what is done, and of how much where known.
+        video: a video or several. A video that is not AV1 is converted first, to a stream in the
+            folder or at `options.match.keep_stream`, which a resumed run uses again.
+        output: the folder; new, empty, or from an earlier run.
+        photos: folder of photos of the same scene. None: no photos.
+        gaussians: file (.ply) for initial Gaussians of the points.
+        overwrite: replace an existing file of Gaussians.
+        options: options of all stages.
+        progress: called with a stage's name, the amount of work done, and the total if known.
 
     Raises:
-        VideoError: the video cannot be read, or has no motion to match.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
+        VideoError: a video cannot be read, or has no motion to match.
+        BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
+            second frame.
         ImageError: images cannot be chosen or written.
         ModelError: no poses are found, or the output cannot be written.
-        OptionError: an option does not fit the video, the folder holds other things, or the file
-            for Gaussians cannot be made.
+        OptionError: an option does not fit the video, the folder has other contents, or the file
+            of Gaussians cannot be made.
     """
     options = (options if options is not None else ReconstructOptions()).with_extension
     progress = progress if progress is not None else no_progress
@@ -198,7 +199,7 @@ def reconstruct(
     clock = Clock()
     check_apart(output, [*paths_of(video), photos, *options.match.files])
     inputs = read_inputs(video, photos, options.match, flat=True)
-    # What can be refused is refused before the long work.
+    # Invalid input is refused before the long work.
     checked = [*(own.path for own in inputs.videos), *options.match.files]
     check_gaussians_path(gaussians, checked, overwrite=overwrite)
     for own, masks in zip(inputs.videos, inputs.masks_of_videos, strict=True):
@@ -234,7 +235,7 @@ def reconstruct(
         run = Run(inputs, sources, shown, output, stages, options, clock, progress)
         try:
             report = _run_stages(run)
-        except ColmapAv1Error:  # which may come of a change
+        except ColmapAv1Error:  # A file that changed during the run may be the cause.
             check_unchanged(*run.files)
             raise
         if gaussians is not None:
@@ -246,7 +247,7 @@ def reconstruct(
 
 
 def _remove_earlier_layout(stages: Path) -> None:
-    """Remove models that earlier versions kept among the stages, in folders.
+    """Remove the models that earlier versions kept in folders of the stages.
 
     Trainers that search the whole output folder would find them.
     """
@@ -257,7 +258,7 @@ def _remove_earlier_layout(stages: Path) -> None:
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
-    """The options with which videos are converted."""
+    """The options for the conversion of videos."""
     if not options.mapping.adjust:
         return options.match
     return replace(options.match, encode=encoding_for_pictures(options.match.encode))
@@ -273,7 +274,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     positions = image_positions(image_set, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
     posed = estimate_poses(run, videos, image_set)
-    del videos  # as large as the tracks that the poses agree with
+    del videos  # These tracks are as large as those in `posed`.
     placed, written = written_model(run, posed, image_set)
     further, unplaced = further_models(run, posed, image_set)
     assert posed.far_views is not None
@@ -357,25 +358,25 @@ def _warnings(
     further: Sequence[FurtherModel],
     unplaced: Sequence[str],
 ) -> list[str]:
-    """What the user should know of the poses and the model."""
+    """Warnings about the poses and the model."""
     matches, poses = posed.matches.result, posed.last.result
     warnings = []
     if further:
         warnings.append(
-            f"nothing holds all images together: 'sparse/0' holds {poses.num_registered} of "
+            f"no model has all images: 'sparse/0' has {poses.num_registered} of "
             f"{num_images}, {', '.join(map(str, further))}; each folder has its own "
             "'images' and 'sparse/0'"
         )
     if unplaced:
         warnings.append(
-            f"{len(unplaced)} of {num_images} images have no pose and are left out: "
+            f"{len(unplaced)} of {num_images} images are not registered and left out: "
             f"{some_names(unplaced)}"
         )
     left_out = [name for name, count in poses.registered.items() if count == 0]
     if left_out and not further:
         names = ", ".join(f"'{name}'" for name in left_out)
         warnings.append(
-            f"the model holds no image of {names}: reconstruct what shows another scene apart"
+            f"the model has no image of {names}: reconstruct videos of another scene separately"
         )
     if matches.depth.warning is not None:
         warnings.append(matches.depth.warning)
@@ -395,14 +396,14 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
     """Read the report of an earlier run from its folder.
 
     Raises:
-        ModelError: there is none, or it is damaged or of another version.
+        ModelError: the report is missing, damaged or from another version.
     """
     path = Path(output) / _REPORT
     try:
         return cattrs.structure(json.loads(path.read_text()), ReconstructReport)
     except (OSError, ValueError, TypeError, KeyError, cattrs.BaseValidationError) as error:
         raise ModelError(
-            f"{path}: missing, damaged or of another version: run reconstruct again"
+            f"{path}: missing, damaged or from another version: run reconstruct again"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The joint estimate of all poses: its stages in their order, for `match` and `reconstruct`."""
+"""The joint estimate of all poses: the sequence of its stages, for `match` and `reconstruct`."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# Number of the adjustment after the first split: after that of the key images and a second mapping.
+# Number of the adjustment after the first split; 1 and 2 follow the first and second mapping.
 _FIRST_SPLIT = 3
 
 
 @dataclass(frozen=True)
 class Posed:
-    """The stages that end in poses, and the tracks that agree with these.
+    """The finished stages of the joint estimate, and the tracks that agree with its poses.
 
     Attributes:
         matches: the database of the key images, see `match_stage`; that of the first model.
         mapped: the poses of the key images, see `pose_stage`.
-        resection: the poses of the images between these; None: all images are key images.
-        dynamic: what moves; None: it was not looked for.
-        adjustment: the adjusted poses; None: they are not adjusted.
-        tracks: the tracks of all videos, cut where motion is not believed.
+        resection: the poses of the images in between; None if all images are key images.
+        dynamic: the dynamic objects; None if they were not looked for.
+        adjustment: the adjusted poses; None if they are not adjusted.
+        tracks: the tracks of all videos, cut at gaps that links replace.
         links: links as tracks.
-        moving: by the names of images, masks that leave out what moves by itself.
-        in_place: tracks lie where the pictures show them; what a shutter's read-out has moved does
-            not.
-        far_views: the stage that held views from far apart against the poses; None: none did.
+        moving: masks that exclude dynamic objects, by image name.
+        in_place: whether tracks have the positions of the pictures; false if they were corrected
+            for a rolling shutter.
+        far_views: the long-range check; None if it was not made.
     """
 
     matches: Kept[MatchesResult]
@@ -66,12 +66,12 @@ class Posed:
 
     @property
     def last(self) -> Kept[PosesResult]:
-        """The stage that holds the poses."""
+        """The stage with the final poses."""
         return self.adjustment or self.resection or self.mapped
 
     @property
     def resumed(self) -> list[str]:
-        """Names of the stages that an earlier run had finished, in order."""
+        """Names of the stages that an earlier run finished, in order."""
         stages: dict[str, Kept[object] | None] = {
             "matches": self.matches,
             "poses": self.mapped,
@@ -85,11 +85,11 @@ class Posed:
 
 @dataclass(frozen=True)
 class _ToMend:
-    """What shows that poses do not hold together.
+    """Signs that the first poses are wrong.
 
     Attributes:
-        doubted: frames after seams that few points join, and that no pictures were matched across.
-        apart: pictures far apart in time contradict the poses, and places seen again were not
+        doubted: frames after doubtful seams where no links were looked for.
+        apart: whether pictures far apart in time contradict the poses, and loop closures were not
             looked for.
     """
 
@@ -98,11 +98,10 @@ class _ToMend:
 
 
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
-    """Estimate poses; where they do not hold together, again with links.
+    """Estimate poses, and if they are doubtful estimate them again with SIFT links.
 
-    These take the place of motion where few points join what lies on either side of two images, and
-    connect places seen again where pictures far apart in time contradict the poses. Where nothing
-    holds the model together even so, it is split, see `parts`.
+    Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
+    time contradict the poses. A model that is still poorly connected is split, see `parts`.
     """
     first: list[Posed] = []
 
@@ -138,11 +137,11 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
 
 def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Split the poses at seams that nothing holds, and adjust the largest part on its own.
+    """Split the model at weak seams, and adjust the largest part separately.
 
-    If pictures far apart in time contradict the poses, doubtful seams do not hold either. What held
-    two sides together before may not agree once the largest part is adjusted on its own, so its
-    seams are looked at again.
+    If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
+    separate adjustment may change the number of points at a seam, so the seams of the largest part
+    are checked again until no split is left.
     """
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
@@ -171,21 +170,21 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
-    """Whether views far apart contradict the poses, and links of such have not been looked for."""
+    """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
     assert posed.far_views is not None
     looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
     return posed.far_views.result.apart and not looked
 
 
 def _with_all_links(run: Run) -> Run:
-    """The run with links between places seen again in any video."""
+    """The run with loop closures in all videos."""
     match = run.options.match
     match = replace(match, links=replace(match.links, links="sift"))
     return replace(run, options=replace(run.options, match=match))
 
 
 def _unlinked_seams(run: Run, image_set: ImageSet, posed: Posed) -> list[int]:
-    """Frames after seams that few points join, and that no pictures have been matched across."""
+    """Frames after doubtful seams where no links were looked for."""
     if posed.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = image_set.images.frame_of
@@ -209,14 +208,14 @@ def _pose_stages(
     *,
     doubted: Sequence[int],
 ) -> Posed:
-    """Match, map, place what lies between and adjust; see `match_stage` for what is doubted."""
+    """Match, map, resect and adjust; `doubted` as in `match_stage`."""
     matched = match_stage(run, videos, image_set, doubted)
     depth = matched.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
-    # Where no read-out is found nothing has been moved, whether one was looked for or not.
+    # Without a read-out time the tracks were not corrected.
     in_place = not any(own.read_out for own in videos)
     believed = believed_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
@@ -237,17 +236,17 @@ def _far_views(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeRes
 def believed_tracks(
     run: Run, tracks: Sequence[Tracks], image_set: ImageSet
 ) -> tuple[Tracks, Tracks]:
-    """The tracks of all videos, cut where motion is not believed, and the links."""
+    """The tracks of all videos, cut at gaps that links replace, and the links."""
     links, broken = read_links(run.stages)
     every = Tracks.in_sequence(tracks, image_set.num_frames)
     return every.split_after_frames(broken.tolist()), links
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Map the adjusted observations again, and adjust, if that lowers the cost.
+    """Map the adjusted observations again, and use the result if that lowers the cost.
 
-    See `remapping` for why. A third mapping never lowered the cost further. Poses that no
-    adjustment by corners has left stay as they are.
+    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if the
+    adjustment did not use corners.
     """
     if posed.adjustment is None or not posed.in_place:
         return posed
@@ -260,7 +259,7 @@ def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
 def _adjusted(
     run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
-    """Adjust poses by the tracks that are believed, see `adjustment_stage`."""
+    """Adjust poses, see `adjustment_stage`."""
     moving, in_place = posed.moving, posed.in_place
     follows = in_place and (bool(moving) or has_moving_masks(image_set))
     return adjustment_stage(
@@ -286,15 +285,15 @@ def refined_poses(
     keyed: ImageSet,
     in_place: bool,
 ) -> Posed:
-    """Place what lies between the key images that a mapper placed, and adjust.
+    """Estimate the poses of the images between the key images, and adjust all poses.
 
     Args:
-        run: what every stage is given.
+        run: the run.
         matched: the database that was mapped.
-        mapped: the poses that the mapper found.
+        mapped: the poses of the mapper.
         believed: the tracks and links, see `believed_tracks`.
         image_set: the images.
-        keyed: those of them that were mapped.
+        keyed: the key images.
         in_place: see `Posed`.
     """
     tracks, links = believed

@@ -1,8 +1,9 @@
-"""Splits models at seams that hardly any point joins.
+"""Split models at seams that hardly any points connect.
 
-An adjustment puts the two sides of a seam anywhere if hardly any point joins them, and gives them
-different scales if no point carries the scale across. Such a model is bent, although each side is
-straight. The sides become models of their own, as COLMAP's mapper leaves what it cannot connect.
+If hardly any points connect the two sides of a seam, bundle adjustment leaves their relative pose
+undetermined; if no points carry the scale across, it leaves their relative scale undetermined.
+Such a model is bent, although each side is correct. The sides become separate models, as with
+COLMAP's mapper where it cannot connect images.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from colmap_av1.poses.seams import REACH
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage
 
-# Fewest images of a model beside the first one, as of COLMAP's mapper (`min_model_size`). Shorter
-# parts mostly show a turn on the spot, which leaves their shape open.
+# Further models with fewer images are dropped, as by COLMAP's mapper (`min_model_size`). Most of
+# them show a turn on the spot, which does not determine their shape.
 FEWEST_IMAGES = 10
-# Stretches of different videos belong together if they have this many points in common, which is
-# the least that COLMAP's mapper uses a pair of images for.
+# Stretches of different videos are connected by at least this many common points, the number of
+# inliers that COLMAP's mapper requires of a pair of images.
 _BETWEEN_VIDEOS = 15
-# Stretches of one video need this many. Bent models had at most half of it at the seam.
+# Stretches of one video are connected by at least this many common points. Bent models had at most
+# half of it at the seam.
 _WITHIN_VIDEO = 100
 
 
@@ -42,20 +44,20 @@ def split_stage(
     *,
     number: int,
 ) -> Kept[MappedResult]:
-    """Split an adjusted model at seams that nothing holds.
+    """Split an adjusted model at its weak seams.
 
     Args:
-        run: what every stage is given.
+        run: the run.
         image_set: all images.
-        mapped: the models that the mapper found.
+        mapped: the models of the mapper.
         adjusted: the first of these, adjusted.
-        seams: names of the images before and after each seam that few points join; where the
-            camera turns, see `AdjustedResult`, the model is split as well.
-        number: of the adjustment that follows.
+        seams: names of the images before and after each weak seam. The model is also split at the
+            turns that lose the scale, see `AdjustedResult`.
+        number: number of the next adjustment.
 
     Returns:
-        The poses of the largest part. The other parts, largest first, come before the mapper's
-        other models.
+        The poses of the largest part. The other parts, largest first, precede the mapper's other
+        models.
     """
     name = f"parts_{number}"
 
@@ -101,15 +103,15 @@ def parts_of(
 ) -> list[AbstractSet[str]]:
     """The names of the images of each part of a model, the largest part first.
 
-    The images between two seams of a video form a stretch. Stretches that see enough points in
-    common belong to the same part. Points that are seen all through a turn do not count: they do
-    not carry the scale. Parts of fewer than ten images are left out, if there is a larger one.
+    The images between two seams of a video form a stretch. Stretches with enough common points
+    belong to the same part. Points that are visible throughout a turn do not count: they do not
+    carry the scale. Parts of fewer than ten images are dropped, except the largest.
 
     Args:
         model: the model with its points.
         image_set: all images.
-        seams: names of the images before and after each seam that few points join.
-        turns: names of those between which the camera turns and the scale is lost.
+        seams: names of the images before and after each weak seam.
+        turns: names of the images before and after each seam where a turn loses the scale.
     """
     names = image_set.images.names
     is_turn = np.isin(names, [first for first, _ in turns])
@@ -144,12 +146,12 @@ def parts_of(
 def _common(
     point: NDArray[np.int64], stretch: NDArray[np.int64], num_stretches: int
 ) -> NDArray[np.int64]:
-    """How many points two stretches both see.
+    """The number of points that each two stretches have in common.
 
     Args:
         point: int64 [n] point of each observation.
         stretch: int64 [n] stretch of its image.
-        num_stretches: number of the stretches.
+        num_stretches: number of stretches.
 
     Returns:
         int64 [num_stretches, num_stretches].

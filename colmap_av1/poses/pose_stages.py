@@ -1,4 +1,4 @@
-"""The stages of `reconstruct` that estimate poses: COLMAP's mapper, then bundle adjustment."""
+"""The stages of the joint estimate: COLMAP's mapper, resection, bundle adjustment."""
 
 from __future__ import annotations
 
@@ -49,44 +49,45 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
-# Of an image, below which a mapper that finds no start may lack them.
+# With fewer tracks per image than this, a failed initialization is blamed on the tracks.
 _FEW_TRACKS = 100
-# Tracks of an image that the global mapper starts from, the longest ones, and share of the error
-# that steps lower or end, where an adjustment follows: half the time of 200, to the same poses. But
-# what links videos or images is short, and all of it needed; revisits make long tracks longer.
+# The global mapper initializes from this number of tracks per image, the longest ones, and its
+# optimizations end at this relative change of the cost. This takes half the time of 200 tracks and
+# COLMAP's tolerance, and the adjustment that follows ends at the same poses. Links between videos
+# are short tracks, so where poses depend on them all tracks are used.
 START_TRACKS = 100
 TOLERANCE = 1e-4
-# Tracks that the poses are adjusted on, and the error in pixels from which on they count less: half
-# of them come to 0.3 or 0.4 at most, those beyond have drifted. A larger one comes first: at the
-# end of a video, say, the mapper may leave images that are off by more with all they see.
+# The selection of tracks for bundle adjustment, and the scales of its robust loss in pixels. Half
+# of the observations have errors below 0.3 to 0.4 px; larger ones have drifted. The first
+# adjustment has a larger scale: the mapper may leave images whose observations are all far off.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
 LOSS_SCALES = (1.0, 0.25)
-# Beside corners, one in so many of them: each is less exact, and all may be off one way. They
-# drift, by three times as much over twenty images as over three, and bend what corners hold
-# straight: so they are cut to pieces of so many images.
-_BESIDE = 2
-_MOST_BESIDE = 8
-# Tracks that images between key images are placed by, and views of these that make their points.
+# If corners are used as well, every second motion track is kept, cut into pieces of eight images.
+# Motion tracks are less accurate than corners, their errors are correlated, and they drift: over
+# twenty images by three times as much as over three, which bends the model.
+_NTH_WITH_CORNERS = 2
+_LENGTH_WITH_CORNERS = 8
+# The selection of tracks for resection, and the fewest views of a point by key images.
 _RESECTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
 )
 _FEWEST_VIEWS = 3
-# Beside corners, which say where an image is, motion that is off by more tells nothing. A corner is
-# where the picture shows it, and where a shutter bends this, all of it is to count; a link, too:
-# where poses do not hold together it is as far off as they are.
-_BESIDE_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
+# Corners determine the pose of an image, so motion tracks with larger errors are rejected. Corners
+# and links keep large errors, because these are errors of the poses: of a rolling shutter, or where
+# the model is bent.
+_WITH_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
 FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
 @dataclass(frozen=True)
 class MappedResult(PosesResult):
-    """What `pose_stage` found.
+    """Result of `pose_stage`.
 
     Attributes:
-        mapper: which of COLMAP's mappers found the poses.
-        other_models: files of further models, whose images nothing connects with the first.
+        mapper: the mapper of COLMAP that estimated the poses.
+        other_models: files of further models, which are not connected to the first.
     """
 
     mapper: str
@@ -95,17 +96,16 @@ class MappedResult(PosesResult):
 
 @dataclass(frozen=True)
 class AdjustedResult(PosesResult):
-    """What `adjustment_stage` found.
+    """Result of `adjustment_stage`.
 
     Attributes:
-        num_motion_points: points of motion tracks, which come first; those of corners and links
-            follow.
-        doubtful_seams: names of neighbouring images that few points join.
-        thin_seams: names of those that few points join at this place, see `Seams.thin`.
-        turns: names of those between which the camera turns and the scale is lost, see
-            `Seams.turns`.
-        usual_scaled: number of points that carry the scale across a usual seam.
-        seams_warning: what the user should know of them.
+        num_motion_points: number of points of motion tracks. They come first; points of corners
+            and links follow.
+        doubtful_seams: names of the images before and after each of `Seams.doubtful`.
+        thin_seams: names of the images before and after each of `Seams.thin`.
+        turns: names of the images before and after each of `Seams.turns`.
+        usual_scaled: see `Seams.usual_scaled`.
+        seams_warning: see `Seams.weak_warning`.
     """
 
     num_motion_points: int
@@ -119,7 +119,7 @@ class AdjustedResult(PosesResult):
 def pose_stage(
     run: Run, matched: Kept[MatchesResult], image_set: ImageSet, keyed: ImageSet
 ) -> Kept[MappedResult]:
-    """Estimate the poses of the key images, some of all, by COLMAP's mapper."""
+    """Estimate the poses of the key images with COLMAP's mapper."""
     options, clock, progress = run.options, run.clock, run.progress
     mapping = options.mapping
     found_before = matched.result
@@ -128,14 +128,14 @@ def pose_stage(
     if mapping.mapper != "auto":
         mappers = [mapping.mapper]
     else:
-        # The global mapper needs the focal length, and a zoom misleads its estimate.
+        # The global mapper needs the focal length. A zoom would mislead its estimate.
         mappers = ["incremental"] if found_before.guessed else ["global", "incremental"]
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
-    hangs = links.num_between or reasons & {"contradicted", "few tracks"}
-    start_tracks = None if hangs else START_TRACKS
-    tolerance = TOLERANCE if mapping.adjust and not hangs else None
-    hows = [
+    depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
+    start_tracks = None if depends_on_links else START_TRACKS
+    tolerance = TOLERANCE if mapping.adjust and not depends_on_links else None
+    attempts = [
         MapOptions(
             mapper=mapper,
             forward_motion=forward and mapper == "incremental",
@@ -146,12 +146,12 @@ def pose_stage(
         for mapper in mappers
     ]
 
-    def map_with(how: MapOptions, database: Path) -> list[PosedModel]:
+    def map_with(map_options: MapOptions, database: Path) -> list[PosedModel]:
         with tempfile.TemporaryDirectory() as models:
             sizes = map_poses(
                 database,
                 Path(models),
-                how,
+                map_options,
                 image_path=None,
                 log=run.stages / "mapper.log",
                 num_images=len(keyed.images.names),
@@ -167,15 +167,15 @@ def pose_stage(
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
-            # pycolmap brings a database to its own layout.
+            # pycolmap migrates the databases that it opens to its own layout.
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
-            for how in hows:
-                found = map_with(how, copy)
+            for attempt in attempts:
+                found = map_with(attempt, copy)
                 if found:
                     break
         if not found:
-            raise ModelError(_why_no_start(found_before, how.mapper))
+            raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
         found = _largest_first(found, image_set, keyed)
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
@@ -185,14 +185,14 @@ def pose_stage(
             poses=files[0],
             num_registered=len(found[0].images),
             registered=registered_by_video(found[0].by_name, keyed),
-            mapper=how.mapper,
+            mapper=attempt.mapper,
             other_models=tuple(files[1:]),
         )
 
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, hows, start_tracks, tolerance, pycolmap.__version__],
+        [matched.digest, attempts, start_tracks, tolerance, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],
@@ -203,16 +203,16 @@ def pose_stage(
 def _largest_first(
     models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
 ) -> list[PosedModel]:
-    """The models by how many images, key images or between these, they stand for."""
+    """Sort models by the number of images that are nearest to their key images."""
     if len(models) < 2:
         return models
     key = keyed.images.frames
     nearest = np.searchsorted((key[1:] + key[:-1]) / 2, image_set.images.frames)
-    stands_for = np.bincount(nearest, minlength=len(key))
+    num_nearest = np.bincount(nearest, minlength=len(key))
     size = [
         sum(
             int(count)
-            for name, count in zip(keyed.images.names, stands_for, strict=True)
+            for name, count in zip(keyed.images.names, num_nearest, strict=True)
             if name in images
         )
         for images in (model.by_name for model in models)
@@ -221,45 +221,45 @@ def _largest_first(
 
 
 def refines_intrinsics(options: ReconstructOptions) -> bool:
-    """Whether focal length and distortion are refined: by default those that are not given."""
+    """Whether focal length and distortion are refined; by default if they are not given."""
     if options.mapping.refine_intrinsics is not None:
         return options.mapping.refine_intrinsics
     return options.match.camera.camera_params is None
 
 
-def _why_no_start(found: MatchesResult, mapper: str) -> str:
-    """Why a mapper found no initial pair, and what to try."""
-    no_start = f"COLMAP's {mapper} mapper finds no initial pair"
+def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
+    """Why a mapper found no initial pair, and the remedy."""
+    failure = f"COLMAP's {mapper} mapper finds no initial pair"
     other = "incremental" if mapper == "global" else "global"
     most_agree = found.num_verified_pairs >= found.num_pairs / 2
     if most_agree and found.num_flat_pairs > found.num_verified_pairs / 2:
         return (
-            f"{no_start}: too little parallax, in {found.num_flat_pairs} of "
+            f"{failure}: too little parallax, in {found.num_flat_pairs} of "
             f"{found.num_verified_pairs} pairs the camera only rotates or the scene is flat: "
-            "film while moving sideways, or give a longer part of the video"
+            "move sideways while filming, or give a longer part of the video"
         )
     if not most_agree or found.keypoints_per_image < _FEW_TRACKS:
         return (
-            f"{no_start}: too few tracks, {found.keypoints_per_image:.0f} an image and "
-            f"{found.num_verified_pairs} of {found.num_pairs} pairs that agree with a rigid "
-            "scene: 'colmap-av1 info' says what the stream lacks, --reencode 1 converts it anew"
+            f"{failure}: too few tracks, {found.keypoints_per_image:.0f} per image and "
+            f"{found.num_verified_pairs} of {found.num_pairs} verified pairs: "
+            "'colmap-av1 info' tells what the stream lacks, --reencode 1 converts it again"
         )
     if found.guessed:
         return (
-            f"{no_start}: the focal length is a guess and may be far off, or the parallax too "
-            "little, as where the camera moves along its axis: "
+            f"{failure}: the focal length is a default and may be far off, or there is too little "
+            "parallax, as when the camera moves along its optical axis: "
             f"give --camera_model and --camera_params, or try --mapper {other}"
         )
     return (
-        f"{no_start}: the parallax between images that share tracks is too little, or the "
-        f"intrinsics do not fit: give --camera_model and --camera_params, or try --mapper {other}"
+        f"{failure}: too little parallax between images that share tracks, or wrong intrinsics: "
+        f"give --camera_model and --camera_params, or try --mapper {other}"
     )
 
 
 def resection_stage(
     run: Run, tracks: Tracks, image_set: ImageSet, keyed: ImageSet, posed: Kept[PosesResult]
 ) -> Kept[PosesResult]:
-    """Place the images between the key images by the points of tracks that they see."""
+    """Estimate the poses of the images between the key images by resection."""
 
     def make(partial: Path) -> PosesResult:
         known = read_posed_images(run, posed, keyed)
@@ -281,7 +281,7 @@ def resection_stage(
 
 
 def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -> list[ModelImage]:
-    """The images that have a pose, and those between them that get one; see `resection_stage`."""
+    """The key images with a pose, and the images between them that get one."""
     run_options = run.options.match.run
     seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
     spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
@@ -340,24 +340,22 @@ def adjustment_stage(
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
     number: int = 1,
 ) -> Kept[AdjustedResult]:
-    """Bundle-adjust the poses on more tracks than the mapper gets: long ones, spread over images.
+    """Bundle-adjust the poses with a robust loss, on long tracks that cover the images evenly.
 
-    Links take part whole: without them places seen again would drift apart once more. Corners of
-    the pictures say where an image is whose motion misleads, as where the camera jerks.
-
-    The mapper's own adjustments have no robust loss, and drop what drifts.
+    All links are used: without them places that are seen again would drift apart. Corners of the
+    pictures correct poses that motion misleads, as at a jerk of the camera.
 
     Args:
-        run: what every stage is given.
+        run: the run.
         tracks: the tracks of all sequences.
         links: links as tracks.
         image_set: the images.
-        posed: the stage that left the poses.
-        moved: digest of the stage that found what moves, where tracks and links are without it.
-        follow: corrects the chosen tracks in the images that have a pose.
-        corners: looks for corners of these images' pictures, which take part whole, and corrects
-            poses that these contradict.
-        number: of the mapping that the poses come from.
+        posed: the stage with the initial poses.
+        moved: digest of the stage that found dynamic objects, if `tracks` and `links` exclude them.
+        follow: refines the selected tracks in the registered images.
+        corners: finds corners in the pictures of the registered images, all of which are used, and
+            corrects poses that contradict them.
+        number: number of the mapping that the poses come from.
     """
     options = run.options
     suffix = f"_{number}" if number > 1 else ""
@@ -365,7 +363,7 @@ def adjustment_stage(
 
     def make(partial: Path) -> AdjustedResult:
         placed = read_posed_images(run, posed, image_set)
-        # The long tracks of all images are several times as large as those chosen: they go at once.
+        # Not kept in a variable: the long tracks need several times the memory of the selection.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
         if follow is not None:
             with run.clock.measure("refinement"):
@@ -375,8 +373,8 @@ def adjustment_stage(
         if corners is not None:
             with run.clock.measure("refinement"):
                 followed, placed = corners(Tracks.concatenate(spread, linked), placed)
-            few = spread.every_nth(_BESIDE).split_to_length(_MOST_BESIDE)
-            sets = [(few, _BESIDE_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
+            few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
+            sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as model:
             folder = Path(model)
             points = [_black_points(run, placed, *own) for own in sets]
@@ -388,7 +386,7 @@ def adjustment_stage(
             adjusted = without_unseen_images(folder)
         seams = model_seams(adjusted)
         result = posed_model(adjusted, with_points=True)
-        # Point ids count from 1, in the order of the points.
+        # Point ids start at 1, in the order of `points`.
         is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
         with run.clock.measure("adjustment"):
             result = with_own_cameras(run, result, LOSS_SCALES, refine_intrinsics=refine)
@@ -402,18 +400,27 @@ def adjustment_stage(
             thin_seams=tuple(seams.pairs[i] for i in seams.thin),
             turns=tuple(seams.pairs[i] for i in seams.turns),
             usual_scaled=seams.usual_scaled,
-            # A model whose scale is lost somewhere is split there, see `parts`.
+            # No warning about a lost scale: the model is split there, see `parts`.
             seams_warning=seams.weak_warning,
         )
 
-    how = (options.mapping.mapper_threads, options.match.run.seed, pycolmap.__version__)
-    kinds = (_BESIDE_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,)
-    given = (_ADJUSTED, _BESIDE, _MOST_BESIDE, kinds, LOSS_SCALES, FEW_SEEN, refine, *how)
-    single_camera = options.match.camera.single_camera
+    settings = (
+        _ADJUSTED,
+        _NTH_WITH_CORNERS,
+        _LENGTH_WITH_CORNERS,
+        (_WITH_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,),
+        LOSS_SCALES,
+        FEW_SEEN,
+        refine,
+        options.mapping.mapper_threads,
+        options.match.run.seed,
+        options.match.camera.single_camera,
+        pycolmap.__version__,
+    )
     return run_stage(
         run.stages,
         f"adjustment{suffix}",
-        [posed.digest, given, moved, single_camera],
+        [posed.digest, settings, moved],
         AdjustedResult,
         into=run.stages,
         products=[f"adjusted{suffix}.npz"],
@@ -422,7 +429,7 @@ def adjustment_stage(
 
 
 def adjust_in(run: Run, folder: Path) -> None:
-    """Bundle-adjust the model in a folder, as the options of the run say; it is overwritten."""
+    """Bundle-adjust the model in a folder in place, with the options of the run."""
     adjust_model(
         folder,
         refine_intrinsics=refines_intrinsics(run.options),
@@ -436,7 +443,7 @@ def adjust_in(run: Run, folder: Path) -> None:
 def _black_points(
     run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
-    """Points of tracks in the images that have a pose, without colours."""
+    """Triangulated points of tracks in the registered images, all black."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=options)
     return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))

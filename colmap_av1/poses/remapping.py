@@ -1,9 +1,9 @@
-"""A second mapping, from the observations that the first poses were adjusted on.
+"""A second mapping, from the observations of the first bundle adjustment.
 
-An adjustment ends in the minimum of its cost that is nearest to its start. Where few tracks cross a
-fast turn, the first mapping may be bent, and then the adjustment cannot straighten it. Even so, the
-corners found with its poses form longer and more exact tracks than those it was made from. Mapping
-these gives another start, which is kept if it ends at a lower cost.
+Bundle adjustment converges to a local minimum. If few tracks cross a fast turn, the first mapping
+may be bent, and bundle adjustment does not straighten it. Even so, the corners that were found with
+its poses form longer and more accurate tracks than the motion that it was mapped from. Mapping
+these gives another initialization, which is kept if it ends at a lower cost.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# Share of the observations that another model keeps, at least: less does not explain them.
+# The second mapping is rejected if fewer of the observations than this share agree with it.
 _LEAST_KEPT = 0.9
-# A start is better if its cost is below this share of the other's. Two starts that end in the same
-# minimum differ by 0.1 %; straightening the model of a walk lowered the cost by 1.4 %.
+# The second mapping is accepted if its cost is below this share of the first one's. Costs in the
+# same minimum differ by 0.1 %; straightening the model of a walk lowered the cost by 1.4 %.
 _LOWER = 0.99
 
 
 @dataclass(frozen=True)
 class RemappedResult(PosesResult):
-    """What `remap_stage` found.
+    """Result of `remap_stage`.
 
     Attributes:
-        kept: share of the observations of its images that the second mapping agrees with.
-        cost: mean robust cost of these by the poses they were adjusted on.
-        new_cost: the same by the second mapping, adjusted on these observations.
+        kept: share of the observations in its images that agree with the second mapping.
+        cost: mean robust cost of these with the first poses.
+        new_cost: mean robust cost of these with the second mapping, after adjustment.
     """
 
     kept: float
@@ -69,19 +69,19 @@ class RemappedResult(PosesResult):
 
     @property
     def is_better(self) -> bool:
-        """Whether the second mapping fits the observations better than the first."""
+        """Whether the second mapping fits the observations better than the first one."""
         return self.kept >= _LEAST_KEPT and self.new_cost < _LOWER * self.cost
 
 
 def remap_stage(
     run: Run, image_set: ImageSet, adjusted: Kept[AdjustedResult]
 ) -> Kept[RemappedResult]:
-    """Map the images again, by the observations that their poses were adjusted on.
+    """Map the images again from the observations of their adjustment.
 
     Args:
-        run: what every stage is given.
+        run: the run.
         image_set: the images.
-        adjusted: the stage that adjusted them.
+        adjusted: the stage that adjusted their poses.
     """
     name = "remapped"
 
@@ -121,7 +121,7 @@ def remap_stage(
 def _map_tracks(
     run: Run, image_set: ImageSet, known: PosedModel, tracks: Tracks
 ) -> PosedModel | None:
-    """Map the images of a model by its tracks, with COLMAP's global mapper; None: it failed."""
+    """Map the images of a model from its tracks with COLMAP's global mapper; None if it fails."""
     options = run.options
     cameras = [known.cameras[image.camera_id] for image in known.images]
     frames = posed_images_of(known, image_set).frames
@@ -153,18 +153,18 @@ def _map_tracks(
 def _costs(
     run: Run, image_set: ImageSet, known: PosedModel, found: PosedModel, tracks: Tracks
 ) -> tuple[float, float, float]:
-    """Compare a model with another start, adjusted on the observations of the model's points.
+    """Compare two models by the robust cost of the same observations.
 
     Args:
-        run: what every stage is given.
+        run: the run.
         image_set: the images.
-        known: the model, with points.
-        found: poses of all its images, or of some.
-        tracks: the observations of the model, see `tracks_of_model`.
+        known: the first model, with points.
+        found: the second model: poses of all images of `known`, or of some.
+        tracks: the observations of `known`, see `tracks_of_model`.
 
     Returns:
         The share of the observations in images of `found` that agree with it, and their mean robust
-        costs by both.
+        costs with `known` and with `found`, after adjustment.
     """
     placed = posed_images_of(found, image_set)
     in_both = np.isin(tracks.frame, placed.frames)
@@ -187,5 +187,5 @@ def _costs(
 
 
 def _mean_cost(errors: NDArray[np.float64]) -> float:
-    """Mean of the robust loss (Cauchy) that adjustments use last, of errors in pixels."""
+    """Mean Cauchy loss of errors in pixels, with the scale of the last adjustment."""
     return float(robust_costs(errors, LOSS_SCALES[-1]).mean())

@@ -1,4 +1,7 @@
-"""How firmly points join the images on either side of each gap between neighbours in time."""
+"""How well points connect the images before and after each seam of a model.
+
+A seam lies between two images that are neighbours in time.
+"""
 
 from __future__ import annotations
 
@@ -14,45 +17,45 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
 from colmap_av1.images.names import natural_order, videos_of
 
-# Two views of a point say nothing of how far one of them is from a third.
+# Points with fewer views are ignored: two views do not constrain the scale between images.
 _FEWEST_VIEWS = 3
-# A seam is doubtful, and may be looked at again, that has less than this share of the points that
-# the seams of a model usually have; and weak below the other. Jerks that links mend have 15 % and
-# more afterwards, models that were bent there 1 to 5 %.
+# A seam is doubtful, or weak, if it has less than this share of the median number of points. At
+# jerks, links bring correct models to 15 % or more; models that were bent had 1 to 5 %.
 _DOUBTFUL = 0.15
 _WEAK = 0.07
-# Images between two that see a point, beyond which these say nothing of the seams between: a place
-# seen again would count for all of the way there and back.
+# A point connects two images that are at most this many images apart. Otherwise a place that is
+# seen again would connect all seams in between.
 REACH = 10
-# So many points hold any seam, however many others have: bent ones had 50 at most.
+# A seam with this many points is never weak, however many others have: bent models had at most 50.
 _ENOUGH = 100
-# Share of the points of usual seams that images before a seam share with those after it, however
-# far apart, from which on it is not weak: parts of a cut video may see each other elsewhere.
+# A seam is not weak if images before and after it share at least this share of the median number
+# of points, however far apart they are: the parts of a cut video may see the same place elsewhere.
 _ELSEWHERE = 0.5
-# A point has depth if its parallax exceeds this many pixels: several times the error of an
+# A point has depth if its parallax exceeds this many pixels, several times the error of an
 # observation.
 _LEAST_PARALLAX = 2.0
-# The scale of a model is lost at a seam that less than this share of the usual points carry it
-# across, though so many points have depth on either side. Where a camera stands still and turns by
-# as much as it sees at once few do: bent models had 7 % at most, others 11 % and more.
+# The scale of a model is lost at a seam that less than this share of the usual number of points
+# carry it across, although _DEEP points have depth on either side. This happens where the camera
+# turns on the spot by its field of view: bent models had at most 7 %, correct ones at least 11 %.
 _LOST = 0.08
 _DEEP = 100
 
 
 @dataclass(frozen=True)
 class Seams:
-    """What joins neighbouring images of the same camera and folder.
+    """The points at each seam: between neighbours in time of the same camera and folder.
+
+    Only points with at least three views count.
 
     Attributes:
-        pairs: names of the images before and after each seam, in the order of their names.
-        num_points: int64 [n] points that join them: which images on both sides see, up to ten
-            images apart, and three images at least.
-        num_elsewhere: int64 [n] points that images on both sides see, however far apart.
-        num_scaled: int64 [n] points that carry the scale across: which have depth by the views up
-            to the image before, and by those from it on. A place that is seen again more than ten
-            images later counts as another point.
-        num_deep: int64 [n] points that have depth by the views up to the image before, or by those
-            from it on, whichever are fewer.
+        pairs: names of the images before and after each seam, in natural order.
+        num_points: int64 [n] points with views on both sides that are at most ten images apart.
+        num_elsewhere: int64 [n] points with views on both sides, however far apart.
+        num_scaled: int64 [n] points that carry the scale across: they have depth both by the views
+            up to the image before the seam and by those from it on. A place that is seen again
+            more than ten images later counts as another point.
+        num_deep: int64 [n] points that have depth by the views up to the image before the seam, or
+            by those from it on, whichever are fewer.
     """
 
     pairs: tuple[tuple[str, str], ...]
@@ -63,7 +66,7 @@ class Seams:
 
     @property
     def weak(self) -> list[int]:
-        """Seams, by index, that hold far less than the others do: a model may be bent there."""
+        """Indices of seams with far fewer points than the others: a model may be bent there."""
         if len(self.num_points) == 0:
             return []
         enough = _ELSEWHERE * float(np.median(self.num_points))
@@ -71,29 +74,29 @@ class Seams:
 
     @property
     def doubtful(self) -> list[int]:
-        """Seams, by index, that hold much less than the others do, the weak ones among them."""
+        """Indices of seams with much fewer points than the others, including the weak ones."""
         return self._below(_DOUBTFUL)
 
     @property
     def usual_scaled(self) -> float:
-        """Number of points that carry the scale across a usual seam: the third quartile."""
-        # Much of a clip may be a turn, so the median may be that of turns.
+        """Usual number of points that carry the scale across a seam: the third quartile."""
+        # The median may be that of turns, if they are a large part of the video.
         return float(np.quantile(self.num_scaled, 0.75)) if len(self.num_scaled) else 0.0
 
     @property
     def unscaled(self) -> list[int]:
-        """Seams, by index, across which nothing carries the scale of the model."""
+        """Indices of seams across which too few points carry the scale of the model."""
         least = _LOST * self.usual_scaled
         return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
 
     @property
     def thin(self) -> list[int]:
-        """Seams, by index, that few points join, whatever both sides see elsewhere."""
+        """Indices of seams that few points connect, even if both sides share points elsewhere."""
         return self._below(_WEAK, most=_ENOUGH)
 
     @property
     def turns(self) -> list[int]:
-        """The weakest seam, by index, of every run of seams that do not carry the scale."""
+        """Index of the weakest seam in every run of consecutive seams that lose the scale."""
         runs: list[list[int]] = []
         for seam in self.unscaled:
             if runs and runs[-1][-1] == seam - 1:
@@ -113,12 +116,12 @@ class Seams:
 
     @property
     def warning(self) -> str | None:
-        """What the user should know of a model that hardly holds together somewhere."""
+        """Warning about weak seams, or else about seams that lose the scale."""
         return self.weak_warning or self._scale_warning
 
     @property
     def weak_warning(self) -> str | None:
-        """What the user should know of weak seams."""
+        """Warning about weak seams."""
         if not self.weak:
             return None
         where = min(self.weak, key=lambda i: (int(self.num_points[i]), i))
@@ -127,14 +130,14 @@ class Seams:
         others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
         usual = int(np.median(self.num_points))
         return (
-            f"only {count} points join '{first}' and what is before it to '{second}' and what "
-            f"follows, usually {usual} do{others}: scale and direction may change there; film it "
-            "more slowly, or reconstruct the parts on either side apart"
+            f"only {count} points join '{first}' and earlier images to '{second}' and later ones, "
+            f"where {usual} are usual{others}: scale and direction may change there; film it more "
+            "slowly, or reconstruct the two parts separately"
         )
 
     @property
     def _scale_warning(self) -> str | None:
-        """What the user should know of a model whose parts have scales of their own."""
+        """Warning about seams that lose the scale."""
         if not self.unscaled:
             return None
         first = last = self.unscaled[0]
@@ -142,19 +145,15 @@ class Seams:
             last += 1
         more = self.unscaled[-1] > last
         return (
-            f"nothing carries the scale from '{self.pairs[first][0]}' to '{self.pairs[last][1]}'"
-            f"{', and elsewhere' if more else ''}: the camera turns there without moving aside, so "
-            "that what is before and what follows may have scales of their own; film such turns "
-            "while walking, or reconstruct the parts on either side apart"
+            f"no points carry the scale from '{self.pairs[first][0]}' to '{self.pairs[last][1]}'"
+            f"{', and elsewhere' if more else ''}: the camera turns there without moving sideways, "
+            "so the parts before and after may differ in scale; keep walking while you turn, or "
+            "reconstruct the two parts separately"
         )
 
 
 def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
-    """What joins neighbouring images in a model.
-
-    Images that are neighbours in the order of their names, as frames of a video are named, have a
-    seam where one camera took both into one folder.
-    """
+    """Count the points at each seam of a model, see `Seams`."""
     images, seams = images_in_time(reconstruction)
     views, point, xyz = _seen_points(reconstruction, images)
     num_images, num_seams = len(images), max(len(images) - 1, 0)
@@ -164,14 +163,15 @@ def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
     np.minimum.at(first, point, views)
     np.maximum.at(last, point, views)
-    # Views of a place that is seen again carry no scale to what lies between, so each visit counts
-    # as a point of its own.
+    # A place that is seen again carries no scale to the images in between, so each visit counts as
+    # another point.
     starts = np.ones(len(point), np.bool_)
     starts[1 + near] = False
     visit = np.cumsum(starts) - 1
     begin = views[starts]
     end = views[np.append(starts[1:], True)] if len(views) else views
-    # The first view that gives a visit depth beside its first one, and the last beside its last.
+    # The first view of a visit with enough parallax to its first one, and the last view with enough
+    # parallax to its last one.
     deep_from, deep_to = (np.full(len(begin), fill) for fill in (num_images, -1))
     focal = [reconstruction.cameras[image.camera_id].mean_focal_length() for image in images]
     least_angle = np.degrees(_LEAST_PARALLAX / np.median(focal)) if focal else 0.0
@@ -182,7 +182,7 @@ def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
     np.maximum.at(deep_to, visit[from_last], views[from_last])
 
     def between(start: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-        """How many points have each seam from `start` on and before `end`."""
+        """Number of points at each seam. A point spans the seams from `start` to before `end`."""
         some = start < end
         change = np.bincount(start[some], minlength=num_images + 1)
         change -= np.bincount(end[some], minlength=num_images + 1)
@@ -201,7 +201,7 @@ def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
 
 
 def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelImage], list[int]]:
-    """The images of a model with a pose, in the natural order of their names.
+    """The registered images of a model, in the natural order of their names.
 
     Returns:
         The images, and indices of those whose next one is a neighbour in time, see `videos_of`.
@@ -216,9 +216,11 @@ def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelI
 def _seen_points(
     reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Places [m] of the images that see a point, number [m] of that point, and positions [n, 3].
+    """The observations of points with at least three views.
 
-    Points that fewer than three images see are left out.
+    Returns:
+        Index [m] of the image and index [m] of the point of each observation, and the positions
+        [n, 3] of the points.
     """
     place = {image.image_id: k for k, image in enumerate(images)}
     views, counts, xyz = list[int](), list[int](), list[NDArray[np.float64]]()
@@ -235,7 +237,7 @@ def _seen_points(
 def _angle(
     a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Angle in degrees at which points [n, 3] are seen from two places each."""
+    """Angle in degrees between the rays from two positions [n, 3] to each point [n, 3]."""
     rays = [(point - c) / np.linalg.norm(point - c, axis=1, keepdims=True) for c in (a, b)]
     half = np.linalg.norm(rays[0] - rays[1], axis=1) / 2
     return np.asarray(np.degrees(2 * np.arcsin(np.minimum(half, 1))))
