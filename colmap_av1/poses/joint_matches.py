@@ -1,8 +1,8 @@
 """Matches that agree with a joint estimate of all poses, for a COLMAP database.
 
 Two images do not show which tracks have drifted: drifted tracks agree with some epipolar geometry,
-too. The poses of all images show it. They are therefore estimated as in `reconstruct`, and what
-agrees with them is matched: the corners used in the adjustment, and a spread selection of motion
+too. The poses of all images show it, so they are estimated as in `reconstruct`. The tracks that
+agree with them are matched: the corners used in the adjustment, and a spread selection of motion
 tracks. A few long tracks connect the images. The others only have to become points, for which three
 observations suffice. This keeps the mapper fast.
 """
@@ -107,7 +107,7 @@ def match_jointly(
     image_set: ImageSet,
     density: DensityOptions,
 ) -> JointMatches:
-    """Estimate the poses of all images, and match what agrees with them.
+    """Estimate the poses of all images, and match the tracks that agree with them.
 
     Images that are not registered are matched along all their tracks.
 

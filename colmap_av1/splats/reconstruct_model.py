@@ -32,7 +32,7 @@ from colmap_av1.geometry.undistortion import (
 )
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.dynamic.short_tracks import static_points
 from colmap_av1.poses.posed_images import (
     PosedImages,
     PosesResult,
@@ -278,7 +278,7 @@ def model_stage(
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_moving = np.array([image.name in moving for image in images])
-            tracked = take_points(tracked, surely_still(tracked, shows_moving))
+            tracked = take_points(tracked, static_points(tracked, shows_moving))
         undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)

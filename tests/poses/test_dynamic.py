@@ -41,7 +41,7 @@ from colmap_av1.options import (
 from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks, place_tracks
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
 from colmap_av1.poses.dynamic.regions import moving_cells, shares_above_usual, strong_patches
-from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.dynamic.short_tracks import static_points
 from colmap_av1.poses.posed_images import PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
@@ -224,10 +224,10 @@ def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None
         *(np.concatenate(images), np.zeros((sum(map(len, images)), 2))),
     )
     shows_moving = np.isin(np.arange(12), range(2, 8))
-    assert surely_still(points, shows_moving).tolist() == [0, 2, 3, 4]
-    assert surely_still(points, np.ones(12, np.bool_)).tolist() == [2]
-    assert surely_still(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
-    assert len(surely_still(no_points(), shows_moving)) == 0
+    assert static_points(points, shows_moving).tolist() == [0, 2, 3, 4]
+    assert static_points(points, np.ones(12, np.bool_)).tolist() == [2]
+    assert static_points(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
+    assert len(static_points(no_points(), shows_moving)) == 0
 
 
 # A poster of so many pixels that goes across the pictures of the rendered courtyard.

@@ -14,7 +14,7 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.resection import resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
-from colmap_av1.poses.corners.seen_again import found_again
+from colmap_av1.poses.corners.patch_matching import match_patches
 from colmap_av1.poses.pose_stages import FROM_PICTURES
 from colmap_av1.poses.posed_images import PosedImages, triangulate_in
 from colmap_av1.poses.run import Run
@@ -49,8 +49,8 @@ def corners_in_images(
     masks = placed.masks_with(moving)
     with GreyPictures(run.stages) as pictures:
         followed = _followed(run, masks, tracks, placed, pictures)
-        placed = place_anew(run, followed, placed)
-        return _seen_again(run, masks, followed, placed, pictures), placed
+        placed = resect_from_corners(run, followed, placed)
+        return _match_in_all(run, masks, followed, placed, pictures), placed
 
 
 def _followed(
@@ -88,19 +88,19 @@ def _followed(
     return found
 
 
-def _seen_again(
+def _match_in_all(
     run: Run,
     masks: list[Mask | None],
     corners: Tracks,
     placed: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
-    """Locate corners in all images that see them, see `found_again`."""
+    """Locate corners in all images that see them, see `match_patches`."""
     seen, view = seen_in(corners, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
     views = views_of(placed.images, placed.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
-    return found_again(
+    return match_patches(
         seen,
         view,
         points,
@@ -111,7 +111,7 @@ def _seen_again(
     )
 
 
-def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
+def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
     """Resect images from the points of corners, and keep the poses that fit these better.
 
     Where many motion vectors share an error, an image gets a wrong pose that agrees with them. An

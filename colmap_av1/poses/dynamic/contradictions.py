@@ -29,14 +29,14 @@ _AGREES = 2.0
 # Residual above which a track of at least this length in images certainly contradicts.
 _SURELY_CONTRADICTS = 4.0
 _SURE_LENGTH = 12
-# Smallest length in images of a track that proves what lies behind others.
+# Smallest length in images of a track that is evidence for what lies behind other points.
 _LONG = 5
 # Largest residual of an observation, and its value where the track has no point or the point lies
 # behind the camera.
 _MAX_RESIDUAL = 20.0
-# A point occludes its surroundings in an image if these are farther by more than this factor. It
-# contradicts them if it does so in more than this share of at least so many images with at least
-# so many points there.
+# A point would occlude its surroundings in an image if these are farther by more than the first
+# factor. It contradicts them if it would do so in more than the second share of the images that
+# observe enough points there. The last two values are the fewest such images and points.
 _HIDES = 1.3
 _HIDDEN_SHARE = 0.5
 _MIN_IMAGES = 3
@@ -210,7 +210,7 @@ class Contradictions:
         return hiding | self._seen_through(agreeing & ~hiding)
 
     def unseen(self, left_out: _Bools) -> _Floats:
-        """Count the agreeing points that project into each cell but have no observation there.
+        """Count the agreeing points that project into each cell of images not observing them.
 
         Args:
             left_out: bool [num_tracks] tracks that are no evidence.
@@ -316,4 +316,4 @@ class Contradictions:
             steps[step_number] += steps[step_number - 1]
         first = at[2] * size + at[0] * stride + at[1]
         around = [down * stride + across for down in range(_AROUND) for across in range(_AROUND)]
-        return np.asarray(sum(count[first + beside] for beside in around), np.int64)
+        return np.asarray(sum(count[first + shift] for shift in around), np.int64)

@@ -35,7 +35,8 @@ _STRONG, _STRONG_SHARE = 0.35, 0.3
 # A track is dynamic if this share of its observations lies in dynamic cells, or the second share
 # and it contradicts the poses.
 _MOSTLY, _PARTLY = 0.55, 0.2
-# Width in cells of the neighbourhood in which most tracks must be dynamic, and at least so many.
+# A cell is dynamic if most tracks in a neighbourhood of this width in cells are, and at least this
+# many.
 _NEAR = 3
 _MIN_DYNAMIC = 2
 # The second pass no longer takes tracks known to be dynamic for evidence, and so finds more.
@@ -135,7 +136,7 @@ def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
 def _cells_of_tracks(
     placed: PlacedTracks, cells: _Bools, contradicts: _Bools
 ) -> tuple[_Bools, _Bools]:
-    """The cells in which most tracks are dynamic, and these tracks, which are so in all images."""
+    """The cells in which most tracks are dynamic, and the dynamic tracks."""
     every = _sum_around(placed.counts(np.ones(len(contradicts))), _NEAR)
     moving = np.zeros(len(contradicts), np.bool_)
     for _ in range(2):

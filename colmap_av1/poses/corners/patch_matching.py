@@ -77,7 +77,7 @@ class _Patches:
     fraction: _Floats
 
 
-def found_again(
+def match_patches(
     corners: Tracks,
     view: _Indices,
     points: TriangulatedPoints,
