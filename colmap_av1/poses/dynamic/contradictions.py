@@ -67,8 +67,8 @@ class PlacedTracks:
         row: int64 [num_observations] row of its cell.
         column: int64 [num_observations] column of its cell.
         depth: float64 [num_observations] depth of the track's point in the image; nan without one.
-        off: float64 [num_tracks] residual: root mean square of reprojection errors relative to the
-            expected ones.
+        residual: float64 [num_tracks] root mean square of the ratio of reprojection errors to
+            expected errors.
         xyz: float64 [num_tracks, 3] the points; nan without one.
     """
 
@@ -80,7 +80,7 @@ class PlacedTracks:
     row: _Ints
     column: _Ints
     depth: _Floats
-    off: _Floats
+    residual: _Floats
     xyz: _Floats
 
     @property
@@ -142,10 +142,10 @@ def place_tracks(
         error[own] = np.linalg.norm(seen - tracks.xy[own], axis=1)
         depth[own] = local[:, 2]
     expected = np.hypot(SIGMA_FLOOR, tracks.sigma)
-    off = np.minimum(np.nan_to_num(error / expected, nan=_MAX_RESIDUAL), _MAX_RESIDUAL)
+    ratio = np.minimum(np.nan_to_num(error / expected, nan=_MAX_RESIDUAL), _MAX_RESIDUAL)
     columns, rows = (-(-length // cell) for length in views[0].size)
     column, row = (tracks.xy // cell).astype(np.int64).T
-    squared = np.add.reduceat(off**2, offsets[:-1]) / np.diff(offsets)
+    squared = np.add.reduceat(ratio**2, offsets[:-1]) / np.diff(offsets)
     return PlacedTracks(
         shape=(len(views), rows, columns),
         cell=cell,
@@ -155,7 +155,7 @@ def place_tracks(
         row=np.clip(row, 0, rows - 1),
         column=np.clip(column, 0, columns - 1),
         depth=depth,
-        off=np.sqrt(squared),
+        residual=np.sqrt(squared),
         xyz=xyz,
     )
 
@@ -191,13 +191,15 @@ class Contradictions:
     @property
     def by_motion(self) -> _Bools:
         """Bool [num_tracks] tracks that fit no single point over their whole length."""
-        return np.asarray(self._placed.off > _CONTRADICTS)
+        return np.asarray(self._placed.residual > _CONTRADICTS)
 
     @property
     def surely_by_motion(self) -> _Bools:
         """Bool [num_tracks] long tracks with large residuals; drifting tracks are seldom long."""
         placed = self._placed
-        return np.asarray((placed.off > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH))
+        return np.asarray(
+            (placed.residual > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH)
+        )
 
     def by_depth(self, moving: _Bools) -> _Bools:
         """Tracks whose points would occlude other points, or are seen through a surface.
@@ -228,7 +230,7 @@ class Contradictions:
     @property
     def _agreeing(self) -> _Bools:
         placed = self._placed
-        return np.asarray((placed.off < _AGREES) & np.isfinite(placed.xyz[:, 0]))
+        return np.asarray((placed.residual < _AGREES) & np.isfinite(placed.xyz[:, 0]))
 
     def _show(self, view: PosedCamera, there: _Ints, rows: _Ints) -> _Shown:
         placed = self._placed

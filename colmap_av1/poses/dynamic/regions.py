@@ -28,9 +28,9 @@ _MIN_TRACKS = 4
 _MAY, _SURELY = 0.27, 0.6
 _MIN_SURE = 400
 _SURE_SHARE = 0.3
-# A patch of a region in one image is kept if more than this share of its cells has a vote, as
-# above, of more than this. Patches that belong to a region only in time, where people have passed,
-# have fewer.
+# A patch of a region in one image is kept if the mean votes of more than the second share of its
+# cells exceed that of static cells by more than the first value. This drops patches that belong to
+# a region only through other images, at the edges of where people have passed.
 _STRONG, _STRONG_SHARE = 0.35, 0.3
 # A track is dynamic if this share of its observations lies in dynamic cells, or the second share
 # and it contradicts the poses.
@@ -45,7 +45,7 @@ _PASSES = 2
 _CLOSED = 3
 
 
-def moving_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
+def dynamic_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
     """Find the dynamic cells of images.
 
     Args:
@@ -109,7 +109,7 @@ def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Boo
     """
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
-    tracks = _sum_around(placed.counts(np.ones(len(placed.off))), _AROUND)
+    tracks = _sum_around(placed.counts(np.ones(len(placed.residual))), _AROUND)
     region, count = label(share > _MAY, structure=np.ones((3, 3, 3)))
     sure = (share > _SURELY) & (_sum_around(behind, _AROUND) >= tracks)
     num_sure = np.bincount(region[sure], minlength=count + 1)

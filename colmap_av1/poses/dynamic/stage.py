@@ -16,7 +16,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
-from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
+from colmap_av1.poses.dynamic.regions import dynamic_cells, mask_of_cells
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.selection import select_tracks
@@ -56,7 +56,7 @@ def moving_stage(
             for video in range(len(image_set.videos)):
                 own = np.flatnonzero(placed.sequence == video)
                 if len(own) >= _MIN_IMAGES:
-                    found |= _moving_in_video(run, tracks, placed, own)
+                    found |= _dynamic_masks(run, tracks, placed, own)
                 run.progress("moving", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
         left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
@@ -114,7 +114,7 @@ def _write(path: Path, masks: Mapping[str, Mask]) -> None:
         )
 
 
-def _moving_in_video(
+def _dynamic_masks(
     run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
 ) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
@@ -149,7 +149,7 @@ def _moving_in_video(
         num_threads=run.options.match.run.num_threads,
         progress=no_progress,
     )
-    cells = moving_cells(place_tracks(seen, image, points, views, cell=cell), views)
+    cells = dynamic_cells(place_tracks(seen, image, points, views, cell=cell), views)
     return {
         own_image.name: mask_of_cells(moving, cell, size)
         for own_image, moving in zip(images, cells, strict=True)
