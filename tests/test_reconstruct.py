@@ -246,7 +246,7 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
 
     tracks = []
     for name, held in (("once", 1 << 40), ("twice", 0)):
-        monkeypatch.setattr("colmap_av1.poses.track_stage._MOST_HELD", held)
+        monkeypatch.setattr("colmap_av1.poses.track_stage._MAX_HELD", held)
         monkeypatch.setattr(
             "colmap_av1.poses.track_stage.spread_images",
             lambda *_: np.arange(0, 60, 5, dtype=np.int32),
@@ -423,7 +423,7 @@ def test_pictures_that_contradict_the_poses(
     copy: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
 ) -> None:
     """Places seen again are linked then, unless there must be no links."""
-    monkeypatch.setattr("colmap_av1.poses.long_range._FAR_APART", 0.0)
+    monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
     for name in ("far_views", "seams"):
         (copy / ".stages" / f"{name}.json").unlink()

@@ -1,1 +1,1 @@
-"""Which frames become images, under which names, and their camera."""
+"""The images: choosing frames, naming, reading and writing files, masks and photos."""

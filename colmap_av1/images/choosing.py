@@ -1,4 +1,4 @@
-"""Which frames of a video become images: by count, rate, list, time or parallax."""
+"""Choose the frames of a video that become images: by count, rate, list, time or parallax."""
 
 from __future__ import annotations
 
@@ -34,20 +34,21 @@ _Image = NDArray[np.uint8]
 
 # Longer side in pixels at which sharpness is measured.
 _SHARPNESS_SIZE = 640
-# A frame is blurred where it is less sharp than this share of the sharpest one near it.
+# A frame is blurred if its sharpness is less than this share of the sharpest frame nearby.
 _BLURRED = 0.7
-# A neighbour is as good where it shares this share of the tracks with the images beside it.
+# A frame may replace a blurred one if it has at least this share of the tracks that the blurred one
+# has in common with the neighbouring images.
 _AS_GOOD = 0.9
-# How far from its place an image may move, as a share of the distance to the next.
+# Largest distance by which an image may move, as a share of the distance to the next one.
 _REACH = 0.25
-# Focal length that the camera's rotation is judged with, in units of the longer side; what
-# matters is where pictures change by more than a rotation, which depends on it but little.
+# Focal length assumed for fitting the camera's rotation, in units of the longer side. The remaining
+# motion depends little on it.
 _FOCAL_LENGTH = 1.2
 _IRLS_ITERATIONS = 10
-# Tracks, spread over the picture, that the rotation is fitted to at most.
-_MOST_STEPS = 1000
-# Share of plain motion that counts as parallax: rotation explains away much of the motion
-# of a scene that is flat.
+# Largest number of tracks, spread over the picture, that the rotation is fitted to.
+_MAX_STEPS = 1000
+# Share of the whole motion that is added to parallax: in a flat scene, a rotation explains much of
+# the motion.
 _MOTION_SHARE = 0.1
 
 
@@ -65,11 +66,11 @@ class ChosenImages:
 
     @property
     def frame_of(self) -> dict[str, int]:
-        """The display index of each image, by its name."""
+        """The display index of each image, by name."""
         return dict(zip(self.names, self.frames.tolist(), strict=True))
 
     def some(self, index: Sequence[int] | NDArray[np.integer[Any]]) -> ChosenImages:
-        """Some of the images, by their index, ascending."""
+        """Select images by their indices, which must ascend."""
         return ChosenImages([self.names[i] for i in index], self.frames[np.asarray(index, int)])
 
 
@@ -82,24 +83,25 @@ def choose_images(
     times: Callable[[], NDArray[np.float64] | None],
     decode: Callable[[], Iterable[tuple[int, _Image]]],
 ) -> ChosenImages:
-    """Choose the frames that are images: those that existing images show, else by the options.
+    """Choose the frames that become images: the frames of existing images, else by the options.
 
-    Existing images are identified by `frame_list`; by `every`, in the order of their names from
-    frame 0 on, or with `first_number` by the numbers in them; or by count and names, see
-    `frames_of_images`. Where these leave doubt or turn out wrong, and the files are there, what
-    they show says it.
+    The frames of existing images are determined by `frame_list`; by `every`, in the order of their
+    names from frame 0, or with `first_number` by the numbers in their names; or by count and names,
+    see `frames_of_images`. If these are ambiguous or wrong, and the files exist, the frames are
+    found by content.
 
     Args:
         tracks: tracks through all frames.
         options: how to choose.
-        existing: names of images that exist, in any order.
-        folder: folder of the images; None: no picture is looked at.
-        times: gives the frames' times in seconds, None where unknown.
-        decode: gives (display index, picture) of all frames.
+        existing: names of existing images, in any order.
+        folder: folder of the images; None: no picture is decoded.
+        times: returns the times of the frames in seconds; None if unknown.
+        decode: yields (display index, picture) of all frames.
 
     Raises:
-        ImageError: the images do not say which frames they are, or fewer than two are chosen.
-        OptionError: an option does not go with existing images, or `fps` needs times.
+        ImageError: the frames of the existing images cannot be determined, or fewer than two are
+            chosen.
+        OptionError: an option does not apply to existing images, or `fps` needs times.
     """
     if existing:
         chosen = _find_existing(tracks.num_frames, options, existing, folder, decode)
@@ -165,12 +167,12 @@ def choose_frames(
 
 
 def parallax(tracks: Tracks) -> NDArray[np.float64]:
-    """Parallax between consecutive pictures: motion beyond the camera's rotation.
+    """Parallax between consecutive pictures: motion that the camera's rotation does not explain.
 
-    To each pair of neighbouring frames the motion field of a rotation (Longuet-Higgins and
-    Prazdny 1980, for a focal length of 1.2 times the longer side) is fitted, robustly; what
-    remains is median parallax. A tenth of the plain motion is added, as the rotation also
-    takes the part of a flat scene.
+    The motion field of a rotation (Longuet-Higgins and Prazdny 1980, for a focal length of 1.2
+    times the longer side) is fitted robustly to each pair of neighbouring frames. The parallax is
+    the median of the remaining motion. A tenth of the whole motion is added, since in a flat scene
+    the rotation explains part of the parallax.
 
     Returns:
         float64 [num_frames - 1] pixels from each frame to the next, all above 0.
@@ -186,13 +188,13 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
         steps = order[bounds[frame] : bounds[frame + 1]]
         if len(steps) < 3:
             continue
-        steps = steps[:: -(-len(steps) // _MOST_STEPS)]
+        steps = steps[:: -(-len(steps) // _MAX_STEPS)]
         motion = (tracks.xy[steps + 1] - tracks.xy[steps]).astype(np.float64)
         remains = motion - _rotation_field(tracks.xy[steps] - centre, motion, focal)
-        plain = np.median(np.hypot(motion[:, 0], motion[:, 1]))
-        found[frame] = np.median(np.hypot(remains[:, 0], remains[:, 1])) + _MOTION_SHARE * plain
+        whole = np.median(np.hypot(motion[:, 0], motion[:, 1]))
+        found[frame] = np.median(np.hypot(remains[:, 0], remains[:, 1])) + _MOTION_SHARE * whole
     known = np.isfinite(found)
-    # Where nothing is tracked something happened: a typical step stands for it.
+    # Assume a typical step where no track connects two frames.
     typical = float(np.median(found[known])) if known.any() else 1.0
     return np.maximum(np.where(known, found, typical), 1e-6)
 
@@ -202,15 +204,15 @@ def skip_blurred(
     tracks: Tracks,
     sharpness: Callable[[Sequence[int]], NDArray[np.float64]],
 ) -> NDArray[np.int32]:
-    """Replace blurred frames by sharp ones nearby that overlap as well.
+    """Replace blurred frames by sharp ones nearby.
 
-    An image moves within a quarter of the distance to its neighbours, to the sharpest frame
-    that shares nearly as many tracks with them. The first and the last image stay.
+    An image moves by at most a quarter of the distance to its neighbours, to the sharpest frame
+    that has nearly as many tracks in common with them. The first and the last image stay.
 
     Args:
         frames: chosen frames, ascending.
         tracks: tracks through all frames.
-        sharpness: measures frames; called once, with ascending frames.
+        sharpness: returns the sharpness of frames; called once, with ascending frames.
 
     Returns:
         int32 [len(frames)] frames, strictly ascending.
@@ -241,15 +243,15 @@ def skip_blurred(
 def read_frame_list(
     path: str | os.PathLike[str], num_frames: int, options: ImageOptions
 ) -> ChosenImages:
-    """Read which frames are images, and their names.
+    """Read which frames become images, and their names, from a text file.
 
-    A line holds the index of a frame, from 0, and if wanted the image's name; or a name
-    alone, whose last number is the frame's, from `first_number` (0 where that is None). Empty
-    lines and those that start with '#' say nothing.
+    A line holds the index of a frame, from 0, optionally followed by the name of the image; or only
+    a name, whose last number is that of the frame, counted from `first_number` (0 if None). Empty
+    lines and lines that start with '#' are ignored.
 
     Raises:
-        ImageError: the file is missing, or names a frame that the video does not have, a frame
-            twice, or two images alike.
+        ImageError: the file is missing, or lists a frame that the video does not have, or a frame
+            or a name twice.
     """
     entries = _read_entries(path, options)
     for number, frame, _ in entries:
@@ -264,7 +266,7 @@ def read_frame_list(
 
 
 def check_frame_list(options: ImageOptions) -> None:
-    """Refuse a list of frames that is incomplete, whatever the video.
+    """Check the format of a list of frames before the number of frames is known.
 
     Raises:
         ImageError: see `read_frame_list`.
@@ -276,11 +278,11 @@ def check_frame_list(options: ImageOptions) -> None:
 def _read_entries(
     path: str | os.PathLike[str], options: ImageOptions
 ) -> list[tuple[int, int, str]]:
-    """Number of the line, frame and image name of each entry of a list of frames."""
+    """Line number, frame and image name of each entry of a list of frames."""
     try:
         lines = read_lines(path)
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise ImageError(
             f"{path}: cannot be read as a list of frames: {reason}: give a text file with a "
             "frame's index on each line"
@@ -297,7 +299,9 @@ def _read_entries(
             name = line.strip()
             found = last_number(name)
             if found is None:
-                raise ImageError(f"{path}, line {number}: '{name}' names no frame: give its index")
+                raise ImageError(
+                    f"{path}, line {number}: '{name}' has no frame number: give the frame's index"
+                )
             frame = found - (options.first_number or 0)
         entries.append((number, frame, name))
     for what, values in (
@@ -306,7 +310,7 @@ def _read_entries(
     ):
         twice = next((v for v, count in Counter(values).items() if count > 1), None)
         if twice is not None:
-            raise ImageError(f"{path}: gives the {what} {twice} twice: remove one line")
+            raise ImageError(f"{path}: lists {what} {twice} twice: remove one line")
     return entries
 
 
@@ -317,12 +321,12 @@ def _find_existing(
     folder: Path | None,
     decode: Callable[[], Iterable[tuple[int, _Image]]],
 ) -> ChosenImages:
-    """The frames of images that exist."""
+    """Find the frames of existing images."""
     wrong = next((n for n in ("num_images", "fps") if getattr(options, n) is not None), None)
     if wrong is not None:
         raise OptionError(
-            f"{wrong} chooses new images, but there are {len(names)} already: leave it out, or "
-            "give a new database and folder"
+            f"{wrong} chooses new images, but {len(names)} exist already: leave it out, or give a "
+            "new database and folder"
         )
     by_name = [names[i] for i in natural_order(names)]
     files = [image_file(folder, name) for name in by_name] if folder is not None else []
@@ -333,7 +337,7 @@ def _find_existing(
         odd = sorted(set(names) ^ set(chosen.names))
         if odd:
             where = "has no image" if odd[0] in chosen.names else f"{options.frame_list} has no"
-            raise ImageError(f"{where} '{odd[0]}': list each image that exists, and no other")
+            raise ImageError(f"{where} '{odd[0]}': list exactly the images that exist")
     elif options.every is not None:
         chosen = _in_order(by_name, _at_steps(by_name, num_frames, options))
     else:
@@ -345,7 +349,7 @@ def _find_existing(
             return _by_content(by_name, files, decode)
         chosen = _in_order(by_name, frames)
     if files:
-        # The first and the last: a wrong start or rate shows there.
+        # A wrong start or rate shows at the first or the last image.
         ends = sorted({0, len(chosen.names) - 1})
         paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
         check_content(paths, chosen.frames[ends].tolist(), decode())
@@ -357,9 +361,9 @@ def _by_content(
     files: Sequence[Path],
     decode: Callable[[], Iterable[tuple[int, _Image]]],
 ) -> ChosenImages:
-    """Images identified by what they show, without those that repeat the one before.
+    """Find the frames of images by content, without images that repeat the previous one.
 
-    ffmpeg's fps filter repeats pictures where the video has fewer.
+    FFmpeg's fps filter repeats pictures if the video has a lower rate.
     """
     try:
         return _in_order(names, frames_by_content(files, decode()))
@@ -371,8 +375,8 @@ def _by_content(
     once = sorted(set(range(len(files))) - set(repeated))
     frames = frames_by_content([files[k] for k in once], decode())
     warnings.warn(
-        f"{files[0].parent}: ignored {len(repeated)} images that repeat the one before, the first "
-        f"is '{names[repeated[0]]}'",
+        f"{files[0].parent}: ignored {len(repeated)} images that repeat the previous one, the "
+        f"first is '{names[repeated[0]]}'",
         stacklevel=2,
     )
     return _in_order([names[k] for k in once], frames)
@@ -388,7 +392,7 @@ def _in_order(names: Sequence[str], frames: NDArray[np.int32]) -> ChosenImages:
 
 
 def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> NDArray[np.int32]:
-    """The frames of images that show one in every `every` frames."""
+    """The frames of existing images if every `every`-th frame is an image."""
     step = options.every or 1
     numbers = list(range(len(names)))
     if options.first_number is not None:
@@ -403,14 +407,14 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
                 f"{num_frames - 1}: give another every or first_number"
             )
     if len(set(numbers)) < len(numbers):
-        raise ImageError("two images have one number: name their frames with --frame_list")
+        raise ImageError("two images have the same number: list their frames in a --frame_list")
     return np.array(numbers, dtype=np.int32) * step
 
 
 def _sharpness(
     frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
 ) -> NDArray[np.float64]:
-    """Variance of the Laplacian of some frames, at a size at which noise matters little."""
+    """Variance of the Laplacian of some frames, downscaled to reduce noise."""
     wanted = set(frames)
     measured: list[float] = []
     for index, picture in pictures:
@@ -423,7 +427,7 @@ def _sharpness(
 
 
 def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
-    """The frames that ffmpeg's fps filter takes: the last whose time rounds to a tick or below."""
+    """The frames that FFmpeg's fps filter selects: the last ones that round to a tick or below."""
     tick = np.floor(times * fps + 0.5)
     interval = np.median(np.diff(times)) if len(times) > 1 else 0.0
     num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + 0.5))
@@ -432,7 +436,7 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
 
 
 def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of the nearest of ascending positions to each wanted one; the earlier of two."""
+    """Index of the position nearest to each wanted one, the earlier of two; positions ascend."""
     above = np.clip(np.searchsorted(places, wanted), 1, max(len(places) - 1, 1))
     if len(places) == 1:
         return np.zeros(len(wanted), dtype=np.int64)
@@ -441,7 +445,7 @@ def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArra
 
 
 def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
-    """Ascending frames, moved as little as it takes to be all different and below `count`."""
+    """Move ascending frames so that they are distinct and below `count`."""
     index = np.arange(len(frames))
     pushed_up = np.maximum.accumulate(frames - index) + index
     most = count - len(frames) + index
@@ -451,7 +455,7 @@ def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
 def _rotation_field(
     xy: NDArray[np.float64], motion: NDArray[np.float64], focal: float
 ) -> NDArray[np.float64]:
-    """Motion [n, 2] at positions [n, 2] from the picture's centre by the best-fitting rotation."""
+    """Motion [n, 2] of the best-fitting rotation at positions [n, 2] from the picture's centre."""
     x, y = xy[:, 0] / focal, xy[:, 1] / focal
     columns = np.empty((len(xy), 2, 3))
     columns[:, 0] = focal * np.stack([x * y, -(1 + x * x), y], axis=1)
@@ -463,13 +467,13 @@ def _rotation_field(
         rows = (columns * scale[:, :, None]).reshape(-1, 3)
         turn = np.linalg.lstsq(rows, (motion * scale).reshape(-1), rcond=None)[0]
         field = columns @ turn
-        # Least absolute distances: what moves otherwise pulls no harder for being far.
+        # Weights for least absolute residuals, which are robust to other motion.
         weight = 1 / np.maximum(np.hypot(*(motion - field).T), 1e-3)
     return np.asarray(field)
 
 
 def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
-    """A function that lists the tracks a frame sees, ascending."""
+    """A function that returns the tracks observed in a frame, ascending."""
     number = tracks.track
     order = tracks.order_by_frame()
     bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))

@@ -1,4 +1,4 @@
-"""Image files: existing ones, and those that are written."""
+"""Read, check and write image files."""
 
 from __future__ import annotations
 
@@ -37,22 +37,23 @@ from colmap_av1.video.facts import read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
-# Images that others wrote are only read.
+# Extensions of images that can be read.
 READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
-# Frames waiting to be compressed, per thread; bounds memory.
+# Number of frames per thread that wait for compression. It bounds memory.
 _QUEUE_PER_THREAD = 2
-# Longer side in pixels at which detail is looked for: larger pictures are soft at their full size,
-# and not the worse for it.
-_DETAILED_SIZE = 960
-# A pixel is detail where its grey value changes by more than this when the picture is halved and
-# enlarged again. Of sharp videos 2 to 30 % of the pixels are, of one that was blurred by Gaussians
-# of 2.5 to 12 px none of ten thousand or two.
+# Longer side in pixels at which detail is measured. Larger pictures are often soft at full size,
+# which does no harm.
+_DETAIL_SIZE = 960
+# A pixel has detail if its grey value changes by more than this when the picture is halved and
+# enlarged again. 2 to 30 % of the pixels of sharp videos have detail, and at most two in ten
+# thousand after a Gaussian blur of 2.5 to 12 px. Images with less than the second share are
+# blurred.
 _VISIBLE = 8.0
-_LEAST_DETAIL = 0.005
-# Detail along rows, columns and both diagonals, which motion blur leaves across its direction only:
-# second differences of grey values. Sharp videos have 12 % and more of that in the richest
-# direction in any other, those that were blurred along a line of 9 px 3 % at most, of 25 to 80 px
-# half a per cent, with noise of 3 grey levels, too.
+_MIN_DETAIL = 0.005
+# Second differences of grey values along rows, columns and both diagonals. Motion blur leaves
+# detail only across its direction. In sharp videos, the poorest direction has at least 12 % of the
+# detail of the richest; after a blur along a line of 9 px at most 3 %, of 25 to 80 px 0.5 %, even
+# with noise of 3 grey levels.
 _SECOND_DIFFERENCES = tuple(
     np.array(kernel, np.float32) / 4
     for kernel in (
@@ -62,24 +63,24 @@ _SECOND_DIFFERENCES = tuple(
         [[0, 0, -1], [0, 2, 0], [-1, 0, 0]],
     )
 )
-_LEAST_OF_RICHEST = 0.02
-# Images that are looked at, of a video.
-_NUM_DETAILED = 5
+_MIN_OF_RICHEST = 0.02
+# Number of images of a video in which detail is measured.
+_NUM_MEASURED = 5
 
 
 def size_of_images(
     sizes: Mapping[str, tuple[int, int]], video_size: tuple[int, int], pixel_aspect: float = 1.0
 ) -> tuple[int, int]:
-    """The common size of existing images: that of the video's pictures, or these scaled.
+    """The common size of existing images, which may be scaled.
 
     Args:
-        sizes: (width, height) of each image, by name; empty where none exist.
-        video_size: (width, height) of the pictures, turned as players do.
-        pixel_aspect: width of the pictures' pixels over their height; images whose pixels were
-            made square fit, too.
+        sizes: (width, height) of each image, by name; empty if there are none.
+        video_size: (width, height) of the video's pictures, rotated as players show them.
+        pixel_aspect: width of the pictures' pixels over their height; images with square pixels
+            are accepted as well.
 
     Raises:
-        ImageError: the images differ in size, or in shape from the video's pictures.
+        ImageError: the images differ in size, or their aspect ratio differs from the video's.
     """
     if not sizes:
         return video_size
@@ -88,7 +89,7 @@ def size_of_images(
         if size != first:
             raise ImageError(
                 f"image '{name}' is {size[0]}x{size[1]}, '{first_name}' {first[0]}x{first[1]}: "
-                "images of one video have one size; match those of other cameras apart"
+                "images of one video have one size; match those of other cameras separately"
             )
     width, height = video_size
     square = (width * pixel_aspect, height)
@@ -96,41 +97,41 @@ def size_of_images(
         turned = first == video_size[::-1]
         raise ImageError(
             f"image '{first_name}' is {first[0]}x{first[1]}, the video's pictures are "
-            f"{width}x{height}{' as players turn them' if turned else ''}: give the video that "
-            "it comes from, or begin with a new database and folder"
+            f"{width}x{height}{' as players rotate them' if turned else ''}: give the video that "
+            "it comes from, or start with a new database and folder"
         )
     return first
 
 
 def has_shape(size: tuple[int, int], of: tuple[float, float]) -> bool:
-    """Whether a (width, height) is another one scaled, rounded to whole pixels."""
+    """Whether a (width, height) is a scaled version of another one, rounded to whole pixels."""
     return abs(size[0] * of[1] - size[1] * of[0]) <= max(*size, *of)
 
 
 def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> None:
-    """Check that images, which are scaled and so cannot be written, are in a folder.
+    """Check that scaled images, which cannot be written, exist in a folder.
 
     Raises:
-        ImageError: one is missing.
+        ImageError: an image is missing.
     """
     missing = next((n for n in names if not image_file(Path(folder), n).exists()), None)
     if missing is not None:
         raise ImageError(
-            f"{Path(folder) / missing}: is missing, and the images have another size than the "
-            "video, so it cannot be written: give the folder that holds all images"
+            f"{Path(folder) / missing}: is missing, and cannot be written because the images "
+            "differ in size from the video: give the folder that holds all images"
         )
 
 
 def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
-    """Images that a folder already holds, unless an earlier run of this package wrote them.
+    """Images in a folder, unless an earlier run of this package wrote them.
 
     Args:
         folder: the folder; it need not exist.
         pattern: pattern of the names of new images, see `image_names`.
 
     Returns:
-        File names in their natural order; none where frame 0 is there under the name that the
-        pattern gives it. Other programs count from 1.
+        File names in natural order; empty if frame 0 exists under the name that the pattern gives
+        it, since other programs count from 1.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -150,7 +151,7 @@ def check_image_folder(
     names: Sequence[str] | str,
     video_size: tuple[int, int],
 ) -> None:
-    """Check that images can be written to a folder and that those there have the right size.
+    """Check that images can be written to a folder and that existing ones have the right size.
 
     Args:
         folder: the folder; it need not exist.
@@ -158,9 +159,9 @@ def check_image_folder(
         video_size: (width, height) of the video.
 
     Raises:
-        ImageError: the folder is a file or not writable, a name leaves the folder, or an
-            image there is of another size or unreadable.
-        OptionError: the pattern or an extension is none of an image.
+        ImageError: the folder is a file or not writable, a name leaves the folder, or an existing
+            image is unreadable or has another size.
+        OptionError: the pattern or an extension is not that of an image.
     """
     root = Path(folder)
     existing_parent = root
@@ -190,12 +191,12 @@ def check_image_folder(
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Make a folder of images and hold it as long as the body runs; waits for other processes.
+    """Create a folder of images and lock it while the body runs; waits for other processes.
 
-    File systems without locks, and Windows, let others go on.
+    On Windows, and on file systems without locks, the folder is not locked.
 
     Raises:
-        ImageError: it cannot be made.
+        ImageError: the folder cannot be created.
     """
     is_new = not folder.exists()
     try:
@@ -212,13 +213,13 @@ def alone_in(folder: Path) -> Iterator[None]:
             yield
         except BaseException:
             if is_new:
-                with contextlib.suppress(OSError):  # it holds images
+                with contextlib.suppress(OSError):  # not empty
                     folder.rmdir()
             raise
 
 
 def files_in(folder: Path) -> set[Path]:
-    """The files in a folder and those below it; none where there is no such folder."""
+    """All files in a folder and its subfolders; empty if the folder does not exist."""
     return {Path(parent, name) for parent, _, names in os.walk(folder) for name in names}
 
 
@@ -242,26 +243,26 @@ def write_images(
 
     Args:
         video: the video file.
-        folder: where the images go; made where missing.
-        names: the images' names, which may hold folders.
+        folder: folder for the images; created if missing.
+        names: the images' names, which may contain folders.
         frames: display index of each image.
-        num_threads: threads; None: one per CPU.
+        num_threads: number of threads; None: one per CPU.
         operating_point: operating point of a scalable stream.
-        change: called with (display_index, picture) of each image that is not there yet, in
-            display order; gives the picture to write.
-        display: how pictures are cut and turned; None: as players do.
-        kept: what it holds is not decoded.
+        change: called with (display_index, picture) of each missing image in display order;
+            returns the picture to write.
+        display: how pictures are cropped and rotated; None: as players do.
+        kept: store of decoded pictures, which are not decoded again.
         progress: called with the number of images done so far.
 
     Returns:
-        The number of images written; the others were there.
+        The number of images written; the others existed.
 
     Raises:
         ImageError: an image cannot be written, the frames change their size, or the decoder
-            gives fewer frames than asked for.
-        BitstreamError: the stream cannot be decoded up to the last frame asked for.
-        VideoError: the video cannot be read, or changes meanwhile; then what was written of it
-            is removed.
+            returns too few frames.
+        BitstreamError: the stream cannot be decoded up to the last frame.
+        VideoError: the video cannot be read, or changes meanwhile; images written from it are then
+            removed.
     """
     root = Path(folder)
     wanted = {
@@ -285,7 +286,7 @@ def write_images(
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ImageError(
-                f"{parent}: cannot be made: {error.strerror}: fix that, or give another path"
+                f"{parent}: cannot be created: {error.strerror}: fix that, or give another path"
             ) from error
         remove_leftovers(parent)
     try:
@@ -301,11 +302,11 @@ def write_images(
             )
             with contextlib.closing(decoded):
                 _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)
-    except VideoError:  # images of two videos would be kept as those of one
+    except VideoError:  # a later run would mix these images with those of the new video
         for path in wanted.values():
             path.unlink(missing_ok=True)
         for parent in made:
-            with contextlib.suppress(OSError):  # it holds what was not written here
+            with contextlib.suppress(OSError):  # not empty
                 parent.rmdir()
         raise
     return len(wanted)
@@ -318,7 +319,7 @@ def _write_frames(
     num_threads: int,
     report: Callable[[int], None],
 ) -> None:
-    """Write the wanted ones of the frames, on threads; `report` gets how many are written."""
+    """Write the wanted frames on threads; `report` is called with the number written so far."""
     size: tuple[int, ...] | None = None
     queue: list[Future[None]] = []
     num_taken = 0
@@ -330,7 +331,7 @@ def _write_frames(
                 size = size or picture.shape
                 if picture.shape != size:
                     raise ImageError(
-                        f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, those before "
+                        f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, earlier ones are "
                         f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
                         "re-encode the video at one size"
                     )
@@ -343,13 +344,13 @@ def _write_frames(
                     report(num_taken - len(queue))
                 if index >= last:
                     break
-            for future in queue:  # left where the decoder ends early
+            for future in queue:  # not empty if the decoder ends early
                 future.result()
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     if num_taken < len(wanted):
         raise ImageError(
-            f"the decoder gives no frame {sorted(wanted)[num_taken]} of the {last + 1} that the "
+            f"the decoder returns no frame {sorted(wanted)[num_taken]} of the {last + 1} that the "
             "stream shows: leave out the images, or re-encode the video"
         )
 
@@ -358,18 +359,18 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """Read an image file: uint8 [height, width, 3] BGR.
 
     Raises:
-        ImageError: it is missing, or none that can be read.
+        ImageError: it is missing or cannot be read.
     """
-    # COLMAP, too, takes pixels as they are stored and leaves an orientation in EXIF alone.
+    # COLMAP ignores the EXIF orientation, too.
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     if not may_read(path):
         raise ImageError(f"{path}: no permission to read it: change that")
     image = None
     try:
-        # OpenCV opens no path that is not UTF-8.
+        # OpenCV cannot open paths that are not UTF-8.
         data = path.read_bytes() if path.is_file() else b""
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how) if data else None
-    except cv2.error as error:  # more pixels than OpenCV takes
+    except cv2.error as error:  # more pixels than OpenCV accepts
         raise ImageError(f"{path}: is too large for an image: give the folder of the images") from (
             error
         )
@@ -381,31 +382,31 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def blur_warning(files: Sequence[Path]) -> str | None:
-    """What the user should know of images that are all blurred, by the pictures of a few.
+    """Warning if the images are blurred, measured in a few of them.
 
     Raises:
         ImageError: an image is missing or cannot be read.
     """
-    some = [files[i] for i in evenly_spread(len(files), _NUM_DETAILED, rounded=True)]
-    greys = [grey_within(read_image(file), _DETAILED_SIZE) for file in some]
-    if float(np.median([_detail(grey) for grey in greys])) < _LEAST_DETAIL:
+    some = [files[i] for i in evenly_spread(len(files), _NUM_MEASURED, rounded=True)]
+    greys = [grey_within(read_image(file), _DETAIL_SIZE) for file in some]
+    if float(np.median([_detail(grey) for grey in greys])) < _MIN_DETAIL:
         return (
-            f"{files[0].parent}: the images are blurred, dark or plain, half their size would show "
-            "as much: tracks in them are few and inexact; film in focus, in good light and more "
-            "slowly"
+            f"{files[0].parent}: the images are blurred, dark or lack texture; half their size "
+            "would show as much: their tracks are few and inaccurate; film in focus, in good light "
+            "and more slowly"
         )
     directions = np.median([_detail_by_direction(grey) for grey in greys], axis=0)
-    if directions.min() < _LEAST_OF_RICHEST * directions.max():
+    if directions.min() < _MIN_OF_RICHEST * directions.max():
         return (
-            f"{files[0].parent}: the images are blurred along one direction, as by the camera's "
-            "motion: tracks in them are few and inexact; film more slowly, or in more light, which "
-            "makes exposures shorter"
+            f"{files[0].parent}: the images are blurred in one direction, as by camera motion: "
+            "their tracks are few and inaccurate; film more slowly, or in more light, which "
+            "shortens the exposure"
         )
     return None
 
 
 def _detail(grey: NDArray[np.uint8]) -> float:
-    """Share of the pixels that are detail."""
+    """Share of the pixels that have detail."""
     height, width = grey.shape
     half = (max(1, width // 2), max(1, height // 2))
     small = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
@@ -414,7 +415,7 @@ def _detail(grey: NDArray[np.uint8]) -> float:
 
 
 def _detail_by_direction(grey: NDArray[np.uint8]) -> list[float]:
-    """Share of the pixels that are detail along rows, columns and both diagonals."""
+    """Share of the pixels that have detail along rows, columns and both diagonals."""
     return [
         float(np.mean(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)) > _VISIBLE))
         for kernel in _SECOND_DIFFERENCES
@@ -422,7 +423,7 @@ def _detail_by_direction(grey: NDArray[np.uint8]) -> list[float]:
 
 
 def grey_within(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """The grey picture of a BGR one, made smaller where its longer side has more pixels than so."""
+    """Convert a BGR picture to grey, downscaled if its longer side exceeds `longest` pixels."""
     scale = min(1.0, longest / max(picture.shape[:2]))
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -433,7 +434,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, without decoding it in full.
 
     Raises:
-        ImageError: it is none that can be read.
+        ImageError: the file cannot be read as an image.
     """
     size = (0, 0)
     if path.exists() and not path.is_file():
@@ -455,8 +456,8 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Write an image (BGR), PNG or JPEG by its extension; it appears when it is complete.
 
     Raises:
-        ImageError: it cannot be written.
-        OptionError: the extension is none of these.
+        ImageError: the file cannot be written.
+        OptionError: the extension is that of another format.
     """
     check_extension(path.name)
     suffix = path.suffix.lower()

@@ -1,4 +1,4 @@
-"""Images of several videos and photos, counted through, and their pictures."""
+"""The image set of several videos and photos, and the pictures of its images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from colmap_av1.video.facts import Video
 from colmap_av1.video.kept_pictures import KeptPictures
 
 Image = NDArray[np.uint8]
-# Gives the pictures of images, by index, ascending.
+# Yields the pictures of images, given by their indices, in ascending order.
 Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
 
 
@@ -32,11 +32,12 @@ class ImageSet:
     numbered through all sequences, in the order of the sequences.
 
     Attributes:
-        videos: what messages call the videos, which are the first sequences; '' of a lone one.
-        images: their names among all images, and frames numbered through all sequences.
+        videos: names of the videos for messages; '' for a single video. The videos are the first
+            sequences.
+        images: names of the images, and their frames, numbered through all sequences.
         sequence: int32 [num_images] the sequence of each image, ascending.
         first_frame: int64 [num_sequences + 1] first frame of each sequence, and `num_frames`.
-        masks: the pixels of each image that count; None: all.
+        masks: which pixels of each image are used; None for all.
     """
 
     videos: tuple[str, ...]
@@ -57,7 +58,7 @@ class ImageSet:
 
     @property
     def masked(self) -> float | None:
-        """Share of the images' pixels that masks leave out; None without masks."""
+        """Share of the images' pixels that masks exclude; None without masks."""
         if all(mask is None for mask in self.masks):
             return None
         return 1.0 - sum(m.share if m is not None else 1.0 for m in self.masks) / len(self.masks)
@@ -68,14 +69,14 @@ class ImageSet:
         return range(int(first), int(last))
 
     def some(self, index: Sequence[int] | NDArray[np.int64]) -> ImageSet:
-        """Some of the images, by their index, ascending."""
+        """Select images by their indices, which must ascend."""
         chosen = np.asarray(index, dtype=np.int64)
         masks = tuple(self.masks[i] for i in chosen)
         taken = self.sequence[chosen]
         return replace(self, images=self.images.some(index), sequence=taken, masks=masks)
 
     def of_video(self, video: int) -> ChosenImages:
-        """The images of a video, at the frames of its own."""
+        """The images of a video, with frames numbered within the video."""
         own = self.images_of(video)
         names = self.images.names[own.start : own.stop]
         frames = self.images.frames[own.start : own.stop] - self.first_frame[video]
@@ -90,14 +91,14 @@ def count_through(
     *,
     masks: Sequence[Sequence[Mask | None]] = (),
 ) -> ImageSet:
-    """Count the images of videos and photos through.
+    """Number the images of videos and photos through all sequences.
 
     Args:
-        videos: the folder of each video's images among all images; '' where they have none.
-        chosen: the images of each video, by their names in its folder.
+        videos: the folder of each video's images in the folder of all images; '' for none.
+        chosen: the images of each video, with names relative to its folder.
         num_frames: number of frames of each video.
-        photos: names of the photos among all images.
-        masks: those of the images of each video, then those of the photos; empty: there are none.
+        photos: names of the photos, relative to the folder of all images.
+        masks: masks of the images of each video, then of the photos; empty: no masks.
     """
     first = np.concatenate([[0], np.cumsum([*num_frames, *(1 for _ in photos)])]).astype(np.int64)
     names = [
@@ -122,14 +123,14 @@ def count_through(
 
 @dataclass(frozen=True)
 class ShownVideo:
-    """A video whose pictures are looked at, in the size of its images.
+    """A video and how its pictures are displayed in its images.
 
     Attributes:
         video: the video.
         size: (width, height) of the images in pixels; pictures of another size are resized.
-        pixel_aspect: width of a pixel of theirs over its height.
-        display: how its pictures are cut and turned; None: as players do.
-        kept: keeps those that were decoded; None: they are decoded each time.
+        pixel_aspect: width of the images' pixels over their height.
+        display: how pictures are cropped and rotated; None: as players do.
+        kept: store of decoded pictures; None: pictures are decoded each time.
     """
 
     video: Video
@@ -170,7 +171,7 @@ def pictures_of(
     photos: Sequence[Path],
     options: ReadOptions,
 ) -> Pictures:
-    """What gives the pictures of images.
+    """A function that yields the pictures of images.
 
     Args:
         image_set: the images.
@@ -179,8 +180,8 @@ def pictures_of(
         options: how videos are decoded.
 
     Returns:
-        A function that decodes those videos which the asked images are of, up to the last of them.
-        Where a video is damaged the pictures after it are missing, with a warning.
+        A function that decodes the videos of the requested images, each up to the last of these.
+        The pictures after damage of a video are missing, with a warning.
     """
 
     def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
@@ -195,7 +196,7 @@ def pictures_of(
             }
             if image_of:
                 decoded = shown.pictures(
-                    max(image_of) + 1, options, wanted=image_of, use="pictures are looked at"
+                    max(image_of) + 1, options, wanted=image_of, use="pictures are used"
                 )
                 for frame, picture in decoded:
                     yield image_of[frame], picture

@@ -1,4 +1,4 @@
-"""The videos and photos of one run, opened once and told apart by name."""
+"""The videos and photos of a run, opened once and distinguished by names."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ _Path = str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Inputs:
-    """The videos and photos of one run.
+    """The videos and photos of a run.
 
     Attributes:
-        videos: the videos, in the order in which they were given.
-        labels: folder of each video's images among all images; '' of a lone one.
+        videos: the videos, in the given order.
+        labels: the folder of each video's images in the folder of all images; '' for a single
+            video.
         photos: the photos.
-        masks: what of their pictures counts; None: all does.
-        warnings: what the user should know of them.
+        masks: their masks; None: all pixels are used.
+        warnings: warnings about them.
     """
 
     videos: tuple[Video, ...]
@@ -48,17 +49,17 @@ class Inputs:
 
     @property
     def states(self) -> tuple[FileState, ...]:
-        """The states of all files as they were at the start."""
+        """The states of all files at the start."""
         return (*(video.state for video in self.videos), *(photo.state for photo in self.photos))
 
     @property
     def no_motion(self) -> NDArray[np.float32]:
-        """Shares of inter units of the photos, which have none."""
+        """Shares of inter units of the photos, which are 0."""
         return np.zeros(len(self.photos), np.float32)
 
     @property
     def masks_of_videos(self) -> list[VideoMasks | None]:
-        """The masks of each video; None where it has none."""
+        """The masks of each video; None for a video without masks."""
         return [self.masks.of_video(label) if self.masks else None for label in self.labels]
 
     def image_set(
@@ -67,12 +68,12 @@ class Inputs:
         num_frames: Sequence[int],
         photos: Sequence[Photo] | None = None,
     ) -> ImageSet:
-        """The images counted through, with their masks.
+        """The image set, with its masks.
 
         Args:
             chosen: the images of each video.
-            num_frames: number of frames of each.
-            photos: those of the photos that are images; None: all.
+            num_frames: number of frames of each video.
+            photos: the photos that become images; None: all.
 
         Raises:
             ImageError: some images of a video have a mask, and others have none.
@@ -85,7 +86,7 @@ class Inputs:
     def _masks_of_images(
         self, chosen: Sequence[ChosenImages], photos: Sequence[Photo]
     ) -> list[list[Mask | None]]:
-        """The masks of the images of each video, then those of photos; None where one has none."""
+        """The masks of the images of each video, then of the photos; None for images without."""
         if self.masks is None:
             return []
         of_videos: list[list[Mask | None]] = [
@@ -95,17 +96,17 @@ class Inputs:
         return [*of_videos, [self.masks.of_photo(photo.name, photo.size) for photo in photos]]
 
     def with_names(self, of_videos: Sequence[Sequence[str]]) -> list[str]:
-        """What is to be said of each video, with its name where there are several."""
+        """Notes about each video, prefixed with its name if there are several videos."""
         return _with_names(self.videos, of_videos)
 
     def conversion(self, of_videos: Sequence[str | None]) -> str | None:
-        """How videos were converted, in words; None where none was."""
+        """Description of how videos were converted; None if none was."""
         given = [[words] if words is not None else [] for words in of_videos]
         return "; ".join(self.with_names(given)) or None
 
     @property
     def name(self) -> str:
-        """What messages call them all."""
+        """Name of all videos for messages."""
         return ", ".join(str(video) for video in self.videos)
 
 
@@ -130,14 +131,13 @@ def read_inputs(
     *,
     flat: bool = False,
 ) -> Inputs:
-    """Open the videos and look at the photos of a run.
+    """Open the videos and read the metadata of the photos of a run.
 
     Args:
         video: a video, or several.
-        photos: folder of photos; None: there are none.
-        options: refused where they are for one video and there are several, or leave photos
-            without links.
-        flat: names of photos are made fit for trainers, see `read_photos`.
+        photos: folder of photos; None: no photos.
+        options: options of the run, checked against the number of videos and photos.
+        flat: give photos names that trainers accept, see `read_photos`.
 
     Raises:
         VideoError: a video cannot be read, is given twice, or shows all directions.
@@ -164,8 +164,8 @@ def read_inputs(
     _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
-    said = [(v.doubtful_times, doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
-    doubts = _with_names(videos, [[note for note in own if note is not None] for own in said])
+    doubtful = [(v.doubtful_times, doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
+    doubts = _with_names(videos, [[note for note in own if note is not None] for own in doubtful])
     notes = (*hints, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
     if options.masks.mask_path is None:
@@ -173,23 +173,23 @@ def read_inputs(
     counts = [count_shown(video) for video in videos]
     masks = read_masks(Path(options.masks.mask_path), of_videos, counts)
     for photo in found:
-        masks.of_photo(photo.name, photo.size)  # which is refused where it does not fit
+        masks.of_photo(photo.name, photo.size)  # checks the size of the mask
     return replace(inputs, masks=masks)
 
 
 def labels_of(places: Sequence[str]) -> list[str]:
-    """Names that tell files or folders apart: their own, with those of folders where alike.
+    """Distinct names for files or folders: their own, with their parent folders if necessary.
 
     Args:
         places: absolute paths, without extensions.
 
     Raises:
-        OptionError: no number of folders tells them apart.
+        OptionError: the names are not distinct with all parent folders either.
     """
     parts = [[_plain(part) for part in Path(place).parts[1:]] or ["root"] for place in places]
     for count in range(1, max(map(len, parts)) + 1):
         labels = ["_".join(part[-count:]) for part in parts]
-        # Some file systems take 'A' for 'a'.
+        # Some file systems ignore case.
         if len({label.lower() for label in labels}) == len(labels):
             return labels
     lower = [label.lower() for label in labels]
@@ -198,27 +198,27 @@ def labels_of(places: Sequence[str]) -> list[str]:
 
 
 def _plain(word: str) -> str:
-    """The word without what programs take for an extension or another word in names."""
+    """Replace characters other than letters, digits, '-' and '_', which confuse some programs."""
     return re.sub(r"[^\w-]+", "_", word)
 
 
 def _check_options(num_videos: int, photos: Path | None, options: MatchOptions) -> None:
     if photos is not None and options.links.links == "none":
         raise OptionError(
-            "links 'none': photos have no motion, only links connect them: leave out --links or "
-            "--photos"
+            "links 'none': photos have no motion and are connected by links only: leave out "
+            "--links or --photos"
         )
     if num_videos == 1:
         return
     if options.images.frame_list is not None:
         raise OptionError(
-            "frame_list lists the frames of one video, and there are several: choose images by "
-            "--every, --fps or --num_images, which count for each"
+            "frame_list lists the frames of one video, but several are given: choose images by "
+            "--every, --fps or --num_images, which apply to each video"
         )
     if options.keep_stream is not None:
         raise OptionError(
-            "keep_stream names one file, and there are several videos: leave it out, or convert "
-            "them by 'colmap-av1 encode' first"
+            "keep_stream names one file, but several videos are given: leave it out, or convert "
+            "them with 'colmap-av1 encode' first"
         )
 
 
@@ -230,13 +230,13 @@ def _check_different(videos: Sequence[Video]) -> None:
 
 
 def _check_rates(videos: Sequence[Video], options: CameraOptions) -> None:
-    """Refuse a read-out time in milliseconds where nothing says how long a frame is."""
+    """Reject a read-out time in milliseconds if the frame rate of a video is unknown."""
     shutter = options.rolling_shutter
     unknown = next((video for video in videos if video.frame_rate is None), None)
     if unknown is not None and shutter not in ("none", "estimate"):
         raise OptionError(
-            f"rolling_shutter is {shutter} milliseconds, but {unknown} does not say its frame "
-            "rate: leave it out, or give a copy of the video that does"
+            f"rolling_shutter is {shutter} milliseconds, but the frame rate of {unknown} is "
+            "unknown: leave it out, or give a copy of the video with a frame rate"
         )
 
 
@@ -245,14 +245,14 @@ def _are_same(a: Video, b: Video) -> bool:
         return False
     if a.state.found[0] == b.state.found[0]:
         return True
-    # Only those of one length are read for it.
+    # Digests are computed only for files of the same length.
     return a.state.found[1] == b.state.found[1] and file_digest(a.path) == file_digest(b.path)
 
 
 def _check_one_camera(
     videos: Sequence[Video], photos: Sequence[Photo], camera: CameraOptions
 ) -> None:
-    """Refuse one camera, or given intrinsics, for pictures of several sizes."""
+    """Reject a shared camera, or given intrinsics, for pictures of several sizes."""
     sizes = {str(video): video.picture_size for video in videos}
     if camera.single_camera:
         sizes |= {str(photo.path): photo.size for photo in photos}
@@ -262,8 +262,8 @@ def _check_one_camera(
     odd = next((name for name, other in sizes.items() if other != size), None)
     if odd is None:
         return
-    what = "single_camera is 1" if camera.single_camera else "camera_params are those of one size"
+    what = "single_camera is 1" if camera.single_camera else "camera_params apply to one size"
     raise OptionError(
         f"{what}, but {first} is {size[0]}x{size[1]} and {odd} {sizes[odd][0]}x{sizes[odd][1]}: "
-        "leave it out, or give what one camera took"
+        "leave it out, or give pictures of one camera"
     )

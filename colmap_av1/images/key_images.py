@@ -1,4 +1,4 @@
-"""Key images: those of a video that its poses are found from, as many as tracks need to connect."""
+"""Key images: the images of a video that are mapped, as many as tracks need to connect them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from colmap_av1.images.choosing import choose_frames
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
 
-# Share of its cells with tracks that a key image has in common with the next one: of three in a row
-# they then have half in common, and a point takes three views.
+# Share of its cells with tracks that a key image has in common with the next one. Three consecutive
+# key images then have half of them in common, which matters since a point needs three observations.
 _KEPT = 0.7
-# Key images are so many at least, where there are as many images, and one in so many at least.
-_LEAST_KEYS = 10
-_MOST_APART = 6
+# Smallest number of key images, if there are that many images, and largest distance in images
+# between two of them.
+_MIN_KEYS = 10
+_MAX_APART = 6
 
 
 def key_images(
@@ -25,23 +26,23 @@ def key_images(
     spacing: float,
     num_cells: int,
 ) -> NDArray[np.int64]:
-    """Choose key images as far apart as tracks still connect neighbours well.
+    """Choose key images as far apart as tracks allow.
 
-    Where tracks live long, because the camera moves slowly or much is seen for long, key images lie
-    far apart; what moves fast or ends early has them close together.
+    Where tracks are long, for example because the camera moves slowly, key images lie far apart.
+    Where tracks are short, key images lie close together.
 
     Args:
         tracks: tracks of the whole video that poses may be estimated from.
         frames: int32 [num_images] display index of each image, ascending.
         always: bool [num_images] images that become key images in any case.
         spacing: width in pixels of the cells of an image that are counted.
-        num_cells: cells with tracks that an image needs at most.
+        num_cells: number of cells with tracks beyond which an image needs no more.
 
     Returns:
-        int64 indices of images, ascending, the first and the last among them.
+        int64 indices of images, ascending, including the first and the last.
     """
     num_images = len(frames)
-    apart = max(1, min(_MOST_APART, (num_images - 1) // (_LEAST_KEYS - 1)))
+    apart = max(1, min(_MAX_APART, (num_images - 1) // (_MIN_KEYS - 1)))
     seen = _TracksByImage(tracks, frames, spacing)
     key = [0]
     while key[-1] < num_images - 1:
@@ -58,19 +59,19 @@ def key_images(
 
 
 def spread_images(tracks: Tracks, num_images: int, key: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Choose images of a long video: its key images, and between them evenly in parallax.
+    """Choose images of a long video: its key images, and others evenly in parallax.
 
     Args:
         tracks: tracks of the whole video.
-        num_images: images to choose.
-        key: int64 key images, as frames, ascending.
+        num_images: number of images to choose.
+        key: int64 frames of the key images, ascending.
 
     Returns:
-        int32 frames, ascending: `num_images` of them, or more where key images are close together.
+        int32 frames, ascending: `num_images`, or more if key images are close together.
     """
     evenly = ImageOptions(num_images=num_images, select="parallax")
     spread = choose_frames(tracks, evenly).astype(np.int64)
-    # A key image takes the place of the one nearest to it.
+    # Each key image replaces the nearest other image.
     after = np.clip(np.searchsorted(spread, key), 1, len(spread) - 1)
     is_before = key - spread[after - 1] <= spread[after] - key
     replaced = np.unique(np.where(is_before, after - 1, after))
@@ -78,7 +79,7 @@ def spread_images(tracks: Tracks, num_images: int, key: NDArray[np.int64]) -> ND
 
 
 class _TracksByImage:
-    """Which tracks each image sees, and in how many of its cells."""
+    """Counts the cells of images with tracks that are also observed in another image."""
 
     def __init__(self, tracks: Tracks, frames: NDArray[np.int32], spacing: float) -> None:
         order = tracks.order_by_frame()
@@ -91,12 +92,12 @@ class _TracksByImage:
         self._compared = np.zeros(tracks.num_tracks, dtype=np.bool_)
 
     def compare_with(self, image: int) -> None:
-        """Count from now on the tracks that this image sees, too."""
+        """Set the image whose tracks are counted from now on."""
         self._compared[:] = False
         self._compared[self._number[self._rows[image]]] = True
 
     def num_shared_cells(self, image: int) -> int:
-        """Cells of an image in which it sees tracks of the compared one."""
+        """Number of cells of an image with tracks of the image set by `compare_with`."""
         rows = self._rows[image]
         rows = rows[self._compared[self._number[rows]]]
         column, row = (self._xy[rows] // self._spacing).astype(np.int32).T

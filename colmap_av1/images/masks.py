@@ -1,4 +1,4 @@
-"""Masks: which pixels of frames and images count; what is black in them is left out."""
+"""Masks of frames and images: black pixels are ignored."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.cpus import threads_or_cpus
 
 _SUFFIX = ".png"
-# Share of a frame's pixels below which no motion is carried over it.
-_LEAST_SHARE = 0.05
+# A frame with a smaller share of unmasked pixels is treated as if it had no motion.
+_MIN_SHARE = 0.05
 _LAYOUTS = (
     "give one PNG for all frames, or a folder with a PNG for every frame or with IMAGE.png for "
     "every image"
@@ -36,11 +36,10 @@ class VideoMasks:
     """The masks of a video.
 
     Attributes:
-        place: the file or folder they come from, for messages.
-        everywhere: the one of all frames.
-        of_frames: one for each frame, in order.
-        of_images: those of images by the names of these in the video's folder, or by these without
-            an extension.
+        place: the file or folder of the masks, for messages.
+        everywhere: the mask of all frames.
+        of_frames: a mask for each frame, in order.
+        of_images: masks of images, by their names in the video's folder, with or without extension.
     """
 
     place: str
@@ -54,15 +53,15 @@ class VideoMasks:
         names: Sequence[str] | None,
         options: ImageOptions,
     ) -> None:
-        """Refuse masks that cannot fit a video, before the long work.
+        """Check masks against a video before any work.
 
         Args:
-            sizes: the (width, height) that are fit: of the images, and of the video.
-            names: names of the images where they are known.
-            options: how they are named where they are not.
+            sizes: valid (width, height): of the images, and of the video.
+            names: names of the images; None if they are not known yet.
+            options: how images are named if `names` is None.
 
         Raises:
-            ImageError: a mask has another size, or none is that of an image.
+            ImageError: a mask has another size, or no mask belongs to an image.
         """
         one = [self.everywhere] if self.everywhere is not None else []
         for mask in [*one, *self.of_frames, *(self.of_images or {}).values()]:
@@ -83,20 +82,20 @@ class VideoMasks:
             if not any(named.fullmatch(name) for name in found):
                 raise ImageError(
                     f"{self.place}: none of its {len(self.of_images)} masks is named like an image "
-                    f"({options.file_name}{_SUFFIX}), and the video has another number of frames: "
-                    f"{_LAYOUTS}"
+                    f"({options.file_name}{_SUFFIX}), and the video has a different number of "
+                    f"frames: {_LAYOUTS}"
                 )
 
     def on_tracks(self, tracks: Tracks, chosen: ChosenImages, min_length: int) -> Tracks:
-        """The tracks where all masks leave them, see `mask_tracks`.
+        """Apply all masks to tracks, see `mask_tracks`.
 
         Raises:
-            ImageError: an image has none.
+            ImageError: an image has no mask.
         """
         return self.on_images(self.on_frames(tracks, min_length), chosen, min_length)
 
     def on_frames(self, tracks: Tracks, min_length: int) -> Tracks:
-        """The tracks where masks of frames leave them, see `mask_tracks`."""
+        """Apply the masks of frames to tracks, see `mask_tracks`."""
         if self.everywhere is not None:
             return mask_tracks(tracks, self.everywhere, min_length)
         if not self.of_frames:
@@ -104,17 +103,17 @@ class VideoMasks:
         return mask_tracks(tracks, dict(enumerate(self.of_frames)), min_length)
 
     def on_motion(self, inter_share: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Shares of inter units [num_frames]: none in frames of which next to nothing is left."""
-        nothing_left = [frame for frame, m in enumerate(self.of_frames) if m.share < _LEAST_SHARE]
+        """Shares of inter units [num_frames], set to 0 in frames that are almost fully masked."""
+        nothing_left = [frame for frame, m in enumerate(self.of_frames) if m.share < _MIN_SHARE]
         found = inter_share.copy()
         found[[frame for frame in nothing_left if frame < len(found)]] = 0.0
         return np.asarray(found)
 
     def on_images(self, tracks: Tracks, chosen: ChosenImages, min_length: int) -> Tracks:
-        """The tracks where masks of images leave them, see `mask_tracks`.
+        """Apply the masks of images to tracks, see `mask_tracks`.
 
         Raises:
-            ImageError: an image has none.
+            ImageError: an image has no mask.
         """
         if self.of_images is None:
             return tracks
@@ -125,7 +124,7 @@ class VideoMasks:
         """The masks of images.
 
         Raises:
-            ImageError: one has none.
+            ImageError: an image has no mask.
         """
         if self.everywhere is not None:
             return [self.everywhere] * len(chosen.names)
@@ -139,7 +138,7 @@ class VideoMasks:
         if len(masks) < len(names):
             missing = next(n for n, mask in zip(names, found, strict=True) if mask is None)
             raise ImageError(
-                f"{self.place}: holds {len(self.of_images or {})} masks, but none of "
+                f"{self.place}: holds {len(self.of_images or {})} masks, but lacks those of "
                 f"{len(names) - len(masks)} of {len(names)} images, such as "
                 f"'{missing}{_SUFFIX}': {_LAYOUTS}"
             )
@@ -151,11 +150,12 @@ class Masks:
     """The masks of videos and photos.
 
     Attributes:
-        path: the file, or the folder.
-        everywhere: the one of all frames of all videos.
-        of_frames: for videos with one for each frame, these by the video's folder among all images.
-        of_images: all others, by path in the folder without the extension of PNG.
-        digest: digest of them all.
+        path: the file or folder of the masks.
+        everywhere: the mask of all frames of all videos.
+        of_frames: for videos with a mask for each frame, these masks by the folder of the video's
+            images in the folder of all images.
+        of_images: all other masks, by their path in the folder without the extension .png.
+        digest: digest of all masks.
     """
 
     path: Path
@@ -165,7 +165,7 @@ class Masks:
     digest: str
 
     def of_video(self, label: str) -> VideoMasks | None:
-        """Those of the video whose images lie in a folder; None where it has none."""
+        """The masks of the video whose images lie in a folder; None if it has no masks."""
         if self.everywhere is not None:
             return VideoMasks(str(self.path), self.everywhere)
         place = str(self.path / label)
@@ -176,22 +176,22 @@ class Masks:
         return VideoMasks(place, of_images=own) if own else None
 
     def of_photo(self, name: str, size: tuple[int, int]) -> Mask | None:
-        """That of a photo; None where it has none.
+        """The mask of a photo; None if it has no mask.
 
         Raises:
-            ImageError: it is of another size.
+            ImageError: the mask has another size.
         """
         mask = _mask_of(name, self.of_images)
         if mask is not None and mask.size != size:
             raise ImageError(
                 f"{self.path}: the mask of '{name}' is {mask.size[0]}x{mask.size[1]}, the photo "
-                f"{size[0]}x{size[1]}: give one of that size"
+                f"{size[0]}x{size[1]}: give a mask of that size"
             )
         return mask
 
 
 def _mask_of(name: str, masks: Mapping[str, Mask]) -> Mask | None:
-    """That of an image: 'a.jpg.png' as COLMAP has it, else 'a.png' as trainers have it."""
+    """The mask of an image 'a.jpg': 'a.jpg.png' as in COLMAP, else 'a.png' as in trainers."""
     return masks.get(name) or masks.get(str(PurePosixPath(name).with_suffix("")))
 
 
@@ -199,11 +199,11 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
     """Read the masks of videos and photos: one for all frames, of frames, or of images.
 
     Args:
-        path: a PNG for all frames; or a folder with one for every frame, in the order of their
-            names, of several videos in a folder for each; or with those of images in COLMAP's
-            layout, `NAME.png`, or in that of trainers, with .png for the name's extension.
-        labels: folder of each video's images among all images.
-        num_frames: frames of each video.
+        path: a PNG for all frames; or a folder with a PNG for every frame, in the order of their
+            names, with a subfolder for each of several videos; or a folder with masks of images in
+            COLMAP's layout, `NAME.png`, or in that of trainers, where .png replaces the extension.
+        labels: the folder of each video's images in the folder of all images.
+        num_frames: number of frames of each video.
 
     Raises:
         ImageError: there is no such file or folder, a mask cannot be read, or all are black.
@@ -223,8 +223,8 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
     if not any(mask.share for mask in masks):
         what = "the mask is" if len(masks) == 1 else f"all {len(masks)} masks are"
         raise ImageError(
-            f"{path}: {what} black, which leaves nothing of the pictures: black is what is "
-            "ignored; invert them if it is what shall count"
+            f"{path}: {what} black, which leaves nothing of the pictures: black pixels are "
+            "ignored; invert the masks if black marks the pixels to use"
         )
     digest = hashlib.sha256()
     for file, mask in zip(files, masks, strict=True):
@@ -243,7 +243,7 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
 def _in_folder(
     path: Path, masks: dict[str, Mask], num_frames: dict[str, int], digest: str
 ) -> Masks:
-    """Tell masks of frames from those of images, by their names and number."""
+    """Distinguish masks of frames from masks of images, by their names and number."""
     of_frames = {}
     for label, count in num_frames.items():
         own = [name for name in masks if PurePosixPath(name).parent == PurePosixPath(label)]
@@ -255,8 +255,8 @@ def _in_folder(
     if all(found.of_video(label) is None for label in num_frames):
         folders = ", ".join(f"'{label}'" for label in num_frames)
         raise ImageError(
-            f"{path}: holds no mask of a video: its images' masks lie in folders {folders}, like "
-            "the images, or one PNG is for all frames"
+            f"{path}: holds no mask of a video: put the masks in folders {folders}, like the "
+            "images, or give one PNG for all frames"
         )
     return found
 
@@ -264,14 +264,14 @@ def _in_folder(
 def _read_mask(path: Path) -> Mask:
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
-        # Colours are looked at as they are: in grey the darkest would be black.
+        # In grey, the darkest colours would become black.
         picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     except (OSError, cv2.error):
         picture = None
     if picture is None:
-        raise ImageError(f"{path}: is no mask that can be read: {_LAYOUTS}")
+        raise ImageError(f"{path}: cannot be read as a mask: {_LAYOUTS}")
     if picture.ndim == 3:
-        # As COLMAP, without regard to transparency.
+        # COLMAP ignores transparency, too.
         picture = picture[:, :, :3].any(axis=2)
     return make_mask(picture > 0)
 
@@ -279,18 +279,18 @@ def _read_mask(path: Path) -> Mask:
 def mask_tracks(
     tracks: Tracks, masks: Mask | Mapping[int, Mask], min_length: int, *, scaled: bool = True
 ) -> Tracks:
-    """The tracks without what masks leave out: one that enters such an area ends there.
+    """Remove observations on masked pixels, and split tracks there.
 
-    One that leaves such an area begins there, too: what was before may be of another surface. In
-    frames that do not see a track, between two that do, it is where the straight way between these
-    leads.
+    A track that leaves a masked area is a new track, since it may be on another surface than
+    before. In frames without an observation, between two with one, its position is interpolated
+    linearly.
 
     Args:
         tracks: any tracks.
         masks: by frame, or one for all.
-        min_length: observations that are left of a track at least.
-        scaled: masks may be of another size than the pictures; else each is of its picture's, which
-            need not be alike.
+        min_length: smallest number of observations of a track.
+        scaled: masks may differ in size from the pictures; otherwise each has the size of its own
+            picture, and these sizes may differ.
     """
     size = (tracks.width, tracks.height)
     of_all, by_frame = (masks.kept, {}) if isinstance(masks, Mask) else (None, masks)
@@ -314,7 +314,7 @@ def mask_tracks(
 
 
 class _Unseen:
-    """Where tracks are in frames that do not see them, between two that do."""
+    """Interpolates tracks in frames without an observation, between two with one."""
 
     def __init__(self, tracks: Tracks) -> None:
         self._tracks = tracks
@@ -327,7 +327,7 @@ class _Unseen:
         self._start = tracks.frame[self._after - 1]
 
     def at(self, frame: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The observations that follow such a gap in a frame, and positions [n, 2] there."""
+        """The observations after the gaps that cover a frame, and positions [n, 2] in the frame."""
         tracks = self._tracks
         first, last = np.searchsorted(self._start, [frame - self._longest + 1, frame])
         after = self._after[first:last]

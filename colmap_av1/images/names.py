@@ -1,4 +1,4 @@
-"""Names of images: patterns of new ones, numbers and order of existing ones."""
+"""Names of images: patterns for new images, and numbers and order of existing ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_DIGITS = 255
 WRITE_PARAMETERS: dict[str, list[int]] = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-    ".png": [],  # OpenCV's defaults are for speed
+    ".png": [],  # OpenCV's defaults are fast
 }
 
 
@@ -31,14 +31,14 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
         frames: display indices.
 
     Raises:
-        OptionError: the pattern has no integer field, or no extension of an image.
+        OptionError: the pattern has no integer field, or not the extension of an image.
     """
     check_image_pattern(pattern)
     return [pattern % frame for frame in frames]
 
 
 def names_of_all(options: ImageOptions, num_frames: int) -> list[str] | None:
-    """Names of new images where every frame becomes one; None where an option chooses."""
+    """Names of new images if every frame becomes an image; None if the options choose frames."""
     return None if options.ways else image_names(options.file_name, range(num_frames))
 
 
@@ -47,23 +47,22 @@ def frames_of_images(
 ) -> NDArray[np.int32]:
     """Find the video frame of each image of a database that already lists images.
 
-    As many images as frames: they are the frames in the order of the names, numbers in
-    them compared as numbers. Otherwise the last number in a name is the frame's, counted
-    from `first_number`, which is guessed only where the names leave no doubt: gaps show
-    that they count frames of the video, and a 0 or the number of the last frame shows from
-    where. Image sequences cut at a lower rate are numbered without gaps; they say nothing.
+    If there are as many images as frames, they are the frames in natural order of the names.
+    Otherwise the last number in a name is that of the frame, counted from `first_number`. If that
+    is None, it is inferred when the names are unambiguous: gaps show that the numbers count frames
+    of the video, and a 0 or the number of the last frame shows where they start. Image sequences
+    extracted at a lower rate are numbered without gaps and therefore ambiguous.
 
     Args:
         names: names of the images, in any order.
         num_frames: number of shown frames of the video.
-        first_number: number in the name of the video's first frame, usually 0 or 1; None:
-            only where names and count leave no doubt.
+        first_number: number in the name of the video's first frame, usually 0 or 1; None: inferred.
 
     Returns:
         int32 [len(names)] display index of each image.
 
     Raises:
-        ImageError: count or names do not say which frame an image is.
+        ImageError: count and names do not determine the frames.
     """
     numbers = [last_number(name) for name in names]
     if first_number is None and len(names) == num_frames:
@@ -78,7 +77,7 @@ def frames_of_images(
         unnumbered = names[numbers.index(None)]
         raise ImageError(
             f"{counts}, and '{unnumbered}' has no frame number: list the images in a "
-            "--frame_list, or give their folder as --image_path, to recognise them by content"
+            "--frame_list, or give their folder as --image_path to identify them by content"
         )
     lowest, highest = min(found), max(found)
     if first_number is None:
@@ -86,8 +85,8 @@ def frames_of_images(
     if lowest < first_number or highest - first_number >= num_frames:
         raise ImageError(
             f"{counts}, but the image numbers run from {lowest} to {highest} where frames are "
-            f"numbered {first_number} to {first_number + num_frames - 1}: give the video the "
-            "images were cut from"
+            f"numbered {first_number} to {first_number + num_frames - 1}: give the video that the "
+            "images were extracted from"
         )
     if len(set(found)) < len(found):
         twice = next(number for number in found if found.count(number) > 1)
@@ -105,15 +104,14 @@ def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) ->
     if with_gaps and highest == num_frames and lowest > 0:
         return 1
     raise ImageError(
-        f"{counts}, and the image numbers {lowest} to {highest} do not say which frames they "
-        "are: say with --first_number how the first frame of the video is numbered, list the "
-        "images in a --frame_list, or give their folder as --image_path, to recognise them by "
-        "content"
+        f"{counts}, and the image numbers {lowest} to {highest} do not determine the frames: give "
+        "the number of the video's first frame as --first_number, list the images in a "
+        "--frame_list, or give their folder as --image_path to identify them by content"
     )
 
 
 def natural_order(names: Sequence[str]) -> list[int]:
-    """Indices of names in the order in which 'f9' comes before 'f10'."""
+    """Indices that sort names so that 'f9' comes before 'f10'."""
     return sorted(range(len(names)), key=lambda i: natural_key(names[i]))
 
 
@@ -132,13 +130,13 @@ def videos_of(
 
 
 def last_number(name: str) -> int | None:
-    """The last number in an image's name, its extension left out; None where there is none."""
+    """The last number in an image's name without its extension; None if there is none."""
     digits = re.findall(r"\d+", PurePosixPath(name).stem)
     return _value(digits[-1]) if digits else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key under which 'f9' comes before 'f10'; the text itself breaks ties."""
+    """Sort key by which 'f9' comes before 'f10'; the text itself breaks ties."""
     parts = re.split(r"(\d+)", name)
     # Every second part is digits.
     key = [(1, _value(p), p) if i % 2 else (0, 0, p) for i, p in enumerate(parts)]
@@ -146,12 +144,12 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def _value(digits: str) -> int:
-    """The number that digits are; no file name has more of them than Python reads as one."""
+    """The value of digits. Python limits their number, to more than a file name can have."""
     return int(digits[:_MOST_DIGITS])
 
 
 def pattern_regex(pattern: str) -> re.Pattern[str]:
-    """A regular expression that matches the names a pattern makes."""
+    """A regular expression that matches the names that a pattern creates."""
     before, after = pattern.split(check_image_pattern(pattern))
     return re.compile(re.escape(before) + r"\d+" + re.escape(after))
 
@@ -160,8 +158,8 @@ def check_new_name(name: str) -> None:
     """Check that an image can be written under a name.
 
     Raises:
-        OptionError: it is of no kind that can be written.
-        ImageError: it leads out of the image folder.
+        OptionError: the extension is not that of a format that can be written.
+        ImageError: the name leaves the image folder.
     """
     check_extension(name)
     image_file(Path(), name)
@@ -171,7 +169,7 @@ def image_file(root: Path, name: str) -> Path:
     """The file of an image in a folder.
 
     Raises:
-        ImageError: the name leads out of the folder, or is none that a file can have.
+        ImageError: the name leaves the folder, or is not a valid file name.
     """
     check_name(name)
     return root / name

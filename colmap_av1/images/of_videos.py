@@ -1,4 +1,4 @@
-"""Which images of a model are of which video, and of which size."""
+"""Assign the images of a model to videos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from colmap_av1.video.facts import Video
 
 @dataclass(frozen=True)
 class VideoImages:
-    """A video, the model's images of it by their names in a folder, their size and masks."""
+    """A video, and the model's images of it: their names in a folder, size and masks."""
 
     video: Video
     names: list[str]
@@ -33,10 +33,10 @@ def images_of_videos(
     folder: Path | None,
     options: ImageOptions,
 ) -> list[VideoImages]:
-    """The model's images of each video, of (width, height) by their names; refuses others.
+    """Assign the images of a model, given as (width, height) by name, to the videos.
 
     Raises:
-        ModelError: the model has an image of another video, or none of one.
+        ModelError: the model has an image of another video, or no image of a video.
         ImageError: images do not fit their video.
     """
     photos = {photo.name for photo in inputs.photos}
@@ -45,8 +45,8 @@ def images_of_videos(
         label, _, own = name.partition("/") if len(of_label) > 1 else ("", "", name)
         if label not in of_label:
             raise ModelError(
-                f"{model}: image '{name}' lies in no folder of a video, "
-                f"{', '.join(of_label)}: give the video it comes from, or the photos as --photos"
+                f"{model}: image '{name}' is not in a folder of a video ({', '.join(of_label)}): "
+                "give the video it comes from, or the photos as --photos"
             )
         of_label[label][own] = sizes[name]
     found = []
@@ -70,11 +70,11 @@ def _images_of_video(
     folder: Path | None,
     options: ImageOptions,
 ) -> VideoImages:
-    """The model's images of a video; refuses those that do not fit it."""
+    """Check that the model's images of a video fit it."""
     check_frame_list(options)
     if len(sizes) < 2:
         raise ModelError(
-            f"{model}: only one image of {video} has a pose: give a model with two or more"
+            f"{model}: only one image of {video} is registered: give a model with two or more"
         )
     try:
         size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
@@ -82,5 +82,7 @@ def _images_of_video(
         raise ImageError(f"{model}: {error}") from error
     missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
     if missing is not None:
-        raise ImageError(f"{folder}: lacks the model's image '{missing}': give the folder of these")
+        raise ImageError(
+            f"{folder}: lacks the model's image '{missing}': give the folder of the model's images"
+        )
     return VideoImages(video, list(sizes), folder, size, None)

@@ -1,4 +1,4 @@
-"""Photos that become images beside those of videos."""
+"""Photos that become images together with those of videos."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from colmap_av1.util.files import whole_file
 from colmap_av1.util.texts import check_name
 from colmap_av1.video.unchanged import FileState, file_state
 
-# Photos as phones and cameras write them that nothing here reads: worth a word where they are left
-# out; other files beside photos are not.
+# Extensions of photos of phones and cameras that cannot be read. They cause a warning, unlike other
+# files next to photos.
 _UNREADABLE_PHOTOS = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 _NUM_NAMED = 3
 _JPEG = {".jpg", ".jpeg"}
@@ -35,12 +35,12 @@ class Photo:
     Attributes:
         path: the file.
         name: path relative to the folder of all images.
-        size: (width, height) in pixels as they are stored; an orientation in EXIF is left alone,
-            as COLMAP does.
-        camera: what EXIF says of the camera; empty where it says nothing.
-        focal_length: in pixels, by EXIF; None where it says nothing.
-        place: latitude and longitude in degrees, altitude in metres, by EXIF; None likewise.
-        state: the state of the file when it was looked at.
+        size: (width, height) in pixels as stored; the EXIF orientation is ignored, as in COLMAP.
+        camera: the camera according to EXIF; empty if unknown.
+        focal_length: focal length in pixels according to EXIF; None if unknown.
+        place: latitude and longitude in degrees, altitude in metres, according to EXIF; None if
+            unknown.
+        state: the state of the file when it was read.
     """
 
     path: Path
@@ -53,19 +53,19 @@ class Photo:
 
 
 def photo_files(folder: Path) -> tuple[list[Path], str | None]:
-    """The photos in a folder and those below it, and a warning of those that nothing reads.
+    """The photos in a folder and its subfolders, and a warning about those that cannot be read.
 
     Returns:
-        Paths relative to the folder, in their natural order; at least one.
+        Paths relative to the folder, in natural order, at least one; and the warning.
 
     Raises:
-        ImageError: there is no such folder, it cannot be read, or holds no photo.
+        ImageError: there is no such folder, it cannot be read, or it holds no photo.
     """
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
         raise ImageError(f"{folder}: {what}: give the folder of the photos")
     found, unread = [], []
-    for parent, folders, files in os.walk(folder, onerror=_refuse):
+    for parent, folders, files in os.walk(folder, onerror=_raise_unreadable):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in files:
             path = Path(parent, name).relative_to(folder)
@@ -74,35 +74,34 @@ def photo_files(folder: Path) -> tuple[list[Path], str | None]:
                 found.append(path)
             elif suffix in _UNREADABLE_PHOTOS:
                 unread.append(path)
-    said = sorted((p.as_posix() for p in unread), key=natural_key)
-    some = ", ".join(said[:_NUM_NAMED]) + (", ..." if len(said) > _NUM_NAMED else "")
+    named = sorted((p.as_posix() for p in unread), key=natural_key)
+    some = ", ".join(named[:_NUM_NAMED]) + (", ..." if len(named) > _NUM_NAMED else "")
     convert = f"convert these to JPEG or PNG: {some}"
     if not found:
         why = f"{convert}" if unread else "give a folder with JPEG or PNG files"
         raise ImageError(f"{folder}: holds no photo that can be read: {why}")
     order = sorted(found, key=lambda path: natural_key(path.as_posix()))
-    warning = f"{folder}: {len(unread)} photos are left out, {convert}" if unread else None
+    warning = f"{folder}: ignored {len(unread)} photos: {convert}" if unread else None
     return order, warning
 
 
-def _refuse(error: OSError) -> None:
+def _raise_unreadable(error: OSError) -> None:
     raise ImageError(
-        f"{error.filename}: cannot be read: {error.strerror}: give a folder of photos that can"
+        f"{error.filename}: cannot be read: {error.strerror}: give another folder of photos"
     ) from error
 
 
 def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) -> list[Photo]:
-    """Look at photos: their sizes, and what EXIF says of their cameras.
+    """Read the sizes and EXIF data of photos.
 
     Args:
         folder: the folder of the photos.
         files: their paths in it.
-        label: folder among all images that their names get.
-        flat: they are written anew for trainers, which want names with one dot and an extension
-            that can be written.
+        label: their folder in the folder of all images.
+        flat: give them names for trainers, with one dot and an extension that can be written.
 
     Raises:
-        ImageError: one is damaged, or two would have one name.
+        ImageError: a photo is damaged, or two would have the same name.
     """
     photos: list[Photo] = []
     names: dict[str, Path] = {}
@@ -118,7 +117,7 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         size = image_size(path)
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
         if bitmap is None or _is_cut_short(path):
-            raise ImageError(f"{path}: is damaged: copy it anew, or remove it")
+            raise ImageError(f"{path}: is damaged: copy it again, or remove it")
         camera, focal_length = bitmap.exif_camera_model() or "", bitmap.exif_focal_length()
         place = _place_of(bitmap)
         photos.append(Photo(path, name, size, camera, focal_length, place, file_state(path)))
@@ -126,7 +125,7 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
 
 
 def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
-    """Where a photo was taken, by EXIF; at sea level where that says no altitude."""
+    """Position of a photo according to EXIF; the altitude is 0 if unknown."""
     latitude, longitude = bitmap.exif_latitude(), bitmap.exif_longitude()
     if latitude is None or longitude is None:
         return None
@@ -134,7 +133,7 @@ def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
 
 
 def _is_cut_short(path: Path) -> bool:
-    """Whether a JPEG file ends within its picture, whose rest decoders paint grey."""
+    """Whether a JPEG file is truncated; decoders would fill the missing part with grey."""
     if path.suffix.lower() not in _JPEG:
         return False
     data = path.read_bytes()
@@ -142,20 +141,20 @@ def _is_cut_short(path: Path) -> bool:
 
 
 def _flat(file: Path) -> str:
-    """A photo's path as trainers take it."""
+    """A photo's path in a form that trainers accept."""
     suffix = file.suffix.lower()
     plain = [re.sub(r"[^\w-]+", "_", part) for part in file.with_suffix("").parts]
     return "/".join(plain) + (suffix if suffix in IMAGE_EXTENSIONS else ".png")
 
 
 def place_photos(photos: Sequence[Photo], folder: Path) -> int:
-    """Copy photos to their names in the folder of all images; those that are there stay.
+    """Copy photos to the folder of all images; existing copies stay.
 
     Returns:
         The number of photos copied.
 
     Raises:
-        ImageError: another file has a photo's name, or one cannot be copied.
+        ImageError: another file has the name of a photo, or a photo cannot be copied.
     """
     num_copied = 0
     for photo in photos:
@@ -174,10 +173,10 @@ def place_photos(photos: Sequence[Photo], folder: Path) -> int:
 
 
 def check_places(photos: Sequence[Photo], folder: Path) -> None:
-    """Refuse photos whose names other files have in the folder of all images.
+    """Check that no other file in the folder of all images has the name of a photo.
 
     Raises:
-        ImageError: so it is.
+        ImageError: another file has the name of a photo.
     """
     for photo in photos:
         file = image_file(folder, photo.name)
@@ -189,6 +188,6 @@ def _check_same(photo: Photo, file: Path) -> None:
     if file.samefile(photo.path) or file.read_bytes() == photo.path.read_bytes():
         return
     raise ImageError(
-        f"{file}: is another file than {photo.path}, which would have this name: give another "
-        "image folder, or rename the folder of the photos"
+        f"{file}: is another file than the photo {photo.path}, which would get this name: give "
+        "another image folder, or rename the folder of the photos"
     )

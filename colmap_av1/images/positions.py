@@ -1,4 +1,4 @@
-"""Where images were taken, as the containers of their videos and the EXIF data of photos say."""
+"""Positions of images, from the containers of videos and the EXIF data of photos."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from colmap_av1.video.metadata.positions import Positions, interpolate, read_pos
 
 @dataclass(frozen=True)
 class ImagePositions:
-    """What is known of where images were taken, and how the camera was held.
+    """Positions of images, and the orientation of the camera.
 
     Attributes:
         places: float64 [num_images, 3] latitude and longitude in degrees, altitude in metres
             (WGS 84); NaN where unknown.
         gravity: float64 [num_images, 3] direction of gravity in axes of the camera, see
             `Positions`; NaN where unknown.
-        place: the one position of a whole video; None: none is said, or there are others.
-        warnings: what the user should know of them.
+        place: the single position of a whole video; None if there is none, or if images have
+            positions.
+        warnings: warnings about the positions.
     """
 
     places: NDArray[np.float64]
@@ -36,7 +37,7 @@ class ImagePositions:
 
     @property
     def digest(self) -> str:
-        """Identifies them."""
+        """Digest of the positions and directions of gravity."""
         arrays = self.places.tobytes() + self.gravity.tobytes()
         return hashlib.sha256(arrays + repr(self.place).encode()).hexdigest()
 
@@ -44,7 +45,7 @@ class ImagePositions:
 def image_positions(
     image_set: ImageSet, videos: Sequence[Video], photos: Sequence[Photo]
 ) -> ImagePositions:
-    """Find where images were taken: those of videos by time, between positions that are said.
+    """Find the positions of images; those of video frames are interpolated by time.
 
     Args:
         image_set: the images.
@@ -81,7 +82,7 @@ def image_positions(
 
 
 def _times_since_start(video: Video) -> NDArray[np.float64] | None:
-    """Seconds of the frames that players show after the first picture; None where unknown."""
+    """Times in seconds after the first picture of the frames that players show; None if unknown."""
     times = picture_times(video)
     if times is None:
         return None
@@ -92,7 +93,7 @@ def _times_since_start(video: Video) -> NDArray[np.float64] | None:
 
 
 def _places(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    # Both sides of the date line are one neighbourhood.
+    # Positions on both sides of the date line are close to each other.
     east = np.unwrap(found.places[:, 1], period=360.0)
     places = np.column_stack([found.places[:, 0], east, found.places[:, 2]])
     between = interpolate(times, found.times, places)

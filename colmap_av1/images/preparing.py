@@ -1,4 +1,4 @@
-"""The frames of a video that are images, and its tracks in their pixels."""
+"""Prepare the images of a video: choose its frames, and express its tracks in their pixels."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ _Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PreparedImages:
-    """The images of a video, before anything is matched.
+    """The images of a video before matching.
 
     Attributes:
-        source: the video; a stream that is not kept is gone by now.
+        source: the video; a stream that is not kept no longer exists.
         display: how its pictures are shown in the images.
         tracked: the tracks, in pixels of the images, and the images.
         size: (width, height) of the images.
-        pixel_aspect: width of a pixel of theirs over its height.
+        pixel_aspect: width of the images' pixels over their height.
     """
 
     source: VideoSource
@@ -70,9 +70,9 @@ class _Fit:
     """How the pictures of a video and existing images correspond.
 
     Attributes:
-        existing: (width, height) of the images that exist, by name.
+        existing: (width, height) of existing images, by name.
         display: how the video's pictures are shown in the images.
-        video_size: (width, height) of the pictures so shown.
+        video_size: (width, height) of the pictures with this display.
         size: (width, height) of the images.
     """
 
@@ -92,17 +92,17 @@ class _Fit:
 def check_fit(
     camera: CameraOptions, images: ImageOptions, size: tuple[int, int], pixel_aspect: float
 ) -> None:
-    """Refuse options that cannot give images of a video, before the long work.
+    """Check the options for the images of a video before any work.
 
     Args:
-        camera: which camera the images have.
-        images: how they are chosen.
+        camera: camera options.
+        images: how the images are chosen.
         size: (width, height) of the images.
-        pixel_aspect: width of a pixel of theirs over its height.
+        pixel_aspect: width of the images' pixels over their height.
 
     Raises:
         ImageError: the list of frames cannot be read.
-        OptionError: the camera's parameters do not fit such pixels.
+        OptionError: the camera's parameters do not fit the images.
     """
     make_camera(camera, *size, pixel_aspect)
     check_frame_list(images)
@@ -122,20 +122,21 @@ def prepare_images(
 
     Args:
         video: a video.
-        folder: folder of the images, which may exist; None: none are wanted.
-        options: all but those of density, pairs and verification are used.
-        listed: (width, height) of images that a database lists, by name.
-        masks: what of the pictures counts; None: all.
-        beside: the file that is being made, see `open_source`.
-        context: gets the stages up to "choice".
+        folder: folder of the images, which may exist; None: no images are written.
+        options: all are used except those of density, pairs and verification.
+        listed: (width, height) of images in an existing database, by name.
+        masks: masks of the pictures; None: all pixels are used.
+        beside: the output file, see `open_source`.
+        context: measures the stages up to "choice".
 
     Raises:
         VideoError: the video cannot be read.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
+        BitstreamError: the stream is damaged before its second frame, or anywhere if
+            `options.read.strict` is set.
         ImageError: images, names or masks do not fit the video.
         OptionError: an option does not fit the video or its images.
     """
-    # What can be refused is refused before the long work.
+    # All checks run before the long work.
     fit = _fit(video, folder, options.images, listed)
     display, size, existing = fit.display, fit.size, list(fit.existing)
     check_fit(options.camera, options.images, size, fit.pixel_aspect)
@@ -196,7 +197,11 @@ def _fit(
     options: ImageOptions,
     listed: Mapping[str, tuple[int, int]],
 ) -> _Fit:
-    """Find existing images, and how they show the video; refuses those that do not fit."""
+    """Find existing images and how they show the video.
+
+    Raises:
+        ImageError: the images do not fit the video.
+    """
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
@@ -204,7 +209,7 @@ def _fit(
         existing = {name: image_size(folder / name) for name in names}
     back = _way_back(video, existing, folder)
     if back is not None:
-        # What exists was written by a program that does not turn pictures.
+        # The images were written by a program that does not rotate pictures.
         display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
         video_size = shown_size(video_size, back)
     size = size_of_images(existing, video_size, display.pixel_aspect)
@@ -218,12 +223,12 @@ def write_prepared(
 
     Args:
         prepared: the images.
-        folder: where they go.
+        folder: folder for the images.
         read: how the video is decoded.
         progress: called in the stage "images".
 
     Returns:
-        The number of images written; the others were there.
+        The number of images written; the others existed.
     """
     chosen = prepared.tracked.chosen
     return write_images(
@@ -248,13 +253,13 @@ def write_all_prepared(
     """Write the images of videos, see `write_prepared`.
 
     Args:
-        videos: the folder of each video's images in that of all, and these.
-        folder: where the images go.
+        videos: the subfolder of each video's images, and the prepared images.
+        folder: folder for all images.
         read: how the videos are decoded.
         progress: called in the stage "images".
 
     Returns:
-        The number of images written, and what the user should know of all images.
+        The number of images written, and warnings about the images.
     """
     num_written, warnings = 0, list[str]()
     for label, own in videos:
@@ -269,10 +274,11 @@ def _way_back(
     existing: dict[str, tuple[int, int]],
     folder: Path | None,
 ) -> Display | None:
-    """The turn from shown pictures to existing images; None where these are shown the same.
+    """The rotation from shown pictures to existing images; None if they have the same orientation.
 
-    Their shape says it. Where either would do, the first image says it by what it shows, if its
-    file is there; else images count as turned, as players and ffmpeg do.
+    It follows from the shape of the images. If both orientations fit, the content of the first
+    image decides, if its file exists. Otherwise images are assumed to be rotated as players and
+    FFmpeg show them.
     """
     display = video.display
     if display.turn == Display().turn or not existing:

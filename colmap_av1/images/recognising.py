@@ -1,4 +1,4 @@
-"""Which frame of a video an image shows, found by looking at it at low resolution."""
+"""Identify the frame of a video that an image shows, by comparing thumbnails."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from colmap_av1.video.display import Display, shown_picture, turned_back
 
 _Image = NDArray[np.uint8]
 
-# Side of the squares that pictures are compared at: small enough that neither scaling nor
-# JPEG shows, large enough that the motion between frames does.
+# Width and height of thumbnails: small enough to hide scaling and JPEG compression, large enough to
+# show the motion between frames.
 _THUMBNAIL = 48
-# Least normalised correlation of an image with its frame.
-_LEAST_LIKENESS = 0.98
-# Any other frame must be this many times less like the image than its own.
+# Smallest normalised correlation of an image with its frame.
+_MIN_CORRELATION = 0.98
+# The dissimilarity (1 - correlation) of any other frame must exceed that of the image's own frame
+# by this factor.
 _MARGIN = 1.5
-# Frames on either side of one that an image is compared with.
+# Number of frames on either side of a frame that an image is compared with.
 _REACH = 2
-# Pictures that are less unlike than this differ by motion of less than half a pixel.
+# Two pictures with less dissimilarity differ by a motion of less than half a pixel.
 _SAME = 5e-5
 
 
@@ -34,27 +35,27 @@ def frames_by_content(
 ) -> NDArray[np.int32]:
     """Find the frames that image files show.
 
-    An image's frame is the one it is most like. Where a camera stands still and several are,
-    the files count as being in the order of the video. It must leave no doubt: each image is
-    like its frame, and clearly less like any other that shows something else.
+    The frame of an image is the most similar one. If several are, because the camera stands still,
+    the files are assumed to be in the order of the video. The result must be unambiguous: each
+    image is similar to its frame, and clearly less similar to all other frames.
 
     Args:
-        files: image files of any size with the video's aspect.
+        files: image files of any size with the video's aspect ratio.
         pictures: (display index, uint8 [h, w, 3] BGR) of all frames, in order.
 
     Returns:
         int32 [len(files)] display indices, all different.
 
     Raises:
-        ImageError: there are more images than frames, an image cannot be read, shows no frame of
-            the video, or shows several as well.
+        ImageError: there are more images than frames, or an image cannot be read, or shows no
+            frame of the video, or is similar to several.
     """
     images = np.array([_thumbnail(read_image(path)) for path in files])
     frames = np.array([_thumbnail(picture) for _, picture in pictures])
     if len(images) > len(frames):
         raise ImageError(
             f"there are {len(images)} images, but the video has {len(frames)} frames: "
-            "give the video the images were cut from"
+            "give the video that the images were extracted from"
         )
     likeness = images @ frames.T
     found = np.argmax(likeness, axis=1).astype(np.int32)
@@ -62,11 +63,11 @@ def frames_by_content(
         found = _ascending_assignment(likeness)
     for k, path in enumerate(files):
         best = int(np.argmax(likeness[k]))
-        if likeness[k, best] < _LEAST_LIKENESS:
+        if likeness[k, best] < _MIN_CORRELATION:
             raise ImageError(
-                f"{path}: shows no frame of the video (the best is frame {best}, alike by "
-                f"{likeness[k, best]:.1%}): give the images that were cut from this video, "
-                "unedited, or name their frames with --frame_list"
+                f"{path}: shows no frame of the video (the most similar is frame {best}, with "
+                f"correlation {likeness[k, best]:.3f}): give unedited images of this video, or "
+                "list their frames in a --frame_list"
             )
         if _is_clearly_less(likeness[k, found[k]], likeness[k, best]):
             twins = [files[int(i)].name for i in np.flatnonzero(likeness.argmax(axis=1) == best)]
@@ -78,15 +79,15 @@ def frames_by_content(
 def check_content(
     files: Sequence[Path], frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
 ) -> None:
-    """Check that images show their frames, and not clearly those beside them.
+    """Check that images show their frames rather than neighbouring ones.
 
     Args:
         files: image files.
-        frames: the frame that each should show, ascending.
-        pictures: (display index, picture) in order; not read beyond what is needed.
+        frames: the frame that each image should show, ascending.
+        pictures: (display index, picture) in order; not read beyond the last needed one.
 
     Raises:
-        ImageError: one shows something else.
+        ImageError: an image shows something else.
     """
     images = np.array([_thumbnail(read_image(path)) for path in files])
     likeness = np.zeros((len(files), 2 * _REACH + 1))
@@ -100,17 +101,17 @@ def check_content(
             break
     for path, frame, alike in zip(files, frames, likeness, strict=True):
         best = int(np.argmax(alike))
-        if alike[_REACH] >= _LEAST_LIKENESS and not _is_clearly_less(alike[_REACH], alike[best]):
+        if alike[_REACH] >= _MIN_CORRELATION and not _is_clearly_less(alike[_REACH], alike[best]):
             continue
-        shows = f"frame {frame + best - _REACH}" if alike[best] >= _LEAST_LIKENESS else "another"
+        shows = f"frame {frame + best - _REACH}" if alike[best] >= _MIN_CORRELATION else "another"
         raise ImageError(
-            f"{path}: should show frame {frame} of the video but shows {shows}: give the images "
-            "that were cut from this video, unedited, or name their frames with --frame_list"
+            f"{path}: should show frame {frame} of the video but shows {shows}: give unedited "
+            "images of this video, or list their frames in a --frame_list"
         )
 
 
 def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: Display) -> bool:
-    """Whether an image shows a picture as it is stored, not as players turn it.
+    """Whether an image shows pictures as stored, not as players rotate them.
 
     Args:
         path: the image file.
@@ -126,7 +127,7 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
     for _, picture in pictures:
         both = (picture, shown_picture(picture, back))
         best = np.maximum(best, [float(image @ _thumbnail(p)) for p in both])
-        if best.max() >= _LEAST_LIKENESS:
+        if best.max() >= _MIN_CORRELATION:
             break
     return bool(best[1] > best[0])
 
@@ -134,9 +135,9 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
 def _check_rivals(
     path: Path, frame: int, likeness: NDArray[np.float32], frames: NDArray[np.float32]
 ) -> None:
-    """Refuse an image that another frame fits as well, unless the camera stands still."""
+    """Reject an image that fits another frame as well, unless the camera stands still."""
     rivals = ~_is_clearly_less(likeness, likeness[frame])
-    # Frames without motion between them are one picture, and have one set of places.
+    # Frames without motion between them are interchangeable.
     differs = 1 - frames @ frames[frame] > _SAME
     still = np.ones(len(frames), dtype=np.bool_)
     still[: frame + 1] = ~np.maximum.accumulate(differs[frame::-1])[::-1]
@@ -145,8 +146,8 @@ def _check_rivals(
     if rivals.any():
         rival = int(np.argmax(np.where(rivals, likeness, -1)))
         raise ImageError(
-            f"{path}: looks like frame {frame} and like frame {rival}: name the images' frames "
-            "with --frame_list"
+            f"{path}: looks like frame {frame} and like frame {rival}: list the frames of the "
+            "images in a --frame_list"
         )
 
 
@@ -156,12 +157,12 @@ def _is_clearly_less(likeness: Any, than: Any) -> NDArray[np.bool_]:
 
 
 def _ascending_assignment(likeness: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Strictly ascending columns, one for each row, with the greatest sum."""
+    """Strictly ascending columns, one for each row, with the largest sum."""
     num_images, num_frames = likeness.shape
     total = likeness[0].astype(np.float64)
     best_before = np.empty((num_images, num_frames), dtype=np.int32)
     for k in range(1, num_images):
-        # The best end of the first k rows in any column before each.
+        # For each column, the largest sum of the first k rows that ends before it.
         running = np.maximum.accumulate(total)
         is_new = np.concatenate([[True], total[1:] > running[:-1]])
         where = np.maximum.accumulate(np.where(is_new, np.arange(num_frames), 0))
@@ -175,7 +176,7 @@ def _ascending_assignment(likeness: NDArray[np.float32]) -> NDArray[np.int32]:
 
 
 def _thumbnail(image: _Image) -> NDArray[np.float32]:
-    """The picture's grey values at low resolution, of mean 0 and length 1."""
+    """Grey values of a picture at low resolution, with mean 0 and norm 1."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     small = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).reshape(-1)
     small -= small.mean()

@@ -1,4 +1,4 @@
-"""The step from a video to the tracks of its images: chain, mask, choose, refine."""
+"""From a video to the tracks of its images: chain, mask, choose, refine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from colmap_av1.video.display import Display, shown_size, turned_back
 
 _Image = NDArray[np.uint8]
 
-# Images that observe a track, at least, where other frames are not kept.
+# Smallest number of observations of a track if only images are kept.
 _MIN_IMAGES = 2
 
 
@@ -65,28 +65,29 @@ def track_images(
     refine: bool = True,
     context: RunContext,
 ) -> TrackedImages:
-    """Chain the motion of a video into tracks, mask them, choose images and refine there.
+    """Chain the motion of a video into tracks, mask them, choose images and refine tracks there.
 
-    Masks of frames apply before images are chosen; all masks apply again at the end, as
-    refinement moves observations and images may have masks of their own.
+    Masks of frames are applied before images are chosen. All masks are applied again at the end,
+    since refinement moves observations and images may have their own masks.
 
     Args:
         source: the video.
         options: how motion is read and chained, and tracks are refined.
-        choose: chooses the images by the masked tracks.
-        masks: masks of the video; None: all pixels count.
+        choose: chooses the images from the masked tracks.
+        masks: masks of the video; None: all pixels are used.
         display: how images show the pictures; None: as players do.
-        one_size: refuse frames of several sizes, see `track_video`.
-        frames: int32 [n] frames among which images are chosen; tracks are kept in the images alone.
-            None: tracks are kept in all frames.
+        one_size: raise an error if frames differ in size, see `track_video`.
+        frames: int32 [n] candidate frames for images; observations are kept in the images only.
+            None: observations are kept in all frames.
         refine: correct tracks of downscaled motion that are not refined yet, see
             `refine_in_images`.
-        context: gets the stages of `track_video`, "choice" and "refinement".
+        context: measures the stages of `track_video`, "choice" and "refinement".
 
     Raises:
-        VideoError: the video shows no frame, or frames of another size than its container says.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: the frames change their size and must not, no images can be chosen, or an image
+        VideoError: the video shows no frame, or its frames differ in size from its container.
+        BitstreamError: the stream is damaged before its second frame, or anywhere if
+            `options.read.strict` is set.
+        ImageError: shown frames differ in size but must not, no images can be chosen, or an image
             has no mask.
         OptionError: an option does not fit the video or its images.
     """
@@ -142,7 +143,7 @@ def choose_from_video(
         tracks: tracks through all its frames.
         options: how images are chosen.
         read: how pictures are decoded.
-        existing: names of images that exist.
+        existing: names of existing images.
         folder: folder of the images; None: no picture is decoded.
         display: how images show the pictures; None: as players do.
         context: its progress is called in the stage "looking".
@@ -170,7 +171,7 @@ def decode_all(
         num_frames,
         options,
         display,
-        use="pictures are looked at",
+        use="pictures are used",
     )
     for index, picture in pictures:
         context.progress("looking", index + 1, num_frames)
@@ -181,7 +182,7 @@ def _as_displayed(tracks: Tracks, source: VideoSource, display: Display | None) 
     """The tracks in pixels of the pictures as images show them.
 
     Raises:
-        VideoError: frames have another size than the container says.
+        VideoError: the frames differ in size from the container.
     """
     pictures, size = source.pictures, source.pictures.picture_size
     if display is not None and display.turn != pictures.display.turn:
@@ -190,6 +191,6 @@ def _as_displayed(tracks: Tracks, source: VideoSource, display: Display | None) 
     if (tracks.width, tracks.height) != size:
         raise VideoError(
             f"{source.stream}: its pictures are {tracks.width}x{tracks.height}, those of "
-            f"{pictures} {size[0]}x{size[1]}: convert it by another --encoder"
+            f"{pictures} {size[0]}x{size[1]}: convert it with another --encoder"
         )
     return tracks

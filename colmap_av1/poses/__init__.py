@@ -1,1 +1,1 @@
-"""The joint estimate of all poses: key images, mapper, resection, adjustment."""
+"""Joint estimation of all poses: key images, mapper, resection, bundle adjustment."""

@@ -1,10 +1,10 @@
-"""Matches that agree with one estimate of the poses of all images, for a COLMAP database.
+"""Matches that agree with a joint estimate of all poses, for a COLMAP database.
 
-A pair of images cannot tell a drifted track from a good one: both agree with some epipolar
-geometry. The poses of all images can. So these are estimated as `reconstruct` does it, and what
-agrees with them is matched: the corners that the poses were adjusted on, and a spread selection of
-motion tracks. Few long tracks hold the images together; the others only have to become points, for
-which three observations are enough. This keeps the time of a mapper low.
+Two images do not show which tracks have drifted: drifted tracks agree with some epipolar geometry,
+too. The poses of all images show it, so they are estimated as in `reconstruct`. The tracks that
+agree with them are matched: the corners used in the adjustment, and a spread selection of motion
+tracks. A few long tracks connect the images. The others only have to become points, for which three
+observations suffice. This keeps the mapper fast.
 """
 
 from __future__ import annotations
@@ -39,46 +39,47 @@ from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import some_names
 from colmap_av1.video.coded_size import smaller_grey
 
-# An observation of the adjusted model disagrees with the poses if its error exceeds both this many
-# pixels and this multiple of the median error, which a rolling shutter, for example, raises.
+# An observation of the adjusted model is an outlier if its error exceeds both this many pixels and
+# this multiple of the median error, which is larger with a rolling shutter, for example.
 _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
 # Points of motion tracks need the mapper's smallest triangulation angle, which is the default here,
 # and a depth error below 50 %.
 _POINTS = TriangulateOptions(max_reprojection_error=1.0, max_depth_error=0.5, points="survey")
-# The longest motion tracks, up to 150 per image, keep all their observations.
+# The longest motion tracks, up to 150 per image, keep all observations.
 _WHOLE = DensityOptions(
     preset="sparse", max_tracks_per_image=150, spacing=8.0, min_images=3, max_sigma=0.0
 )
-# The others keep the first observation and those half and all of one of these distances later, in
-# images: pairs at such distances are matched.
+# The others keep three observations: the first one, and those half and all of one of these spans
+# later, in images. Pairs at such distances are matched.
 _SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
 _NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
-_MOST_PAIRS = 16
-_FEW = 3
-# Most keypoints per image of tracks with three observations, by the density preset: this share of
-# the SIFT features of a picture, and this number. A mapper makes 7 to 12 points per image from 100
-# SIFT features. The shares give about as many points, and some more with the default preset.
+_MAX_PAIRS = 16
+_NUM_KEPT = 3
+# Largest number of keypoints per image from tracks with three observations, by the density preset:
+# this share of the SIFT features of a picture, and this number. A mapper makes 7 to 12 points per
+# image from 100 SIFT features. The shares give about as many points, and somewhat more with the
+# default preset.
 _MOTION = {"sparse": (0.2, 450), "default": (0.4, 950)}
-# Pictures whose features are counted.
+# Number of pictures whose SIFT features are counted.
 _NUM_SAMPLED = 5
-# A motion track this close to a corner, in pixels, sees the same point, less exactly.
+# A motion track this close to a corner, in pixels, observes the same point less accurately.
 _SAME_POINT = 1.0
-# Two tracks of one video this close to each other are the same.
+# Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
-# Most matches of the initial pair.
-_MOST_STARTING = 300
+# Largest number of matches of the initial pair.
+_MAX_INITIAL_MATCHES = 300
 
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """What the estimate of all poses says.
+    """Results of the joint estimate of all poses.
 
     Attributes:
-        num_registered: images with a pose.
-        far_views: median distance in pixels of what the pictures of images ten and more apart show
-            in common from where the poses put it; None where no such images see the same.
-        far_views_largest: the 90 % quantile of it over such pairs of images.
-        moving: share of the images' pixels that move by themselves and have no matches.
+        num_registered: number of registered images.
+        far_views: median long-range epipolar error in pixels, over pairs of images ten or more
+            apart; None if no such images overlap.
+        far_views_largest: its 90th percentile.
+        moving: share of dynamic pixels, which have no matches.
     """
 
     num_registered: int
@@ -92,8 +93,8 @@ class JointMatches(ImageMatches):
     """Matches of all images that agree with an estimate of their poses.
 
     Attributes:
-        estimate: what the estimate says.
-        poses: float64 [3, 4] cam_from_world of each image; None of one that has no pose.
+        estimate: results of the estimate.
+        poses: float64 [3, 4] cam_from_world of each image; None if it is not registered.
     """
 
     estimate: JointEstimate
@@ -106,26 +107,26 @@ def match_jointly(
     image_set: ImageSet,
     density: DensityOptions,
 ) -> JointMatches:
-    """Estimate the poses of all images, and match what agrees with them.
+    """Estimate the poses of all images, and match the tracks that agree with them.
 
-    Images that the estimate leaves out are matched along all their tracks.
+    Images that are not registered are matched along all their tracks.
 
     Args:
-        run: what every stage is given.
+        run: inputs and options of the run.
         videos: the tracks and images of each video.
         image_set: all images.
         density: which motion tracks are matched.
 
     Raises:
-        ModelError: the poses cannot be estimated, or pictures far apart contradict them.
+        ModelError: the poses cannot be estimated, or the long-range check contradicts them.
         VideoError: nothing connects any two images.
     """
     if density.max_sigma is None:
-        density = replace(density, max_sigma=0.0)  # the poses tell which tracks have drifted
+        density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
     posed = estimate_poses(run, videos, image_set)
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
-        raise ModelError("pictures far apart in time contradict the poses")
+        raise ModelError("images far apart in time contradict the poses")
     known = read_posed_model(run.stages / posed.last.result.poses)
     with run.clock.measure("pairs"):
         agreeing = _agreeing_tracks(run, posed, image_set, known, density)
@@ -156,15 +157,14 @@ def match_jointly(
 
 @dataclass(frozen=True)
 class _Agreeing:
-    """Tracks that agree with the poses, in the images that have one.
+    """Tracks that agree with the poses, in the registered images.
 
     Attributes:
-        placed: these images.
-        tracks: the tracks, with all observations that agree; first the corners, then motion.
-        num_corners: number of the corners.
-        others: tracks that images without a pose see.
-        start: the pair of images that a mapper is to begin with, and the tracks to match it by;
-            None: there is no such pair.
+        placed: the registered images.
+        tracks: the tracks, without outliers: first the corners, then motion tracks.
+        num_corners: number of corners.
+        others: tracks with observations in images that are not registered.
+        start: the initial pair for a mapper, and the tracks to match it by; None if there is none.
     """
 
     placed: PosedImages
@@ -177,7 +177,7 @@ class _Agreeing:
 def _agreeing_tracks(
     run: Run, posed: Posed, image_set: ImageSet, known: PosedModel, density: DensityOptions
 ) -> _Agreeing:
-    """The corners of a model and a selection of motion tracks, without what disagrees with it."""
+    """The corners of a model and a selection of motion tracks, without outliers."""
     assert posed.adjustment is not None  # `match` always adjusts
     placed = posed_images_of(known, image_set)
     others = _tracks_of_unregistered(run, posed, image_set, placed, density)
@@ -187,7 +187,7 @@ def _agreeing_tracks(
     corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
     every = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
     every = every.keep_tracks(~at_same_place(every, others, _SAME_TRACK))
-    # `_kept_observations` applies the limit per image, when it knows what each track keeps.
+    # `_kept_observations` applies the limit per image, which depends on what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     some = some.keep_tracks(~at_same_place(some, corners, _SAME_POINT))
     motion, motion_points = _agreeing_motion(run, some, placed)
@@ -210,18 +210,18 @@ def _agreeing_tracks(
 def _agreeing_corners(
     known: PosedModel, num_motion: int, image_set: ImageSet
 ) -> tuple[Tracks, NDArray[np.float64]]:
-    """The corners and links that a model was adjusted on, without what disagrees, and their points.
+    """The corners and SIFT links used in the adjustment, without outliers, and their points.
 
     Args:
-        known: the model.
-        num_motion: number of its points that motion tracks see, which come first.
+        known: the adjusted model.
+        num_motion: number of its points from motion tracks, which come first.
         image_set: all images.
     """
     errors = reprojection_errors(known)
     adjusted = tracks_of_model(known, image_set)
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
     agrees &= adjusted.track >= num_motion
-    enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _FEW
+    enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _NUM_KEPT
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
 
@@ -229,7 +229,7 @@ def _agreeing_corners(
 def _agreeing_motion(
     run: Run, tracks: Tracks, placed: PosedImages
 ) -> tuple[Tracks, NDArray[np.float64]]:
-    """Motion tracks that have a point, without what disagrees with the poses, and their points."""
+    """Motion tracks that have a point, without outliers, and their points."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=_POINTS)
     own = points.observation
@@ -245,28 +245,28 @@ def _agreeing_motion(
 
 
 def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> StartingPair | None:
-    """The pair of images that a mapper is to begin with, see `starting_pair`."""
+    """The initial pair for a mapper, see `starting_pair`."""
     view = np.searchsorted(placed.frames, tracks.frame)
     start = starting_pair(tracks.track, view, points, placed.images)
     if start is None:
         return None
-    step = -(-len(start.points) // _MOST_STARTING)
+    step = -(-len(start.points) // _MAX_INITIAL_MATCHES)
     return replace(start, points=start.points[::step])
 
 
 def _limits(run: Run, image_set: ImageSet, density: DensityOptions) -> DensityOptions:
-    """How many motion tracks keep three observations each."""
+    """Limits of the number of motion tracks that keep three observations."""
     most = density.max_tracks_per_image
     if most is None:
         most = 0
         if density.preset in _MOTION:
             share, limit = _MOTION[density.preset]
             most = min(limit, round(share * _num_features(run, image_set)))
-    return replace(density, max_tracks_per_image=most, min_images=_FEW)
+    return replace(density, max_tracks_per_image=most, min_images=_NUM_KEPT)
 
 
 def _num_features(run: Run, image_set: ImageSet) -> float:
-    """Mean number of SIFT features of a picture, by a few of them."""
+    """Mean number of SIFT features of a picture, estimated from a few."""
     count = len(image_set.sequence)
     some = evenly_spread(count, min(count, _NUM_SAMPLED))
     sift = cv2.SIFT.create()
@@ -277,12 +277,12 @@ def _num_features(run: Run, image_set: ImageSet) -> float:
 def _kept_observations(
     agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions
 ) -> NDArray[np.bool_]:
-    """Which observations are matched: few of most motion tracks, all of others.
+    """Which observations are matched: three of most motion tracks, all of other tracks.
 
     Args:
         agreeing: the tracks.
         frames: int32 [num_images] the frames of all images.
-        limits: how many motion tracks keep three observations each.
+        limits: limits of the number of motion tracks that keep three observations.
 
     Returns:
         bool [num_observations].
@@ -306,16 +306,16 @@ def _kept_observations(
 
 
 def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Three observations of each track, so far apart that pairs of these images are matched.
+    """Choose three observations of each track at distances at which pairs are matched.
 
     Args:
-        tracks: tracks of three and more observations.
-        view: int64 [num_observations] the image of each, by index.
+        tracks: tracks with three or more observations.
+        view: int64 [num_observations] index of the image of each observation.
     """
     first = tracks.offsets[:-1]
     begin, end = view[first], view[tracks.offsets[1:] - 1]
     span = np.array((1, *_SPANS))[np.searchsorted(_SPANS, end - begin, side="right")]
-    # Observations are in the order of tracks, and of images in these.
+    # Observations are sorted by track, then by image.
     num_views = int(view.max()) + 1
     place = tracks.track * num_views + view
     number = np.arange(tracks.num_tracks)[:, None]
@@ -333,7 +333,7 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
 def _paired(
     run: Run, image_set: ImageSet, agreeing: _Agreeing, density: DensityOptions
 ) -> PairedImages:
-    """Match all images: those with a pose along what agrees with it, the others along all."""
+    """Match registered images along the tracks that agree with the poses, others along all."""
     frames, start = image_set.images.frames, agreeing.start
     kept = _kept_observations(agreeing, frames, _limits(run, image_set, density))
     matched = Tracks.concatenate(agreeing.tracks.keep_observations(kept), agreeing.others)
@@ -344,7 +344,7 @@ def _paired(
 
     def choose(keypoints: list[ImageKeypoints]) -> NDArray[np.int32]:
         min_matches = run.options.match.pairs.min_matches
-        pairs = covisible_pairs(keypoints, min_matches, near=_NEAR, most_pairs=_MOST_PAIRS)
+        pairs = covisible_pairs(keypoints, min_matches, near=_NEAR, most_pairs=_MAX_PAIRS)
         if start is None:
             return pairs
         return np.unique(np.vstack([pairs, np.array(pair, np.int32)]), axis=0)
@@ -352,7 +352,7 @@ def _paired(
     paired = pair_by_tracks(matched, frames, choose)
     if start is None:
         return paired
-    # Tracks are numbered anew where some keep no observation.
+    # Tracks without a kept observation are gone, which changes the numbers of the others.
     is_kept = np.add.reduceat(kept, agreeing.tracks.offsets[:-1]) > 0
     wide = np.cumsum(is_kept)[start.points] - 1
     number = int(np.flatnonzero((paired.pairs == pair).all(axis=1))[0])
@@ -365,7 +365,7 @@ def _paired(
 def _tracks_of_unregistered(
     run: Run, posed: Posed, image_set: ImageSet, placed: PosedImages, density: DensityOptions
 ) -> Tracks:
-    """The motion tracks and links that images without a pose see, in all images."""
+    """Motion tracks and SIFT links with observations in images that are not registered."""
     frames = image_set.images.frames
     left = np.setdiff1d(frames, placed.frames)
     if len(left) == 0:
@@ -377,9 +377,9 @@ def _tracks_of_unregistered(
 
 
 def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
-    """The camera of each image: adjusted if a focal length is known, else the guess it began with.
+    """The camera of each image: adjusted if its focal length is known, else the initial guess.
 
-    Those of a database that lists the images stay as they are.
+    Cameras of an existing database stay unchanged.
     """
     if run.cameras is not None:
         return run.cameras.of_images
@@ -393,7 +393,7 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
     own = dict[str, pycolmap.Camera]()
     for image in known.images:
         own[image.name] = known.cameras[image.camera_id]
-        own[image.name].has_prior_focal_length = True  # models do not hold it
+        own[image.name].has_prior_focal_length = True  # models do not store it
         if image.name in matched:
             adjusted[id(matched[image.name])] = own[image.name]
     # Images share a camera if it is the same object, see `ImageMatches`.
@@ -405,17 +405,17 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:
-    """The estimated focal length of the first video; None: it is given, or a guess."""
+    """The estimated focal length of the first video; None if it is given or assumed."""
     given = run.cameras is not None or run.options.match.camera.camera_params is not None
     return None if given or guessed else float(camera.focal_length_y)
 
 
 def _warnings(posed: Posed, left: Sequence[str], num_images: int) -> list[str]:
-    """What the user should know of the estimate."""
+    """Warnings about the estimate."""
     warnings = []
     if left:
         warnings.append(
-            f"{len(left)} of {num_images} images have no pose in the joint estimate and are "
+            f"{len(left)} of {num_images} images are not registered in the joint estimate and are "
             f"matched by motion alone: {some_names(left)}"
         )
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:

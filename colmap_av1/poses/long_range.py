@@ -1,4 +1,4 @@
-"""Whether views from far apart in time agree with the poses, by what the pictures show."""
+"""Long-range check: whether matches of images far apart in time agree with the poses."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 _Image = NDArray[np.uint8]
 
-# Images between two views that are far apart: neighbours agree whatever the model is like.
+# Smallest distance in images of a long-range pair. Neighbours agree even in a bent model.
 GAP = 10
-# Two images see the same where this share of the points of one lie in the other, seen from no
-# more than this angle aside, in degrees, and at no more than this times the distance.
+# Two images overlap if this share of the points of one projects into the other, with at most this
+# angle in degrees between the viewing directions and this ratio of the distances (medians).
 _MIN_OVERLAP = 0.5
 _MAX_ANGLE = 30.0
 _MAX_SCALE = 2.0
-# Points of an image that are asked.
+# Number of points of an image that are projected.
 _NUM_POINTS = 200
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500
-# Images that pairs are made of, evenly spread: features take a twentieth of a second of each.
+# Number of images that pairs are made of, evenly spread. Each takes 0.05 s for its features.
 _NUM_IMAGES = 16
-# Pixels that views from far apart in time may disagree by before it is said: the surfaces of
-# models that hold together agree to less than one, or two with long focal lengths.
-_FAR_APART = 4.0
-# Pairs without a match from which on it is said that there is none.
-_FEWEST_TRIED = 3
+# Long-range epipolar error in pixels (90th percentile) above which there is a warning. Good models
+# have less than one, or two with long focal lengths.
+_MAX_ERROR = 4.0
+# Smallest number of pairs, all without matches, for which there is a warning.
+_MIN_TRIED = 3
 
 
 @dataclass(frozen=True)
 class FarViews:
-    """How far apart views from far apart in time are.
+    """Result of the long-range check.
 
     Attributes:
-        pairs: (name, name) of the images of each pair that has matches.
-        error: float64 [num_pairs] median distance in pixels of a pair's matched features from
-            their epipolar lines, by the poses.
-        num_tried: pairs that by the poses see the same, whose pictures were matched.
-        num_features: median number of features of these pictures; 0 without any.
+        pairs: (name, name) of the images of each pair with matches.
+        error: float64 [num_pairs] long-range epipolar error of each pair: median distance in pixels
+            of its matches from the epipolar lines of the poses.
+        num_tried: number of pairs that overlap by their poses and were matched.
+        num_features: median number of features of their images; 0 if there are none.
     """
 
     pairs: tuple[tuple[str, str], ...]
@@ -66,54 +66,53 @@ class FarViews:
 
     @property
     def median(self) -> float | None:
-        """Median over the pairs; None where no two views from far apart show the same."""
+        """Median error over the pairs; None if no long-range pair has matches."""
         return float(np.median(self.error)) if len(self.error) else None
 
     @property
     def worst(self) -> tuple[str, str] | None:
-        """The images of the pair that is farthest apart."""
+        """The images of the pair with the largest error."""
         return self.pairs[int(self.error.argmax())] if len(self.error) else None
 
     @property
     def largest(self) -> float | None:
-        """The 90 % quantile over the pairs; None as for the median."""
+        """90th percentile of the error over the pairs; None if no long-range pair has matches."""
         return float(np.quantile(self.error, 0.9)) if len(self.error) else None
 
     @property
     def are_apart(self) -> bool:
-        """Whether the model does not hold together."""
-        return self.largest is not None and self.largest > _FAR_APART
+        """Whether the images contradict the poses."""
+        return self.largest is not None and self.largest > _MAX_ERROR
 
     def warning(self, *, linked: bool = False) -> str | None:
-        """What the user should know of a model that does not hold together, or of its pictures.
+        """Warning about poses that the images contradict, or about images without matches.
 
         Args:
-            linked: pictures of places seen again have been matched.
+            linked: whether loop closures have been searched.
         """
-        if not self.pairs and self.num_tried >= _FEWEST_TRIED:
+        if not self.pairs and self.num_tried >= _MIN_TRIED:
             return (
-                f"the pictures of {self.num_tried} pairs of images far apart in time, which by "
-                f"the poses see the same, show nothing in common, with {self.num_features} "
-                "features each, sharp ones have hundreds: they are blurred or plain, or the poses "
-                "are wrong"
+                f"{self.num_tried} pairs of images far apart in time overlap by their poses but "
+                f"show nothing in common, with {self.num_features} features per image where sharp "
+                "ones have hundreds: the images are blurred or lack texture, or the poses are wrong"
             )
         if not self.are_apart or self.worst is None:
             return None
         first, second = self.worst
         return (
-            f"what images far apart in time show in common is up to {self.largest:.1f} px from "
-            f"where the poses put it, most between '{first}' and '{second}': surfaces may be "
-            f"doubled there{'' if linked else '; --links sift matches more pictures'}"
+            f"images far apart in time contradict the poses, with a long-range epipolar error of "
+            f"{self.largest:.1f} px (90th percentile), largest between '{first}' and '{second}': "
+            f"surfaces may be doubled there{'' if linked else '; --links sift matches more images'}"
         )
 
 
 class FarViewCheck:
-    """Collects features of a few images and holds their matches against the poses.
+    """Collects features of a few images, matches them, and compares the matches with the poses.
 
     Args:
         images: the images with their poses, in display order.
         cameras: pycolmap.Camera by id, of any model.
-        points_of: gives float64 [n, 3] positions of the points that an image sees, by its index.
+        points_of: returns float64 [n, 3] the points that an image, given by its index, observes.
     """
 
     def __init__(
@@ -134,18 +133,21 @@ class FarViewCheck:
         return sorted(self._wanted)
 
     def add(self, index: int, picture: _Image, mask: Mask | None = None) -> None:
-        """Take the picture of an image: uint8 [height, width, 3], BGR, as its camera says.
+        """Extract features from the picture of an image.
 
-        `mask` says what of it counts.
+        Args:
+            index: index of the image.
+            picture: uint8 [height, width, 3], BGR, of the size of its camera.
+            mask: which pixels are used; None for all.
         """
         if index in self._wanted:
             features = extract_features(picture, _NUM_FEATURES)
             self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> FarViews:
-        """What the pictures say; all that are needed have been added."""
+        """Match the pairs and compute their errors, after all `wanted` images have been added."""
         features = without_overlays(self._features, self._cameras)
-        # Each pair is freed of outliers by a geometry of its own, not by the poses.
+        # Outliers are removed by each pair's own two-view geometry, not by the poses under test.
         found = match_pairs(
             self._pairs,
             features,
@@ -176,19 +178,19 @@ class FarViewCheck:
             for camera, xy in ((self._cameras[i], xa), (self._cameras[j], xb))
         ]
         focal = np.mean([self._cameras[k].mean_focal_length() for k in (i, j)])
-        # Per image: each has a part of the distance.
+        # The Sampson error splits the distance between both images; sqrt(2) refers it to one.
         distance = np.sqrt(2) * focal * sampson_error(essential_of_poses(a, b), *normalised)
-        # A distorted position may have no ray.
+        # Some distorted positions have no ray.
         return np.asarray(distance[np.isfinite(distance)])
 
 
 def model_far_views(
     reconstruction: Any, image_path: Path, progress: Progress = no_progress
 ) -> FarViews:
-    """Hold the pictures of a model's images against its poses, for a few pairs far apart.
+    """Run the long-range check on a few pairs of a model's images.
 
     Args:
-        reconstruction: pycolmap.Reconstruction; the order of its images' names is that of time.
+        reconstruction: pycolmap.Reconstruction whose image names sort in temporal order.
         image_path: folder of the images.
         progress: called for the stage "far views".
 
@@ -226,10 +228,10 @@ def _far_pairs(
     cameras: Sequence[Any],
     points_of: Callable[[int], _Floats],
 ) -> NDArray[np.int32]:
-    """Choose pairs of images that by their poses see the same though many images lie between.
+    """Choose a few pairs of images that are far apart in time and overlap by their poses.
 
     Returns:
-        int32 [n, 2], first < second; few, spread over the images, with the longest spans first.
+        int32 [n, 2], first < second: first the longest spans, then others spread over the images.
     """
     num_images = len(images)
     if num_images <= GAP:
@@ -246,19 +248,19 @@ def _far_pairs(
             found.append((i, partner))
     found.sort(key=lambda pair: (pair[0] - pair[1], pair[0]))
     half = _NUM_PAIRS // 2
-    # Half of them the longest spans, half spread over the rest.
+
     rest = sorted(found[half:])
     spread = rest[:: max(1, -(-len(rest) // half))] if rest else []
     return np.array(found[:half] + spread[:half], dtype=np.int32).reshape(-1, 2)
 
 
 def _sees_same(points: _Floats, poses: _Floats, camera: Any) -> bool:
-    """Whether an image sees most of the points [n, 3] of another much as that one does.
+    """Whether the second image sees most of the points of the first from a similar viewpoint.
 
     Args:
-        points: those that the other image sees.
-        poses: [2, 3, 4] of the other image and of the one that is asked.
-        camera: of the one that is asked.
+        points: float64 [n, 3] points that the first image observes.
+        poses: float64 [2, 3, 4] cam_from_world of both images.
+        camera: camera of the second image.
     """
     local = points @ poses[1, :, :3].T + poses[1, :, 3]
     local = local[local[:, 2] > 0]

@@ -1,4 +1,4 @@
-"""The stage of `reconstruct` that holds what pictures far apart in time show against the poses."""
+"""The stage of `reconstruct` that runs the long-range check."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# Tracks at most whose points tell which images see the same; short ones are left out.
+# Largest number of tracks whose points determine which images overlap; short ones are ignored.
 _NUM_TRACKS = 10_000
 
 
@@ -34,11 +34,11 @@ class LongRangeResult:
     """What `far_view_stage` found.
 
     Attributes:
-        far_views: median distance in pixels of what the pictures of images ten and more apart show
-            in common from where the poses put it; None where no such images see the same.
-        far_views_largest: the 90 % quantile of it over such pairs of images.
-        far_views_warning: what the user should know of it.
-        apart: the pictures contradict the poses.
+        far_views: median long-range epipolar error in pixels, over pairs of images ten or more
+            apart; None if no such images overlap.
+        far_views_largest: its 90th percentile.
+        far_views_warning: warning about it.
+        apart: whether the images contradict the poses.
     """
 
     far_views: float | None
@@ -56,15 +56,15 @@ def far_view_stage(
     *,
     linked: bool,
 ) -> Kept[LongRangeResult]:
-    """Compare a few pictures that lie far apart in time, and by the poses show the same.
+    """Match a few pairs of images far apart in time, and compare the matches with the poses.
 
     Args:
-        run: what every stage is given.
+        run: inputs and options of the run.
         tracks: the tracks of all sequences.
         image_set: the images.
-        moving: by the names of images, masks that leave out what moves.
-        posed: the stage that holds the poses.
-        linked: pictures of places seen again have been matched.
+        moving: masks that exclude dynamic pixels, by image name.
+        posed: the stage that estimated the poses.
+        linked: whether loop closures have been searched.
     """
 
     def make(_: Path) -> LongRangeResult:
@@ -105,7 +105,7 @@ def _compared(
 
 
 def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDArray[np.float64]]:
-    """Float64 [n, 3] positions of some points that each image sees."""
+    """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
     seen, view = seen_in(pose_tracks(run, some), placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FOR_POSES)

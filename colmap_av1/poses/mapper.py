@@ -1,4 +1,4 @@
-"""COLMAP's mappers and bundle adjustment in separate processes, to stop them and keep logs."""
+"""COLMAP's mappers and bundle adjustment in separate processes, which can be stopped and logged."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from colmap_av1.util.progress import Progress
 if TYPE_CHECKING:
     import pycolmap
 
-# The robust loss makes progress slow: steps that each lower the error by less than a thousandth
-# still bring far views of one place together.
+# Convergence is slow with a robust loss: steps that lower the cost by less than 0.1 % still reduce
+# the long-range epipolar error.
 _ADJUSTMENT_STEPS = 20
 _ADJUSTMENT_TOLERANCE = 1e-4
-# Where an adjustment with a smaller loss follows, which goes on from there to the same end.
+# An adjustment before the last may stop earlier: the next one reaches the same minimum.
 _FIRST_TOLERANCE = 1e-3
-# Images up to which the matrix of all cameras is taken as dense: tracks of many images fill it, and
-# looking for its structure takes as long as solving it.
-_MOST_DENSE_IMAGES = 400
-# Points that an image must see to be held by them, as COLMAP's mapper asks of one before it gets a
-# pose, unless all see few: then this share of what is usual. An image that a pillar fills saw 8
-# where others saw 300 and more, and was off by 300 times as much as they.
+# Largest number of images for which the reduced camera matrix is solved as a dense one: long tracks
+# fill it, and analysing its sparsity takes as long as solving it.
+_MAX_DENSE_IMAGES = 400
+# An image must observe this many points to stay registered, as COLMAP's mapper requires, or this
+# share of the median if that is less. An image filled by a pillar observed 8 where others observed
+# 300 or more, and its pose error was 300 times theirs.
 FEW_SEEN = (30, 0.1)
 
-# The file by itself: the whole package takes twice as long to import as pycolmap. Without '' on the
-# path: what lies in the working folder would be imported in place of libraries.
+# The module is loaded from its file, since importing the whole package takes twice as long as
+# pycolmap. The path must not contain '': files in the working folder would shadow libraries.
 _CHILD = """
 import importlib.util, json, sys
 sys.path[:] = filter(None, sys.path)
@@ -63,26 +63,25 @@ def map_poses(
     start_tracks: int | None = None,
     tolerance: float | None = None,
 ) -> tuple[int, ...]:
-    """Map a database in a process of its own, see `run_mapper`.
+    """Map a database in a separate process, see `run_mapper`.
 
     Args:
-        database: COLMAP database with verified matches; pycolmap brings it to its own layout.
-        output: folder that gets the models; made where it is missing.
-        options: which mapper, and how.
-        image_path: folder of the images; None: the points stay black.
-        log: file that gets what the mapper prints.
+        database: COLMAP database with verified matches; pycolmap migrates it to its schema.
+        output: folder for the models; created if missing.
+        options: mapper and its options.
+        image_path: folder of the images, for the colours of points; None leaves them black.
+        log: file for the output of the mapper.
         num_images: number of images, for the progress.
-        progress: called in the stage "poses" with the number of images placed so far.
-        start_tracks: tracks of each image that the global mapper starts from, the longest ones; the
-            others are triangulated and adjusted on what it finds. None: all.
-        tolerance: share of the error that a step of adjusting all images must lower it by, or be
-            the last. None: what COLMAP sets.
+        progress: called in the stage "poses" with the number of images registered so far.
+        start_tracks: number of tracks per image, the longest ones, that the global mapper starts
+            from; the others are triangulated and adjusted afterwards. None uses all.
+        tolerance: function tolerance of global bundle adjustment; None uses COLMAP's default.
 
     Returns:
-        Images with a pose in each model, the most first; empty where none came out.
+        Number of registered images of each model, in descending order; empty if there is no model.
 
     Raises:
-        ModelError: the mapper failed; the log says more.
+        ModelError: the mapper failed; the log holds the details.
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
@@ -100,7 +99,7 @@ def map_poses(
             sizes = json.loads(value)
 
     failed = f"COLMAP's {options.mapper} mapper"
-    _run_apart(settings, hear, log, failed=failed, hint="try the other --mapper")
+    _run_in_process(settings, hear, log, failed=failed, hint="try the other --mapper")
     if sizes:
         _check_whole(output / "0")
     progress("poses", num_images, num_images)
@@ -117,14 +116,14 @@ def run_mapper(
     """Map a database in this process.
 
     Args:
-        database: COLMAP database with verified matches; pycolmap brings it to its own layout.
-        output: an existing folder; gets a folder for each model, numbered from 0, the model with
-            the most images first: a mapper may make one of two images beside the real one.
-        options: which mapper, and how.
-        image_path: folder of the images; None: the points stay black.
+        database: COLMAP database with verified matches; pycolmap migrates it to its schema.
+        output: an existing folder for the models, each in a folder numbered from 0. The largest
+            comes first, since a mapper may also create spurious models of two images.
+        options: mapper and its options.
+        image_path: folder of the images, for the colours of points; None leaves them black.
 
     Returns:
-        Images with a pose in each model.
+        Number of registered images of each model.
     """
     return run_mapping(_mapping_settings(database, output, options, image_path))
 
@@ -159,23 +158,22 @@ def adjust_model(
     max_steps: int = _ADJUSTMENT_STEPS,
     tolerance: float = _ADJUSTMENT_TOLERANCE,
 ) -> None:
-    """Bundle-adjust poses, points and, if asked to, intrinsics of a model; it is overwritten.
+    """Bundle-adjust poses, points and, optionally, intrinsics of a model, which is overwritten.
 
     Args:
         model: folder of a COLMAP model.
         refine_intrinsics: refine focal length and distortion.
-        loss_scales: reprojection errors in pixels from which on an observation counts less
-            (Cauchy's loss), of one adjustment after another: with a small one alone, images that
-            are off by much more hardly move.
+        loss_scales: scale in pixels of the Cauchy loss of each of several consecutive adjustments.
+            A small scale alone would hardly move images with much larger errors.
         seed: the random seed.
-        num_threads: threads; the result is the same from run to run with one only.
-        log: file that gets what COLMAP prints.
-        max_steps: steps of each adjustment at most.
-        tolerance: share of the cost that a step of the last adjustment must lower it by, or be the
-            last.
+        num_threads: number of threads; only one thread makes the result reproducible.
+        log: file for the output of COLMAP.
+        max_steps: largest number of iterations of each adjustment.
+        tolerance: function tolerance of the last adjustment: smallest relative decrease of the cost
+            per iteration.
 
     Raises:
-        ModelError: the adjustment failed; the log says more.
+        ModelError: the adjustment failed; the log holds the details.
     """
     tolerances = [_FIRST_TOLERANCE] * (len(loss_scales) - 1) + [tolerance]
     settings = {
@@ -187,17 +185,17 @@ def adjust_model(
         "num_threads": num_threads,
         "max_num_iterations": max_steps,
         "function_tolerances": tolerances,
-        "most_dense_images": _MOST_DENSE_IMAGES,
+        "most_dense_images": _MAX_DENSE_IMAGES,
     }
-    _run_apart(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 leaves it out")
+    _run_in_process(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 skips it")
     _check_whole(model)
 
 
 def without_unseen_images(model: Path) -> pycolmap.Reconstruction:
-    """Leave out of a model the images that hardly any of its points are seen in; read it.
+    """Read a model and deregister the images that observe too few points.
 
     Args:
-        model: folder of a COLMAP model; it is overwritten where an image is left out.
+        model: folder of a COLMAP model; it is overwritten if an image is deregistered.
     """
     found = read_model(model)
     counts = {number: image.num_points3D for number, image in found.images.items()}
@@ -212,17 +210,17 @@ def without_unseen_images(model: Path) -> pycolmap.Reconstruction:
 
 
 def _check_whole(model: Path) -> None:
-    """Refuse a model that was cut short, as on a full disk: COLMAP does not say so."""
+    """Check that a model is complete: COLMAP reports no error when the disk is full."""
     try:
         read_model(model)
     except ModelError as error:
         raise ModelError(
-            f"{model}: was not written to its end: see that the disk has space, and run the same "
-            "command again"
+            f"{model}: is incomplete: make sure that the disk has space, and run the same command "
+            "again"
         ) from error
 
 
-def _run_apart(
+def _run_in_process(
     settings: dict[str, Any],
     hear: Callable[[str, str], None] | None,
     log: Path,
@@ -230,12 +228,12 @@ def _run_apart(
     failed: str,
     hint: str,
 ) -> None:
-    """Run the settings in a process; `hear` gets the names and values that it prints."""
-    # Libraries are found where this process has them. Idle threads of BLAS would wait in a loop.
+    """Run `run_child` in a process; `hear` is called with the names and values that it prints."""
+    # The child finds libraries where this process does. Idle BLAS threads would spin.
     path, num_threads = os.pathsep.join(sys.path), str(settings["num_threads"])
     environment = {**os.environ, "PYTHONPATH": path, BLAS_THREADS: num_threads}
     done, reason = False, ""
-    give_back_free_memory()  # the process needs its own beside this one's
+    give_back_free_memory()  # for the child
     with (
         log.open("wb") as file,
         subprocess.Popen(
@@ -260,5 +258,5 @@ def _run_apart(
             raise
     if not done:
         raise ModelError(
-            f"{failed} stopped with status {process.returncode}{reason}: {log} says where; {hint}"
+            f"{failed} stopped with status {process.returncode}{reason}: see {log}; {hint}"
         )

@@ -1,6 +1,7 @@
-"""The work of the process that maps or adjusts; it imports none of the package.
+"""The child process that maps or adjusts.
 
-That takes twice as long as pycolmap alone, each time. So settings and results are what JSON holds.
+It imports nothing else of the package, which would take twice as long as importing pycolmap alone.
+Settings and results are therefore JSON values.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from typing import Any
 
 
 def run_child(settings: dict[str, Any]) -> None:
-    """Map or adjust in this process; progress goes to standard output."""
-    # The interrupt of a terminal reaches the parent, too, which ends this process.
+    """Map or adjust in this process, and print progress to standard output."""
+    # Ctrl-C also reaches the parent, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -39,13 +40,17 @@ def run_child(settings: dict[str, Any]) -> None:
 
 
 def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = None) -> list[int]:
-    """Map a database, see `run_mapper`; `placed` is called at each image of the incremental mapper.
+    """Map a database, see `run_mapper`.
+
+    Args:
+        settings: see `_mapping_settings`.
+        placed: called whenever the incremental mapper registers an image.
 
     Returns:
-        Images with a pose in each model.
+        Number of registered images of each model.
     """
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
-    import pycolmap  # noqa: PLC0415 - after what a process of its own does first
+    import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
     database, output = Path(settings["database"]), Path(settings["model"])
     refine = settings["refine_intrinsics"]
@@ -64,7 +69,7 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
             how.ba_global_function_tolerance = settings["tolerance"]
         if settings["init_max_forward_motion"] is not None:
             how.mapper.init_max_forward_motion = settings["init_max_forward_motion"]
-        # pycolmap takes None for a callback, although the stub does not say so.
+        # pycolmap accepts None for a callback, although its stub does not declare it.
         callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
     else:
@@ -89,7 +94,7 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
 
 
 def _adjust(settings: dict[str, Any]) -> None:
-    import pycolmap  # noqa: PLC0415 - after what run_child does first
+    import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
     model = pycolmap.Reconstruction(settings["model"])
     options = pycolmap.BundleAdjustmentOptions()

@@ -1,4 +1,4 @@
-"""The stage that matches the key images along their tracks and writes a database of them."""
+"""The stage that matches the key images along their tracks and writes their database."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ _LINKS = "links.npz"
 
 @dataclass(frozen=True)
 class MatchesResult:
-    """What `match_stage` found beside the database and the links it keeps.
+    """What `match_stage` found, apart from the database and the links it stores.
 
     Attributes:
-        links: what connects images where motion does not.
-        link_warnings: what the user should know of cameras and links.
-        key_images: index of the images that are mapped.
-        num_pose_tracks: tracks that the poses come from.
-        guessed: the focal length of some video is a guess.
-        forward_motion: the camera moves along its axis, see `MatchReport`.
+        links: SIFT links across gaps and loop closures.
+        link_warnings: warnings about cameras and links.
+        key_images: indices of the key images.
+        num_pose_tracks: number of tracks that the poses are estimated from.
+        guessed: whether the focal length of some video is assumed.
+        forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         depth: whether the matches determine depth.
-        num_pairs: image pairs.
-        num_flat_pairs: pairs that a homography explains.
-        num_verified_pairs: pairs with a two-view geometry.
-        keypoints_per_image: their mean number.
+        num_pairs: number of image pairs.
+        num_flat_pairs: number of pairs that a homography explains.
+        num_verified_pairs: number of pairs with a two-view geometry.
+        keypoints_per_image: mean number of keypoints.
     """
 
     links: LinkReport
@@ -74,7 +74,7 @@ def _write_links(folder: Path, found: ImageMatches) -> None:
 
 
 def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
-    """The links as tracks, and the frames before the gaps that no other track crosses."""
+    """The links as tracks, and the frame before each contradicted gap, which no track crosses."""
     with np.load(stages / _LINKS) as file:
         return tracks_of(file), file["broken"]
 
@@ -85,13 +85,13 @@ def match_stage(
     image_set: ImageSet,
     doubted: Sequence[int],
 ) -> Kept[MatchesResult]:
-    """Write the database of the tracks that the poses come from, and of links.
+    """Match the key images by tracks and links, and write them to a database.
 
     Args:
-        run: what every stage is given.
+        run: inputs and options of the run.
         videos: the tracks of each video.
         image_set: the images.
-        doubted: frames, counted through the videos, whose motion is not to be trusted.
+        doubted: frames, counted through the videos, with unreliable motion.
     """
     options, clock = run.options, run.clock
     mapping = options.mapping
@@ -155,9 +155,9 @@ def match_stage(
 
 
 def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[int]:
-    """The images that are mapped, by their index: all, where key images are not wanted.
+    """Indices of the images that are mapped: the key images, or all if the option is off.
 
-    Photos are key images: no track says where they are.
+    All photos are key images, since no track connects them.
     """
     if not run.options.mapping.key_images:
         return list(range(len(image_set.sequence)))
@@ -171,7 +171,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
 
 
 def _pose_density(run: Run) -> DensityOptions:
-    """Which tracks the poses come from."""
+    """Density of the tracks that poses are estimated from."""
     mapping = run.options.mapping
     return DensityOptions(
         preset="sparse",
@@ -183,7 +183,7 @@ def _pose_density(run: Run) -> DensityOptions:
 def _selected_tracks(
     run: Run, videos: Sequence[VideoTracks], image_set: ImageSet
 ) -> list[SelectedTracks]:
-    """A spread selection of the tracks of each video, for poses."""
+    """A spread selection of the tracks of each video that poses are estimated from."""
     density = _pose_density(run)
     selected = []
     for video, own in enumerate(videos):
@@ -199,14 +199,14 @@ def _selected_tracks(
 def _match_images(
     run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, index: Sequence[int]
 ) -> ImageMatches:
-    """Match the key images, that are some of all images.
+    """Match the key images, given by their indices.
 
-    Cameras are estimated from all images: a few that lie far apart mislead.
+    Cameras are estimated from all images, since key images are too far apart for it.
     """
     options = run.options.match
     camera = options.camera
     if camera.single_camera is False:
-        # The adjustment separates them: mappers hardly find many focal lengths at once.
+        # Mappers rarely converge with many focal lengths. The adjustment gives images their own.
         camera = replace(camera, single_camera=None)
     context = run.context
     groups = ImageMatchOptions(

@@ -1,4 +1,4 @@
-"""The images that a stage has placed, and points of tracks in them."""
+"""The registered images of a stage, and points of tracks in them."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import Kept
 
-# Poses follow from rays, however uncertain the points are that these meet in.
+# For pose estimation even points of uncertain depth are useful, so their depth error is unlimited.
 FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
 
 
 @dataclass(frozen=True)
 class PosesResult:
-    """What a stage found that ends in poses.
+    """Result of a stage that estimates poses.
 
     Attributes:
         poses: file of the posed model, in the folder of the stages.
-        num_registered: images with a pose.
-        registered: those of each of several videos, by its name.
+        num_registered: number of registered images.
+        registered: number of registered images of each video, by its name; empty for one video.
     """
 
     poses: str
@@ -43,7 +43,7 @@ class PosesResult:
 
 @dataclass(frozen=True)
 class PosedImages:
-    """The images that have a pose.
+    """The registered images.
 
     Attributes:
         images: the images, in the order of their frames.
@@ -51,7 +51,7 @@ class PosedImages:
         sequence: int32 [n] their sequences.
         first_frame: first frame of each sequence, see `ImageSet`.
         cameras: their pycolmap.Cameras, by id.
-        masks: of each, which of its pixels count; None: all.
+        masks: which pixels of each image are used; None for all.
     """
 
     images: list[ModelImage]
@@ -67,7 +67,7 @@ class PosedImages:
         return [self.cameras[image.camera_id] for image in self.images]
 
     def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
-        """The mask of each image, joined with another of its name where there is one."""
+        """The mask of each image, joined with the one of its name in `others`, if any."""
         return [
             joined_masks(mask, others.get(image.name))
             for mask, image in zip(self.masks, self.images, strict=True)
@@ -75,12 +75,12 @@ class PosedImages:
 
 
 def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
-    """The images with the poses that a stage left."""
+    """The registered images of a stage."""
     return posed_images_of(read_posed_model(run.stages / posed.result.poses), image_set)
 
 
 def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
-    """The images that have a pose in a model."""
+    """The images of a set that are registered in a model."""
     posed_by_name = poses.by_name
     names = image_set.images.names
     index = [i for i, name in enumerate(names) if name in posed_by_name]
@@ -102,7 +102,7 @@ def triangulate_in(
     rays: NDArray[np.float64] | None = None,
     progress: Progress = no_progress,
 ) -> TriangulatedPoints:
-    """Points of tracks in the images that have a pose; see `triangulate_tracks`."""
+    """Triangulate tracks in the registered images, see `triangulate_tracks`."""
     return triangulate_tracks(
         seen,
         view,
@@ -117,7 +117,7 @@ def triangulate_in(
 
 
 def check_agreement(num_points: int, num_tracks: int) -> None:
-    """Refuse poses that no track agrees with."""
+    """Raise `ModelError` if no track agrees with the poses."""
     if num_points == 0:
         raise ModelError(
             f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
@@ -126,7 +126,7 @@ def check_agreement(num_points: int, num_tracks: int) -> None:
 
 
 def registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
-    """Number of registered images of each of several videos, by its name.
+    """Number of registered images of each video, by its name; empty for one video.
 
     Args:
         names: names of the registered images.

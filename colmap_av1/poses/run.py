@@ -1,4 +1,4 @@
-"""What every stage of the estimate is given."""
+"""The inputs and options that every stage of the estimate gets."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from colmap_av1.video.unchanged import FileState
 
 @dataclass(frozen=True)
 class Run:
-    """What every stage is given.
+    """Inputs and options of a run.
 
     Attributes:
         inputs: the videos and photos.
         sources: for each video, where its motion and pictures come from.
-        shown: for each video, how its pictures are looked at.
-        output: the folder that is made.
-        stages: the folder in it that holds what later runs resume from.
-        options: options of every stage.
-        clock: gets the time of each stage.
+        shown: for each video, how its pictures are decoded and displayed.
+        output: the output folder.
+        stages: its subfolder with the results that later runs resume from.
+        options: options of all stages.
+        clock: measures the time of each stage.
         progress: called in each stage.
-        positions: where the images were taken; None before these are chosen.
-        cameras: of all images, where a database lists them; None: they are made anew.
+        positions: positions of the images; None before the images are chosen.
+        cameras: cameras of all images in an existing database; None creates them.
     """
 
     inputs: Inputs
@@ -52,7 +52,7 @@ class Run:
 
     @property
     def files(self) -> tuple[FileState, ...]:
-        """All files as they were at the start."""
+        """The state of all input files at the start."""
         photos = [photo.state for photo in self.inputs.photos]
         return (*(file for source in self.sources for file in source.files), *photos)
 
@@ -62,6 +62,6 @@ class Run:
         return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
 
     def pictures(self, image_set: ImageSet) -> Pictures:
-        """What gives the pictures of images, see `pictures_of`."""
+        """Reader of the pictures of images, see `pictures_of`."""
         photos = [photo.path for photo in self.inputs.photos]
         return pictures_of(image_set, self.shown, photos, self.options.match.reading)

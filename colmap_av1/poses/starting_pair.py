@@ -1,9 +1,9 @@
-"""The pair of images that COLMAP's incremental mapper is to begin with, by known poses.
+"""The initial pair for COLMAP's incremental mapper, chosen by known poses.
 
-The mapper begins with a pair of many inliers and a wide triangulation angle (the median over the
-inliers), and halves these limits where no pair meets them. On a drive, most of what two images
-share is far ahead: no pair has a wide angle, and the mapper may take one whose pose is wrong. The
-points beside the road do have one.
+The mapper starts from a pair with many inliers and a large triangulation angle (the median over the
+inliers), and halves these limits if no pair meets them. On a drive, most points that two images
+share are far ahead. No pair has a large angle then, and the mapper may choose one with a wrong
+pose. Points beside the road do have a large angle, so that the pair is matched by these alone.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# The mapper estimates pose and inliers anew: what only just meets its limits may fail.
+# The mapper estimates pose and inliers itself, so that a pair that barely meets its limits may
+# fail.
 _MARGIN = 1.1
 _ENOUGH = round(1.5 * INITIAL_MIN_INLIERS)
 _FORWARD = INITIAL_MAX_FORWARD_MOTION - 0.02
-# Images that are tried as the first of a pair, and distances to the second, in images.
+# Number of images that are tried as the first of a pair, and distances in images to the second.
 _NUM_FIRST = 100
 _SPANS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56)
 
 
 @dataclass(frozen=True)
 class StartingPair:
-    """A pair of images to begin with.
+    """An initial pair of images.
 
     Attributes:
         first: index of the first image.
@@ -50,7 +51,7 @@ class StartingPair:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A pair of images, the points that both see, and the angles there in degrees."""
+    """A pair of images, the points that both observe, and their triangulation angles in degrees."""
 
     pair: tuple[int, int]
     points: NDArray[np.int64]
@@ -58,7 +59,7 @@ class _Candidate:
     is_forward: bool
 
     def wide(self, angle: float) -> NDArray[np.int64]:
-        """The points to match the pair by, so that the median angle is wide enough."""
+        """The points to match the pair by, so that their median angle is large enough."""
         if np.median(self.angles) >= angle:
             return self.points
         return self.points[self.angles >= angle]
@@ -70,16 +71,16 @@ def starting_pair(
     xyz: _Floats,
     images: list[ModelImage],
 ) -> StartingPair | None:
-    """Find the pair that sees the most points at a wide angle, sideways if possible.
+    """Find the pair with the most points at a large angle, with sideways motion if possible.
 
     Args:
         point: int64 [num_observations] the point of each observation, ascending.
-        view: int64 [num_observations] the image of each, by index.
+        view: int64 [num_observations] index of its image.
         xyz: float64 [num_points, 3] the points.
         images: the images with their poses.
 
     Returns:
-        The pair; None if the mapper would begin with none, whatever is matched.
+        The pair; None if the mapper would accept none, however it is matched.
     """
     candidates = list(_candidates(point, view, xyz, images))
     for angle in (_MARGIN * INITIAL_MIN_ANGLE, _MARGIN * INITIAL_MIN_ANGLE / 2):

@@ -27,13 +27,13 @@ def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
 
 
 def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np.bool_]:
-    """Which tracks some image shows at the place of another track.
+    """Which tracks have an observation at the position of an observation of another track.
 
     Args:
         tracks: the tracks.
         others: tracks through the same frames, in the same pixels.
-        distance: pixels. Observations up to this far apart are at the same place, and some that
-            are up to three times as far apart, as cells of this size are compared.
+        distance: distance in pixels up to which positions are the same. Cells of this size are
+            compared, so that some positions up to three times as far apart count as well.
 
     Returns:
         bool [num_tracks].
@@ -60,7 +60,7 @@ def pair_by_tracks(
     Args:
         tracks: the tracks.
         frames: int32 [num_images] the frame of each image, ascending.
-        choose: chooses the pairs, int32 [m, 2], by the keypoints, see `covisible_pairs`.
+        choose: chooses the pairs, int32 [m, 2], from the keypoints, see `covisible_pairs`.
     """
     keypoints = image_keypoints(tracks, frames.tolist())
     pairs = choose(keypoints)

@@ -1,4 +1,4 @@
-"""The first stage of `reconstruct`: tracks of each video, and which of its frames are images."""
+"""The first stage of `reconstruct`: the tracks of each video, and its frames that become images."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
-# A mapper may leave a bogus model of two images where it finds no start.
+# A mapper that finds no initial pair may leave a spurious model of two images.
 LEAST_IMAGES = 3
-# Frames that the images of a long video are chosen among, to one of these.
+# Candidate frames per image of a long video.
 _CANDIDATES = 2
-# Observations that are held of them at most, and the pixels that one of these may be there for.
-_MOST_HELD = 24_000_000
-_PIXELS_OF_UNIT = 16
-# They are chosen by one in so many tracks, or by those of squares of so many pixels: a quarter of
-# those that poses come from.
+# Largest number of observations in candidate frames that are held in memory, and the assumed number
+# of pixels per observation.
+_MAX_HELD = 24_000_000
+_PIXELS_PER_OBSERVATION = 16
+# Images of a long video are chosen by every fourth track, or by tracks seeded in squares of this
+# width in pixels: a quarter of the tracks that poses are estimated from.
 _FEWER = 4
 _SEEDING = 8
 
@@ -53,7 +54,7 @@ class VideoTracks:
         chosen: the frames that are images.
         inter_share: see `TrackedVideo`.
         read_out: see `TracksResult`.
-        digest: digest of the stage that keeps them; empty if none does.
+        digest: digest of the stage that stores them; empty if they are not stored.
     """
 
     tracks: Tracks
@@ -63,7 +64,7 @@ class VideoTracks:
     digest: str = ""
 
     def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
-        """The same, but for frames whose motion is not to be trusted, whatever the stream says."""
+        """A copy in which the motion of some frames is unreliable, as if they were intra-coded."""
         share = self.inter_share.copy()
         share[list(frames)] = 0.0
         return replace(self, inter_share=share)
@@ -71,14 +72,14 @@ class VideoTracks:
 
 @dataclass(frozen=True)
 class TracksResult:
-    """What `track_stage` found beside the tracks it keeps.
+    """What `track_stage` found, apart from the tracks it stores.
 
     Attributes:
-        num_frames: shown frames of the video.
-        num_tracks: tracks of the video.
-        read_out: read-out time in milliseconds of the shutter that tracks were corrected for; None:
-            they were not.
-        warnings: what the user should know of the video.
+        num_frames: number of shown frames of the video.
+        num_tracks: number of its tracks.
+        read_out: read-out time in milliseconds of the rolling shutter that tracks were corrected
+            for; None if they were not.
+        warnings: warnings about the video.
     """
 
     num_frames: int
@@ -88,12 +89,12 @@ class TracksResult:
 
 
 def encoding_for_pictures(encode: EncodeOptions) -> EncodeOptions:
-    """How a video is converted if its pictures correct the poses: quickly by default."""
+    """Encoding options if corners refine the poses later: quick by default."""
     return replace(encode, effort="quick") if encode.effort == "auto" else encode
 
 
 def stage_of_video(run: Run, video: int) -> str:
-    """Name of the stage that makes the tracks of a video."""
+    """Name of the track stage of a video."""
     label = run.inputs.labels[video]
     return f"tracks_{label}" if label else "tracks"
 
@@ -117,7 +118,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             options.camera,
             run.context,
         )
-        # Of a long video no other frame is of use from here on.
+        # Later stages need no other frames of a long video.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
         with (partial / f"{name}.npz").open("wb") as file:
@@ -175,23 +176,23 @@ def _track_and_choose(
 
 
 def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages:
-    """The tracks of a video with more frames than `max_images`, in chosen images alone.
+    """Track a video with more frames than `max_images`, and keep the chosen images only.
 
-    These are chosen among evenly spread frames. The motion is read twice, first for the choice
-    alone and by few tracks, if the tracks in all these frames take too much memory, or if the
-    shutter is corrected or tracks are refined, which takes other frames.
+    The images are chosen from evenly spread candidate frames. The motion is read twice, first with
+    few tracks for the choice alone, if the tracks in all candidates need too much memory, or if the
+    rolling shutter is corrected or tracks are refined, both of which need other frames.
     """
     source = run.sources[video]
     count = count_frames(source)
     most = min(count, _CANDIDATES * run.options.max_images)
     candidates = np.array(evenly_spread(count, most), dtype=np.int32)
     width, height = source.stream.picture_size
-    held = len(candidates) * width * height / _PIXELS_OF_UNIT
-    # Motion between all neighbouring frames is needed to correct the shutter.
+    held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION
+    # Correcting the rolling shutter needs the motion between all neighbouring frames.
     has_shutter = run.options.match.camera.rolling_shutter != "none"
     track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
 
-    if options.refine.refine == "none" and not has_shutter and held <= _MOST_HELD:
+    if options.refine.refine == "none" and not has_shutter and held <= _MAX_HELD:
 
         def choose(tracked: TrackedVideo) -> ChosenImages:
             few = tracked.tracks.every_nth(_FEWER)
@@ -218,7 +219,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
 
 
 def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -> ChosenImages:
-    """As many images as a trainer wants among some frames of a video, its key images with them."""
+    """Choose up to `max_images` of the candidate frames, including the key images."""
     tracks = tracked.tracks
     candidates = candidates[candidates < tracks.num_frames]
     names = image_names(run.options.match.images.file_name, candidates.tolist())
@@ -231,7 +232,7 @@ def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -
 def key_images_of_video(
     run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """The key images among some images of a video, by their index."""
+    """Indices of the key images among some images of a video."""
     mapping, links = run.options.mapping, run.options.match.links
     always = images_to_link(inter_share, chosen.frames, links)
     if links.links != "none":
@@ -246,7 +247,7 @@ def key_images_of_video(
 
 
 def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
-    """Refuse images of a video that are too few for a model, or have names unfit for trainers."""
+    """Check that there are enough images for a model, and that trainers accept their names."""
     if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
         raise ImageError(
             f"{len(chosen.names)} of {num_frames} frames become images: a model needs "
@@ -254,11 +255,11 @@ def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
         )
     unfit = next((n for n in chosen.names if "/" in n or n.count(".") != 1), None)
     if unfit is not None:
-        raise OptionError(f"image '{unfit}': trainers want a flat name with one dot")
+        raise OptionError(f"image '{unfit}': trainers need a name without folders and with one dot")
 
 
 def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
-    """The tracks and images that `track_stage` kept of a video."""
+    """The tracks and images of a video that `track_stage` stored."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
         return VideoTracks(
             tracks_of(file),
@@ -270,13 +271,13 @@ def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
 
 
 def read_tracks_only(run: Run, video: int) -> Tracks:
-    """The tracks that `track_stage` kept of a video, without its images."""
+    """The tracks of a video that `track_stage` stored, without its images."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
         return tracks_of(file)
 
 
 def tracks_of(file: Any) -> Tracks:
-    """The tracks that a file of `np.savez` holds."""
+    """The tracks in a file of `np.savez`."""
     arrays = {field.name: file[field.name] for field in dataclasses.fields(Tracks)}
     for name in ("num_frames", "width", "height"):
         arrays[name] = int(arrays[name])
@@ -284,5 +285,5 @@ def tracks_of(file: Any) -> Tracks:
 
 
 def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
-    """The tracks that poses are estimated from; short ones are for points only."""
+    """The tracks that poses are estimated from; shorter ones are used for points only."""
     return tracks.keep_long(least_length(run.options.match.tracks))

@@ -1,8 +1,8 @@
-"""Cameras of their own for the images of a video whose focal length changes.
+"""Separate cameras for the images of a video whose focal length changes.
 
-A camera that all images share hides a zoom: poses and points bend until they fit nearly as well. So
-stretches of a few images each get a camera on trial. If these fit better and differ, the lens has
-zoomed, and each image gets a camera.
+A shared camera hides a zoom: poses and points bend until they fit nearly as well. Groups of a few
+consecutive images therefore get a trial camera each. If these differ and lower the cost, the lens
+has zoomed, and each image gets its own camera.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.poses.mapper import adjust_model
 from colmap_av1.poses.run import Run
 
-# Images that share a camera on trial: fewer determine its focal length less well.
-_STRETCH = 5
-# A lens zooms if the longest focal length of stretches exceeds the shortest by this factor, and the
-# mean cost of an observation falls by this share. Videos without a zoom had 1.017 and 2.7 % at
-# most; a zoom by 1.1 has 1.053 and 5.4 %. One by 1.05 is missed, but bends the path by 0.07 % only.
-_LEAST_RANGE = 1.03
-_LEAST_GAIN = 0.04
-# See `adjust_model`. It takes many steps from poses that one camera has bent to those of a zoom.
+# Number of images that share a trial camera; fewer determine its focal length less well.
+_GROUP = 5
+# A lens zooms if the ratio of the longest to the shortest focal length of trial cameras exceeds the
+# first value, and the mean cost of an observation falls by more than the second, as a share. Videos
+# without a zoom had up to 1.017 and 2.7 %; a zoom by 1.1 has 1.053 and 5.4 %. A zoom by 1.05 is
+# missed, but bends the path by only 0.07 %.
+_MIN_RANGE = 1.03
+_MIN_GAIN = 0.04
+# See `adjust_model`. Poses that a shared camera has bent need many iterations to converge.
 _TRIAL_TOLERANCE, _TOLERANCE = 1e-3, 1e-4
-_MOST_STEPS = 60
+_MAX_STEPS = 60
 
 
 def with_own_cameras(
     run: Run, model: PosedModel, loss_scales: Sequence[float], *, refine_intrinsics: bool
 ) -> PosedModel:
-    """Adjust a model with a camera for each image, if an option or a zoom asks for it.
+    """Adjust a model with a camera for each image, if the options or a zoom require it.
 
     Args:
-        run: context of the run.
+        run: inputs and options of the run.
         model: the adjusted model, with points.
         loss_scales: see `adjust_model`.
         refine_intrinsics: refine focal length and distortion.
@@ -62,7 +63,7 @@ def with_own_cameras(
     if own.cameras.keys() == model.cameras.keys() or not refine_intrinsics:
         return own
     for number in own.cameras.keys() - model.cameras.keys():
-        # The distortion that made one camera fit best would mislead.
+        # The distortion of the shared camera was fitted to the zoom.
         camera = own.cameras[number]
         params = np.array(camera.params)
         params[list(camera.extra_params_idxs())] = 0.0
@@ -71,8 +72,8 @@ def with_own_cameras(
 
 
 def _zooming_cameras(run: Run, model: PosedModel, loss_scale: float) -> set[int]:
-    """Ids of the cameras whose focal length changes from image to image."""
-    trial = _with_copies(model, model.cameras, _STRETCH)
+    """Ids of the cameras whose focal length varies between images."""
+    trial = _with_copies(model, model.cameras, _GROUP)
     if trial.cameras.keys() == model.cameras.keys():
         return set()
     trial = _adjusted(run, trial, [loss_scale], _TRIAL_TOLERANCE)
@@ -85,18 +86,19 @@ def _zooming_cameras(run: Run, model: PosedModel, loss_scale: float) -> set[int]
         own = focal[camera_of_image == number]
         seen = camera_of_observation == number
         gain = 1 - after[seen].sum() / before[seen].sum()
-        if own.max() > _LEAST_RANGE * own.min() and gain > _LEAST_GAIN:
+        if own.max() > _MIN_RANGE * own.min() and gain > _MIN_GAIN:
             zooming.add(number)
     return zooming
 
 
 def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> PosedModel:
-    """The model with copies of its cameras.
+    """Replace cameras of a model by several copies.
 
     Args:
         model: the model.
-        shared: ids of the cameras to replace; those of a single copy stay.
-        num_images: number of consecutive images that share a copy; up to twice as many at the end.
+        shared: ids of the cameras to replace; those that would get a single copy stay.
+        num_images: number of consecutive images that share a copy; the last copy may have up to
+            twice as many.
     """
     count = Counter(image.camera_id for image in model.images)
     place = dict.fromkeys(count, 0)
@@ -135,7 +137,7 @@ def _adjusted(
             seed=run.options.match.run.seed,
             num_threads=run.options.mapping.mapper_threads,
             log=run.stages / "zoom.log",
-            max_steps=_MOST_STEPS,
+            max_steps=_MAX_STEPS,
             tolerance=tolerance,
         )
         return posed_model(read_model(folder), with_points=True)

@@ -65,8 +65,7 @@ def splat_cloud(
     Args:
         points: points of tracks.
         images: the images.
-        max_points: largest number of points, where the finest spacing is dropped first; None: no
-            limit.
+        max_points: largest number of points; the finest spacing is dropped first. None: no limit.
 
     Returns:
         The kept points in their order, then the added points in black.

@@ -32,7 +32,7 @@ from colmap_av1.geometry.undistortion import (
 )
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.dynamic.short_tracks import static_points
 from colmap_av1.poses.posed_images import (
     PosedImages,
     PosesResult,
@@ -56,7 +56,7 @@ _MASKS = "masks"
 def _tracked_points(
     run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
 ) -> tuple[ModelPoints, float]:
-    """Points of all tracks, as a model of the written images has them, in black.
+    """Points of all tracks, in black, with observations in pixels of the written images.
 
     Returns:
         The points, and the share of the tracks that agree with the poses.
@@ -80,21 +80,21 @@ def _tracked_points(
         xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
         return to_model_points(points, view, xy), agreeing
     tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
-    # Triangulation measures errors in pixels of a pinhole camera, and takes rays of pixels that a
-    # fisheye lens sees behind itself for others.
+    # Triangulation measures errors in pixels of a pinhole camera, which are wrong for rays that a
+    # fisheye lens receives from behind.
     tracked = replace(tracked, error=reprojection_errors(tracked, views))
     fit = tracked.error <= run.options.triangulate.max_reprojection_error
     return take_points(tracked, np.flatnonzero(fit)), agreeing
 
 
-# What undistorts the picture of an image, by its index; None: it is written as it is.
+# Returns the undistortion of an image, given by its index; None if it is written unchanged.
 _Undistort = Callable[[int], Undistortion | None]
 
 
 def _undistortions(placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]) -> _Undistort:
-    """What undistorts the pictures, with the cameras of the written images by their ids."""
+    """The undistortion of each image; `cameras` are those of the written images, by id."""
 
-    # Images of a camera follow one another, and a map of each of many cameras takes much memory.
+    # Consecutive images share a camera, and the maps of many cameras would need much memory.
     @functools.lru_cache(maxsize=1)
     def of_camera(camera_id: int) -> Undistortion | None:
         return undistortion(placed.cameras[camera_id], cameras[camera_id])
@@ -113,7 +113,7 @@ def _written_images(
     undistort: _Undistort,
     look: Look,
 ) -> None:
-    """Write the images and look at those of videos on the way."""
+    """Write the images, and call `look` with those of videos."""
     options, progress = run.options, run.progress
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
@@ -258,11 +258,11 @@ def model_stage(
     """Triangulate all tracks, and write the undistorted images and the model.
 
     Args:
-        run: context of the run.
+        run: inputs and options of the run.
         tracks: the tracks of all sequences, without those on dynamic objects.
         image_set: all images.
-        moving: masks of static pixels, by image name.
-        posed: the stage with the poses.
+        moving: masks that exclude dynamic pixels, by image name.
+        posed: the stage that estimated the poses.
     """
     options, clock = run.options, run.clock
     masked = run.inputs.masks is not None or options.moving == "mask"
@@ -278,7 +278,7 @@ def model_stage(
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_moving = np.array([image.name in moving for image in images])
-            tracked = take_points(tracked, surely_still(tracked, shows_moving))
+            tracked = take_points(tracked, static_points(tracked, shows_moving))
         undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)

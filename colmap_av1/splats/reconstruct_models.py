@@ -94,7 +94,7 @@ def further_models(
     models = mapped.result.other_models
     names = [set(read_posed_model(run.stages / poses).by_name) for poses in models]
     for number, (poses, known) in enumerate(zip(models, names, strict=True)):
-        if len(known & left) < LEAST_IMAGES:  # the mapper began there once more
+        if len(known & left) < LEAST_IMAGES:  # the mapper has mapped these images twice
             continue
         own = _run_of_model(run, len(found) + 1)
         own_poses = _poses_of_model(run, own, first, poses)
@@ -113,7 +113,7 @@ def further_models(
                 in_place=first.in_place,
             )
             posed = split_at_seams(own, posed, some)
-        except ModelError:  # no track agrees with what the mapper made of these images
+        except ModelError:  # no track agrees with the mapper's poses of these images
             continue
         new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
@@ -137,7 +137,7 @@ def further_models(
 
 
 def _usual_scaled(posed: Posed) -> float:
-    """See `AdjustedResult`; 0 for poses that are not adjusted."""
+    """`usual_scaled` of `AdjustedResult`; 0 for poses that are not adjusted."""
     return posed.adjustment.result.usual_scaled if posed.adjustment is not None else 0.0
 
 
@@ -147,7 +147,7 @@ def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:
 
 
 def _run_of_model(run: Run, number: int) -> Run:
-    """The run context of a further model, with a separate output folder."""
+    """The run of a further model, with a separate output folder."""
     output = run.output / f"{_FOLDER}{number}"
     own = replace(run, output=output, stages=output / run.stages.name)
     try:
@@ -160,13 +160,14 @@ def _run_of_model(run: Run, number: int) -> Run:
 
 
 def _poses_of_model(run: Run, own: Run, first: Posed, poses: str) -> Kept[MappedResult]:
-    """Hand the poses of a further model of the mapper to that model's own stages.
+    """Copy the poses of a further model of the mapper to the stages of that model.
 
-    Few images determine a camera badly: the camera is that of the first model, if it has it.
+    A few images do not determine a camera well, so that cameras of the first model are used if it
+    has them.
 
     Args:
         run: the run that mapped.
-        own: that of the further model, see `_run_of_model`.
+        own: the run of the further model, see `_run_of_model`.
         first: the first model.
         poses: file of the further model, in the folder of the stages.
     """
@@ -190,7 +191,7 @@ def _poses_of_model(run: Run, own: Run, first: Posed, poses: str) -> Kept[Mapped
 
 
 def _remove_further_models(run: Run, first: int) -> None:
-    """Remove further models of an earlier run, from a number on."""
+    """Remove further models of an earlier run whose number is `first` or higher."""
     for folder in run.output.glob(f"{_FOLDER}*"):
         number = folder.name.removeprefix(_FOLDER)
         if number.isdecimal() and int(number) >= first and (folder / run.stages.name).is_dir():

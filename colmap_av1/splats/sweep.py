@@ -70,7 +70,7 @@ class Sweep:
 
     A point is kept if other pictures agree on a unique depth, both together and individually, if a
     neighbouring point has a similar depth, and if it does not hide points of tracks. Pictures are
-    added one by one, and released as soon as no longer needed.
+    added one by one, and released as soon as they are no longer needed.
 
     Args:
         points: points of tracks.

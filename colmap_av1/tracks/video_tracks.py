@@ -380,7 +380,7 @@ def decodable_frames(
     use: str = "tracks are refined",
     kept: KeptPictures | None = None,
 ) -> Iterator[tuple[int, _Image]]:
-    """Decode the pictures of the frames that have tracks, up to a damage, with a warning.
+    """Decode the pictures of the frames that have tracks, and stop with a warning at damage.
 
     Args:
         video: the video.

@@ -20,7 +20,7 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import MapperOptions
-from colmap_av1.poses.corners.in_images import place_anew
+from colmap_av1.poses.corners.in_images import resect_from_corners
 from colmap_av1.poses.pose_stages import adjustment_stage
 from colmap_av1.poses.posed_images import PosedImages, PosesResult
 from colmap_av1.tracks.tracks import Tracks
@@ -74,7 +74,7 @@ def test_an_image_that_is_off_comes_to_where_its_corners_are() -> None:
     turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
     images = list(placed.images)
     images[WRONG] = replace(images[WRONG], cam_from_world=turned)
-    found = place_anew(RUN, corners, replace(placed, images=images))
+    found = resect_from_corners(RUN, corners, replace(placed, images=images))
     for image, right in zip(found.images, placed.images, strict=True):
         # In pixels at the picture's centre and edges.
         off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
@@ -92,7 +92,7 @@ def test_without_corners_all_stays() -> None:
         sigma=corners.sigma[:0],
         confirmed=corners.confirmed[:0],
     )
-    assert place_anew(RUN, none, placed) is placed
+    assert resect_from_corners(RUN, none, placed) is placed
 
 
 def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:

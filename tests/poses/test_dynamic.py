@@ -40,8 +40,8 @@ from colmap_av1.options import (
 )
 from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks, place_tracks
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
-from colmap_av1.poses.dynamic.regions import moving_cells, shares_above_usual, strong_patches
-from colmap_av1.poses.dynamic.short_tracks import surely_still
+from colmap_av1.poses.dynamic.regions import dynamic_cells, shares_above_usual, strong_patches
+from colmap_av1.poses.dynamic.short_tracks import static_points
 from colmap_av1.poses.posed_images import PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
@@ -175,7 +175,7 @@ def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, 
     by_depth = found.by_depth(np.zeros(len(scene.moves), np.bool_))
     assert np.mean(by_depth[scene.moves]) > 0.2
     assert np.mean(by_depth[~scene.moves]) < 0.01
-    cells = moving_cells(scene.placed, scene.views)
+    cells = dynamic_cells(scene.placed, scene.views)
     placed = scene.placed
     within = placed.mean(cells[placed.image, placed.row, placed.column])
     assert np.mean(within[scene.moves] > 0.5) > 0.9
@@ -187,7 +187,7 @@ def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, 
 def test_nothing_moves_in_a_still_scene(drift: float) -> None:
     """A box before a wall hides and shows it; encoders let tracks of smooth surfaces drift."""
     scene = made(None, drift=drift)
-    assert not moving_cells(scene.placed, scene.views).any()
+    assert not dynamic_cells(scene.placed, scene.views).any()
 
 
 def test_what_is_known_to_move_is_not_the_usual() -> None:
@@ -224,10 +224,10 @@ def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None
         *(np.concatenate(images), np.zeros((sum(map(len, images)), 2))),
     )
     shows_moving = np.isin(np.arange(12), range(2, 8))
-    assert surely_still(points, shows_moving).tolist() == [0, 2, 3, 4]
-    assert surely_still(points, np.ones(12, np.bool_)).tolist() == [2]
-    assert surely_still(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
-    assert len(surely_still(no_points(), shows_moving)) == 0
+    assert static_points(points, shows_moving).tolist() == [0, 2, 3, 4]
+    assert static_points(points, np.ones(12, np.bool_)).tolist() == [2]
+    assert static_points(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
+    assert len(static_points(no_points(), shows_moving)) == 0
 
 
 # A poster of so many pixels that goes across the pictures of the rendered courtyard.

@@ -1,1 +1,1 @@
-"""Corners of the pictures, found again in every image that sees them."""
+"""Image corners, located in every image that sees them."""

@@ -1,4 +1,4 @@
-"""Grey pictures of images, kept while corners are looked for in them more than once."""
+"""Temporary storage for the grey pictures of images, which the search for corners reads twice."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 
 class GreyPictures:
-    """Grey pictures of images in a file without a name, which goes when it is closed.
+    """Stores grey pictures of images in an unnamed temporary file, which is deleted on exit.
 
-    They would be decoded again, or take the memory of all.
+    This avoids decoding the pictures twice or holding all of them in memory.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -32,11 +32,11 @@ class GreyPictures:
         self._file.close()
 
     def __contains__(self, image: int) -> bool:
-        """Whether there is a picture of an image, by its index."""
+        """Whether the picture of an image, given by its index, is stored."""
         return image in self._at
 
     def keep(self, image: int, grey: NDArray[np.uint8]) -> None:
-        """Keep the picture, uint8 [height, width], of an image that has none yet."""
+        """Store the picture, uint8 [height, width], of an image that has none yet."""
         height, width = grey.shape
         self._at[image] = self._file.seek(0, 2), (height, width)
         self._file.write(grey.tobytes())

@@ -1,4 +1,4 @@
-"""Corners in the images that have a pose, for the adjustment of these."""
+"""Corners in the registered images, for bundle adjustment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.resection import resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
-from colmap_av1.poses.corners.seen_again import found_again
+from colmap_av1.poses.corners.patch_matching import match_patches
 from colmap_av1.poses.pose_stages import FROM_PICTURES
 from colmap_av1.poses.posed_images import PosedImages, triangulate_in
 from colmap_av1.poses.run import Run
@@ -22,35 +22,35 @@ from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import progress_in
 
-# Error in pixels from which on a corner counts less (Cauchy's loss) when its image is placed anew:
-# more than a shutter's read-out bends a picture, so that no part of it decides alone.
+# Scale in pixels of the Cauchy loss when an image is resected. It exceeds the distortion by a
+# rolling shutter, so that no part of the picture dominates.
 _LOSS_SCALE = 2.0
-# Of pictures in which what masks leave out changes: what passes cuts what it hides to half the
-# length, and short tracks hold fewer images together.
-_CUT_SHORT = CornerDensity(most=1500, spacing=8)
-# Error beyond which a corner is lost, wherever it is.
-_LOST = 8.0
+# Corner density where the masks of a video change: dynamic objects halve the length of the tracks
+# they occlude, and short tracks connect fewer images.
+_DENSE = CornerDensity(most=1500, spacing=8)
+# Reprojection errors are clipped to this many pixels when two poses are compared.
+_MAX_ERROR = 8.0
 
 
 def corners_in_images(
     run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
 ) -> tuple[Tracks, PosedImages]:
-    """Look for corners of all videos' pictures, and place images anew that contradict them.
+    """Find corners in the images of all videos, and correct poses that contradict them.
 
     Args:
-        run: what every stage is given.
-        moving: by the names of images, masks that leave out what moves.
-        tracks: tracks of what stands still, which say where to look for corners.
-        placed: the images that have a pose.
+        run: inputs and options of the run.
+        moving: masks that exclude dynamic pixels, by image name.
+        tracks: tracks of static points, which guide the search.
+        placed: the registered images.
 
     Returns:
-        The corners as tracks, and the images.
+        The corners as tracks, and the images with the corrected poses.
     """
     masks = placed.masks_with(moving)
     with GreyPictures(run.stages) as pictures:
         followed = _followed(run, masks, tracks, placed, pictures)
-        placed = place_anew(run, followed, placed)
-        return _seen_again(run, masks, followed, placed, pictures), placed
+        placed = resect_from_corners(run, followed, placed)
+        return _match_in_all(run, masks, followed, placed, pictures), placed
 
 
 def _followed(
@@ -60,7 +60,7 @@ def _followed(
     placed: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
-    """Corners followed through each video's images, whose pictures are kept."""
+    """Follow corners through the images of each video, and store the pictures."""
     image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
@@ -76,7 +76,7 @@ def _followed(
             num_frames, run.options.match.reading, wanted=mask_of, use="corners are followed"
         )
         report = progress_in(run.progress, "refinement", len(own))
-        density = _CUT_SHORT if len(set(mask_of.values())) > 1 else CornerDensity()
+        density = _DENSE if len(set(mask_of.values())) > 1 else CornerDensity()
 
         def keep(frame: int, grey: NDArray[np.uint8], first: int = first) -> None:
             pictures.keep(image_of[first + frame], grey)
@@ -88,19 +88,19 @@ def _followed(
     return found
 
 
-def _seen_again(
+def _match_in_all(
     run: Run,
     masks: list[Mask | None],
     corners: Tracks,
     placed: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
-    """Corners where all images show them, see `found_again`."""
+    """Locate corners in all images that see them, see `match_patches`."""
     seen, view = seen_in(corners, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
     views = views_of(placed.images, placed.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
-    return found_again(
+    return match_patches(
         seen,
         view,
         points,
@@ -111,16 +111,16 @@ def _seen_again(
     )
 
 
-def place_anew(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
-    """Place images anew by the points of the corners, where these then fit better.
+def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
+    """Resect images from the points of corners, and keep the poses that fit these better.
 
-    Motion that is wrong together places an image where its own tracks fit, so that what the
-    picture shows is taken for errors, and left out of any adjustment that starts from there.
+    Where many motion vectors share an error, an image gets a wrong pose that agrees with them. An
+    adjustment that starts there treats the correct observations as outliers and cannot recover.
 
     Args:
-        run: what every stage is given.
+        run: inputs and options of the run.
         corners: corners as tracks.
-        placed: the images that have a pose.
+        placed: the registered images.
     """
     seen, view = seen_in(corners, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
@@ -153,10 +153,10 @@ def _error(
     focal: float,
     cam_from_world: NDArray[np.float64],
 ) -> float:
-    """Mean distance in pixels of points from where they are seen, of lost ones that of these."""
+    """Mean reprojection error in pixels, clipped; points behind the camera count as the limit."""
     in_camera = xyz @ cam_from_world[:, :3].T + cam_from_world[:, 3]
-    off = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] * focal - xy, axis=1)
-    return float(np.where(in_camera[:, 2] > 0, np.minimum(off, _LOST), _LOST).mean())
+    error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] * focal - xy, axis=1)
+    return float(np.where(in_camera[:, 2] > 0, np.minimum(error, _MAX_ERROR), _MAX_ERROR).mean())
 
 
 def _keeps(
@@ -165,6 +165,6 @@ def _keeps(
     xy: NDArray[np.float32],
     size: tuple[int, int],
 ) -> NDArray[np.bool_]:
-    """Which positions in the picture of a frame its mask keeps; None: all."""
+    """Which positions in the picture of a frame its mask keeps; all if it has no mask."""
     mask = mask_of[frame]
     return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)

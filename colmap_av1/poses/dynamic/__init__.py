@@ -1,1 +1,1 @@
-"""What moves in the scene on its own, and leaving it out."""
+"""Dynamic objects: finding them, and excluding them from the tracks."""

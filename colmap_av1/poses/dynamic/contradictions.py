@@ -1,8 +1,8 @@
-"""Tracks that contradict the camera over their whole length, or what is seen through their points.
+"""Tracks that contradict the poses over their whole length, or the visibility of other points.
 
-What moves by itself leaves the epipolar lines of its first positions, but slowly where it moves
-along with the camera or against it: then it looks like a point at a wrong distance. Such a point
-would hide what other images see behind it, or is seen through a surface that others see before it.
+A dynamic point leaves the epipolar lines of its first positions, but only slowly if it moves
+parallel to the camera's path: it then looks like a static point at a wrong depth. Such a point
+would occlude points that other images see, or be occluded by a surface that others see.
 """
 
 from __future__ import annotations
@@ -22,48 +22,53 @@ _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 _Bools = NDArray[np.bool_]
 
-# Expected errors that a track is off by, from which on it contradicts, and up to which it agrees.
-# Drift is of one to two, a person who walks across the picture of five and more.
+# Residual of a track, in expected errors, above which it contradicts the poses and below which it
+# agrees with them. Drift causes one to two, a person who walks across the picture five or more.
 _CONTRADICTS = 2.5
 _AGREES = 2.0
-# Those from which on a track of so many images surely contradicts.
+# Residual above which a track of at least this length in images certainly contradicts.
 _SURELY_CONTRADICTS = 4.0
 _SURE_LENGTH = 12
-# Images that see a track which tells what is behind others.
+# Smallest length in images of a track that is evidence for what lies behind other points.
 _LONG = 5
-# What a track is off by where it has no point, or lies behind the camera.
-_MOST = 20.0
-# A point before what others see by more than this factor would hide it; it does so in more than
-# this share of the images that see enough there, of so many at least.
+# Largest residual of an observation, and its value where the track has no point or the point lies
+# behind the camera.
+_MAX_RESIDUAL = 20.0
+# A point would occlude its surroundings in an image if these are farther by more than the first
+# factor. It contradicts them if it would do so in more than the second share of the images that
+# observe enough points there. The last two values are the fewest such images and points.
 _HIDES = 1.3
 _HIDDEN_SHARE = 0.5
-_FEWEST_IMAGES = 3
-_FEWEST_SEEN = 3
-# Distances in steps, to tell how many points lie before another: by this many steps at least.
+_MIN_IMAGES = 3
+_MIN_POINTS_BEHIND = 3
+# Depths are quantized in steps of this factor, and one point is in front of another if it is nearer
+# by at least this many steps.
 _STEP = 1.15
 _NUM_STEPS = 40
 _STEPS_BEFORE = 2
-# Points of a surface before a track, where none is seen, in more than this share of its images.
-_FEWEST_BEFORE = 4
+# A track is seen through a surface where at least this many points should lie in front of it and
+# none is observed there. It contradicts if this holds in more than this share of its images.
+_MIN_BEFORE = 4
 _THROUGH_SHARE = 0.5
-# Width in cells of what counts as around, odd.
+# Width in cells of a neighbourhood; odd.
 _AROUND = 3
 
 
 @dataclass(frozen=True)
 class PlacedTracks:
-    """Tracks with their points, in the cells of the images that see them.
+    """Tracks with their points, and the grid cells of their observations.
 
     Attributes:
         shape: number of images, and of rows and columns of cells.
         cell: width of a cell in pixels.
-        offsets: int64 [num_tracks + 1] the observations of each track.
+        offsets: int64 [num_tracks + 1] start of the observations of each track.
         track: int64 [num_observations] track of each observation.
         image: int64 [num_observations] its image.
-        row: int64 [num_observations] its cell's row.
-        column: int64 [num_observations] its cell's column.
+        row: int64 [num_observations] row of its cell.
+        column: int64 [num_observations] column of its cell.
         depth: float64 [num_observations] depth of the track's point in the image; nan without one.
-        off: float64 [num_tracks] root mean square of the errors over the expected ones.
+        residual: float64 [num_tracks] root mean square of the ratio of reprojection errors to
+            expected errors.
         xyz: float64 [num_tracks, 3] the points; nan without one.
     """
 
@@ -75,7 +80,7 @@ class PlacedTracks:
     row: _Ints
     column: _Ints
     depth: _Floats
-    off: _Floats
+    residual: _Floats
     xyz: _Floats
 
     @property
@@ -106,12 +111,12 @@ def place_tracks(
     *,
     cell: int,
 ) -> PlacedTracks:
-    """Tell how far tracks are off their points.
+    """Compute the residuals, depths and cells of tracks.
 
     Args:
         tracks: tracks in some images of one size.
         image: int64 [num_observations] the image of each observation.
-        points: their points; of those of a track the one that most observations agree with counts.
+        points: their points; for a track with several, the one with the most inliers is used.
         views: the images.
         cell: width of a cell in pixels.
     """
@@ -137,10 +142,10 @@ def place_tracks(
         error[own] = np.linalg.norm(seen - tracks.xy[own], axis=1)
         depth[own] = local[:, 2]
     expected = np.hypot(SIGMA_FLOOR, tracks.sigma)
-    off = np.minimum(np.nan_to_num(error / expected, nan=_MOST), _MOST)
+    ratio = np.minimum(np.nan_to_num(error / expected, nan=_MAX_RESIDUAL), _MAX_RESIDUAL)
     columns, rows = (-(-length // cell) for length in views[0].size)
     column, row = (tracks.xy // cell).astype(np.int64).T
-    squared = np.add.reduceat(off**2, offsets[:-1]) / np.diff(offsets)
+    squared = np.add.reduceat(ratio**2, offsets[:-1]) / np.diff(offsets)
     return PlacedTracks(
         shape=(len(views), rows, columns),
         cell=cell,
@@ -150,14 +155,14 @@ def place_tracks(
         row=np.clip(row, 0, rows - 1),
         column=np.clip(column, 0, columns - 1),
         depth=depth,
-        off=np.sqrt(squared),
+        residual=np.sqrt(squared),
         xyz=xyz,
     )
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """Where points lie in an image that does not see their tracks: cells and depths."""
+    """Cells and depths of the points that project into an image but have no observation there."""
 
     track: NDArray[np.int32]
     row: NDArray[np.int16]
@@ -166,7 +171,7 @@ class _Shown:
 
 
 class Contradictions:
-    """What contradicts the camera among some tracks.
+    """Finds the tracks that contradict the poses.
 
     Args:
         placed: the tracks.
@@ -185,33 +190,35 @@ class Contradictions:
 
     @property
     def by_motion(self) -> _Bools:
-        """Bool [num_tracks] tracks that agree with no point over their whole length."""
-        return np.asarray(self._placed.off > _CONTRADICTS)
+        """Bool [num_tracks] tracks that fit no single point over their whole length."""
+        return np.asarray(self._placed.residual > _CONTRADICTS)
 
     @property
     def surely_by_motion(self) -> _Bools:
-        """Those of them that do so in many images, and by far: what drifts seldom lasts."""
+        """Bool [num_tracks] long tracks with large residuals; drifting tracks are seldom long."""
         placed = self._placed
-        return np.asarray((placed.off > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH))
+        return np.asarray(
+            (placed.residual > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH)
+        )
 
     def by_depth(self, moving: _Bools) -> _Bools:
-        """Tracks whose points would hide what others see, or are seen through a surface.
+        """Tracks whose points would occlude other points, or are seen through a surface.
 
         Args:
-            moving: bool [num_tracks] tracks that are known to move, and prove nothing.
+            moving: bool [num_tracks] tracks that are known to be dynamic and are no evidence.
         """
         agreeing = self._agreeing & ~moving
         hiding = self._hiding(agreeing)
         return hiding | self._seen_through(agreeing & ~hiding)
 
     def unseen(self, left_out: _Bools) -> _Floats:
-        """Points that agree, in the cells of the images that they lie in but are not seen in.
+        """Count the agreeing points that project into each cell of images not observing them.
 
         Args:
-            left_out: bool [num_tracks] tracks that prove nothing.
+            left_out: bool [num_tracks] tracks that are no evidence.
 
         Returns:
-            float64 [images, rows, columns] their numbers.
+            float64 [images, rows, columns].
         """
         agreeing = self._agreeing & ~left_out & (self._placed.lengths >= _LONG)
         found = np.zeros(self._placed.shape)
@@ -223,7 +230,7 @@ class Contradictions:
     @property
     def _agreeing(self) -> _Bools:
         placed = self._placed
-        return np.asarray((placed.off < _AGREES) & np.isfinite(placed.xyz[:, 0]))
+        return np.asarray((placed.residual < _AGREES) & np.isfinite(placed.xyz[:, 0]))
 
     def _show(self, view: PosedCamera, there: _Ints, rows: _Ints) -> _Shown:
         placed = self._placed
@@ -232,7 +239,7 @@ class Contradictions:
         is_seen = np.zeros(len(placed.xyz), np.bool_)
         is_seen[placed.track[rows]] = True
         unseen = np.flatnonzero(~is_seen[track])
-        # Whole pixels first: NumPy divides these many times as fast. There are up to 65,536.
+        # NumPy divides integers many times faster. Positions are at most 65,536.
         cell = (xy[unseen].astype(np.int32) // np.int32(placed.cell)).astype(np.int16)
         own = track[unseen].astype(np.int32)
         return _Shown(own, cell[:, 1], cell[:, 0], depth[unseen].astype(np.float32))
@@ -252,12 +259,12 @@ class Contradictions:
             counts = np.bincount(at, minlength=rows * columns).astype(np.float64)
             count = uniform_filter(counts.reshape(rows, columns), _AROUND, mode="constant")
             count *= _AROUND**2
-            enough = count[shown.row, shown.column] > _FEWEST_SEEN - 0.5
+            enough = count[shown.row, shown.column] > _MIN_POINTS_BEHIND - 0.5
             track = shown.track[enough]
             looked[track] += 1
             before = shown.depth * _HIDES < nearest[shown.row, shown.column]
             hides[track] += before[enough]
-        return (hides > _HIDDEN_SHARE * looked) & (looked >= _FEWEST_IMAGES)
+        return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
 
     def _seen_through(self, agreeing: _Bools) -> _Bools:
         placed = self._placed
@@ -280,8 +287,8 @@ class Contradictions:
             seen = self._at_most(
                 placed.row[proof], placed.column[proof], steps(placed.depth[proof]), at
             )
-            is_through = (there >= _FEWEST_BEFORE) & (seen == 0) & (step >= 0)
-            # An image sees a track once.
+            is_through = (there >= _MIN_BEFORE) & (seen == 0) & (step >= 0)
+            # `+=` suffices: a track has one observation per image.
             through[placed.track[own]] += is_through
         return np.asarray(through > _THROUGH_SHARE * placed.lengths)
 
@@ -292,15 +299,15 @@ class Contradictions:
         step: _Ints,
         at: tuple[_Ints, _Ints, _Ints],
     ) -> _Ints:
-        """Numbers of points around cells that are as near as a step, or nearer.
+        """Count the points around cells whose depth step does not exceed a limit.
 
         Args:
-            row: integers [n] the cell's row of each point.
+            row: integers [n] row of the cell of each point.
             column: integers [n] its column.
-            step: int64 [n] the step of its depth.
-            at: int64 [m] rows and columns of the cells asked for, and the step for each.
+            step: int64 [n] its depth step.
+            at: int64 [m] rows and columns of the queried cells, and the limit for each.
         """
-        # With an edge of empty cells, so that each has all of those around it.
+        # A border of empty cells completes the neighbourhoods of the outer ones.
         edge = _AROUND // 2
         _, rows, columns = self._placed.shape
         stride, size = columns + 2 * edge, (rows + 2 * edge) * (columns + 2 * edge)
@@ -311,4 +318,4 @@ class Contradictions:
             steps[step_number] += steps[step_number - 1]
         first = at[2] * size + at[0] * stride + at[1]
         around = [down * stride + across for down in range(_AROUND) for across in range(_AROUND)]
-        return np.asarray(sum(count[first + beside] for beside in around), np.int64)
+        return np.asarray(sum(count[first + shift] for shift in around), np.int64)

@@ -1,8 +1,7 @@
-"""Tracks beside what moves, corrected on the pictures and taken up again where it has passed.
+"""Tracks near dynamic objects, refined on the pictures and continued after an occlusion.
 
-What passes in front cuts the tracks behind it short, and an encoder that follows it drags along
-what stands still beside it: however many such tracks there are, poses that come from them are
-worse.
+A passing object ends the tracks behind it, and an encoder that follows the object moves the static
+points next to it along with it. Such tracks make the poses worse, however many there are.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import no_progress, progress_in
 
-# Images after the last that sees a point in which it is looked for: from farther away it looks
-# different.
+# Number of images after the last observation of a point in which it is searched; later its
+# surroundings look too different.
 _REACH = 15
-# Width in pixels of the edge of a picture in which nothing is looked for.
+# Width in pixels of the border of a picture that is not searched.
 _MARGIN = 4
-# Expected error in pixels of where poses that are to be adjusted put a point.
+# Expected error in pixels of a projection before the poses are adjusted.
 _PREDICTED_SIGMA = 1.0
 _LK = RefineOptions(refine="lk")
 
 
 def has_moving_masks(image_set: ImageSet) -> bool:
-    """Whether what masks leave out of a video changes from image to image."""
+    """Whether the masks of a video differ between its images."""
     videos = (image_set.images_of(video) for video in range(len(image_set.videos)))
     return any(len({image_set.masks[image] for image in images}) > 1 for images in videos)
 
@@ -44,21 +43,21 @@ def has_moving_masks(image_set: ImageSet) -> bool:
 def follow_behind(
     run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
 ) -> Tracks:
-    """Correct tracks on the pictures, and find their points in more of these.
+    """Refine tracks on the pictures, and find their points in more images.
 
-    A point is looked for where the poses put it in images that do not see it yet, from the first
-    that does to shortly after the last, but not on what moves. It is seen where the picture looks
-    like one that shows it, and followed from there: what lies where it is looked for in vain would
-    agree with the poses whatever these are.
+    A point is searched at its projection in images without an observation of it, from its first
+    observation to shortly after its last, except on dynamic pixels. It is observed where the
+    picture matches one that shows it. Projections without a match are dropped: they would agree
+    with any poses.
 
     Args:
-        run: what every stage is given.
-        moving: by the names of images, masks that leave out what moves.
-        tracks: tracks of what stands still; few, as each is looked for in many pictures.
-        placed: the images that have a pose.
+        run: inputs and options of the run.
+        moving: masks that exclude dynamic pixels, by image name.
+        tracks: tracks of static points; few, since each is searched in many pictures.
+        placed: the registered images.
 
     Returns:
-        The tracks in these images, one for each point, without what disagrees with it.
+        A track for each point, in these images, without outliers.
     """
     masks = placed.masks_with(moving)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
@@ -92,7 +91,7 @@ def follow_behind(
 def _on_pictures(
     run: Run, video: int, tracks: Tracks, expected: NDArray[np.bool_], first_frame: int
 ) -> Tracks:
-    """Tracks of a video, of frames that are counted through, corrected on its pictures."""
+    """Refine tracks on the pictures of their video; their frames count through all videos."""
     frame = tracks.frame - np.int32(first_frame)
     wanted = frozenset(np.unique(frame).tolist())
     shown = run.shown[video]
@@ -114,18 +113,18 @@ def expect_in_views(
     views: Sequence[PosedCamera],
     frames: NDArray[np.int32],
 ) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Points as tracks, with where they should be in views between and after those that see them.
+    """Points as tracks, with their projections into views between and after their observations.
 
     Args:
         tracks: the tracks that the points come from.
-        view: int64 [num_observations] view of each of their observations.
-        points: their points.
-        views: images of one video, in the order of time, and which of their pixels count.
+        view: int64 [num_observations] view of each observation.
+        points: the points.
+        views: images of one video with their masks, in temporal order.
         frames: int32 [num_views] their frames.
 
     Returns:
-        A track for each point, and bool [num_observations] which of their observations are such
-        expectations.
+        A track for each point, and bool [num_observations] which of its observations are
+        projections.
     """
     num_points = len(points.xyz)
     point = np.repeat(np.arange(num_points), np.diff(points.offsets))

@@ -1,4 +1,4 @@
-"""Regions of images that move by themselves, from the tracks in them."""
+"""Dynamic regions of images, from the tracks in them."""
 
 from __future__ import annotations
 
@@ -14,43 +14,46 @@ from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
 _Floats = NDArray[np.float64]
 _Bools = NDArray[np.bool_]
 
-# What a track says of the cells around it that contradicts by its motion alone, and not surely:
-# much does where nothing guides an encoder, as in the sky.
-_BY_MOTION = 0.3
-# Width in cells of what is summed up, and tracks there at least.
+# Vote of a track that contradicts the poses by its motion alone, and not certainly. It is low
+# because many such tracks arise where nothing guides the encoder, as in the sky.
+_MOTION_VOTE = 0.3
+# Width in cells of the neighbourhood whose votes are averaged, and fewest tracks there.
 _AROUND = 5
-_FEWEST_TRACKS = 4
-# Share of the tracks, above that of what stands still, from which on a cell may move, and from
-# which on it surely does, if other images see as many points behind as there are tracks: nobody has
-# seen what is behind the sky. A region has so many sure cells in all its images, and they are so
-# large a share of it: two fifths and more of people, a fifth at most of what encoders find no
-# motion for.
+_MIN_TRACKS = 4
+# A cell may be dynamic if its mean vote exceeds that of static cells by the first value. It
+# certainly is above the second, if as many points lie behind it as there are tracks: this excludes
+# the sky, behind which nothing is seen. A dynamic region has at least this many certain cells in
+# all images, and this share of them: people have two fifths or more, areas where the encoder finds
+# no motion at most a fifth.
 _MAY, _SURELY = 0.27, 0.6
-_FEWEST_SURE = 400
+_MIN_SURE = 400
 _SURE_SHARE = 0.3
-# Share, as above, of the cells in a patch of an image, and share of those in the patch: what joins
-# a region in time only, at the edges of what people passed, has fewer.
+# A patch of a region in one image is kept if the mean votes of more than the second share of its
+# cells exceed that of static cells by more than the first value. This drops patches that belong to
+# a region only through other images, at the edges of where people have passed.
 _STRONG, _STRONG_SHARE = 0.35, 0.3
-# A track moves that is in such cells in most of its images, or in some and contradicts.
+# A track is dynamic if this share of its observations lies in dynamic cells, or the second share
+# and it contradicts the poses.
 _MOSTLY, _PARTLY = 0.55, 0.2
-# Width in cells in which most tracks, and so many, move.
+# A cell is dynamic if most tracks in a neighbourhood of this width in cells are, and at least this
+# many.
 _NEAR = 3
-_FEWEST_MOVING = 2
-# What is found without those that are known to move shows more of them.
+_MIN_DYNAMIC = 2
+# The second pass no longer takes tracks known to be dynamic for evidence, and so finds more.
 _PASSES = 2
-# Holes of this many cells are closed.
+# Width in cells of the holes that are closed.
 _CLOSED = 3
 
 
-def moving_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
-    """Find what moves by itself.
+def dynamic_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
+    """Find the dynamic cells of images.
 
     Args:
-        placed: tracks of a video in its images, about one a cell.
-        views: the images, in the order of time.
+        placed: tracks of a video in its images, about one per cell.
+        views: the images, in temporal order.
 
     Returns:
-        Bool [images, rows, columns] the cells that move, grown by one.
+        Bool [images, rows, columns] the dynamic cells, dilated by one.
     """
     found = Contradictions(placed, views)
     by_motion, surely = found.by_motion, found.surely_by_motion
@@ -59,8 +62,8 @@ def moving_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
     for _ in range(_PASSES):
         by_depth = found.by_depth(moving)
         behind = found.unseen(by_depth | moving)
-        says = np.where(by_depth | surely, 1.0, np.where(by_motion, _BY_MOTION, 0.0))
-        share = shares_above_usual(placed, says, ~cells)
+        votes = np.where(by_depth | surely, 1.0, np.where(by_motion, _MOTION_VOTE, 0.0))
+        share = shares_above_usual(placed, votes, ~cells)
         cells = _sure_regions(placed, share, behind)
         if not cells.any():
             return cells
@@ -75,49 +78,49 @@ def _sum_around(cells: _Floats, width: int) -> _Floats:
     return np.asarray(uniform_filter(cells, (1, width, width), mode="constant") * width**2)
 
 
-def shares_above_usual(placed: PlacedTracks, says: _Floats, still: _Bools) -> _Floats:
-    """How far the tracks around each cell say that it moves, above the median of what is still.
+def shares_above_usual(placed: PlacedTracks, votes: _Floats, still: _Bools) -> _Floats:
+    """Mean vote of the tracks around each cell, less the median over static cells.
 
     Args:
         placed: the tracks.
-        says: float64 [num_tracks] how far each of them says that something moves.
-        still: bool [images, rows, columns] what is not known to move. Where people cover a third of
-            the pictures, the median of all cells is theirs in part, and hides their edges.
+        votes: float64 [num_tracks] vote of each track for being dynamic, from 0 to 1.
+        still: bool [images, rows, columns] cells not known to be dynamic. Where people cover a
+            third of the pictures, the median of all cells would be too high and hide their edges.
 
     Returns:
-        float64 [images, rows, columns]; below 0 where there are too few tracks.
+        float64 [images, rows, columns]; -1 where there are too few tracks.
     """
-    tracks = _sum_around(placed.counts(np.ones(len(says))), _AROUND)
-    enough = tracks > _FEWEST_TRACKS - 0.5
+    tracks = _sum_around(placed.counts(np.ones(len(votes))), _AROUND)
+    enough = tracks > _MIN_TRACKS - 0.5
     if not enough.any():
         return np.full(placed.shape, -1.0)
-    share = _sum_around(placed.counts(says), _AROUND) / np.maximum(tracks, 1.0)
+    share = _sum_around(placed.counts(votes), _AROUND) / np.maximum(tracks, 1.0)
     usual = share[enough & still] if (enough & still).any() else share[enough]
     return np.where(enough, share - float(np.median(usual)), -1.0)
 
 
 def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Bools:
-    """Connected cells in space and time of which enough surely move.
+    """Regions connected in space and time with enough cells that are certainly dynamic.
 
     Args:
         placed: the tracks.
-        share: float64 [images, rows, columns] how far tracks say that something moves.
-        behind: float64 [images, rows, columns] points that only other images see there.
+        share: float64 [images, rows, columns] see `shares_above_usual`.
+        behind: float64 [images, rows, columns] number of points there that only other images see.
     """
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
-    tracks = _sum_around(placed.counts(np.ones(len(placed.off))), _AROUND)
+    tracks = _sum_around(placed.counts(np.ones(len(placed.residual))), _AROUND)
     region, count = label(share > _MAY, structure=np.ones((3, 3, 3)))
     sure = (share > _SURELY) & (_sum_around(behind, _AROUND) >= tracks)
     num_sure = np.bincount(region[sure], minlength=count + 1)
     num_cells = np.bincount(region.ravel(), minlength=count + 1)
-    kept = (num_sure >= _FEWEST_SURE) & (num_sure >= _SURE_SHARE * num_cells)
+    kept = (num_sure >= _MIN_SURE) & (num_sure >= _SURE_SHARE * num_cells)
     kept[0] = False
     return np.asarray(kept[region])
 
 
 def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
-    """The cells in those patches of images of which enough move strongly."""
+    """The cells of the patches in which enough cells have high votes."""
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
     found = np.zeros_like(cells)
@@ -133,19 +136,19 @@ def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
 def _cells_of_tracks(
     placed: PlacedTracks, cells: _Bools, contradicts: _Bools
 ) -> tuple[_Bools, _Bools]:
-    """The cells in which most tracks move, and these: what a track is part of it stays part of."""
+    """The cells in which most tracks are dynamic, and the dynamic tracks."""
     every = _sum_around(placed.counts(np.ones(len(contradicts))), _NEAR)
     moving = np.zeros(len(contradicts), np.bool_)
     for _ in range(2):
         within = placed.mean(cells[placed.image, placed.row, placed.column])
         moving = (within > _MOSTLY) | ((within > _PARTLY) & contradicts)
         around = _sum_around(placed.counts(moving), _NEAR)
-        cells = (around > _MOSTLY * every) & (around > _FEWEST_MOVING - 0.5)
+        cells = (around > _MOSTLY * every) & (around > _MIN_DYNAMIC - 0.5)
     return cells, moving
 
 
 def _closed(cells: _Bools) -> _Bools:
-    """The cells without holes in images and between them, and grown by one."""
+    """The cells with holes in space and time filled, dilated by one."""
     from scipy.ndimage import (  # noqa: PLC0415 - slow to import
         binary_closing,
         binary_dilation,
@@ -155,7 +158,7 @@ def _closed(cells: _Bools) -> _Bools:
     square = np.ones((_CLOSED, _CLOSED), np.bool_)
     grown = np.empty_like(cells)
     lasting = cells.copy()
-    # An image may lack the tracks that those before and after have.
+    # An image may lack tracks that its neighbours have.
     lasting[1:-1] |= cells[:-2] & cells[2:]
     for image, own in enumerate(lasting):
         padded = np.pad(own, _CLOSED)
@@ -165,7 +168,7 @@ def _closed(cells: _Bools) -> _Bools:
 
 
 def mask_of_cells(cells: _Bools, cell: int, size: tuple[int, int]) -> Mask:
-    """A mask of (width, height) that leaves out cells [rows, columns]."""
+    """A mask of (width, height) that excludes cells [rows, columns]."""
     width, height = size
     moving = np.repeat(np.repeat(cells, cell, axis=0), cell, axis=1)[:height, :width]
     return make_mask(~moving)

@@ -1,4 +1,4 @@
-"""Points of tracks that are too short to tell what moves from what stands still."""
+"""Points of tracks that are too short to show whether they are dynamic."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelPoints
 
-# Images that see a point, at least, where all of them show something that moves.
-_FEWEST_IMAGES = 5
+# Fewest observations of a point if all of its images have dynamic pixels.
+_MIN_IMAGES = 5
 
 
-def surely_still(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The points that stand still for all that is known.
+def static_points(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The points that are very likely static.
 
-    For a few images whatever moves on evenly has the place of a point that stands still, nearer or
-    farther than it is: only where it goes on long enough do its rays miss each other. A short track
-    counts where one of its images shows nothing that moves.
+    In a few images, a point in uniform motion looks like a static point at another depth: only in
+    a longer track do its rays fail to intersect. A short track is therefore accepted only if one of
+    its images has no dynamic pixels.
 
     Args:
-        points: points of tracks that masks of what moves have left.
-        shows_moving: bool [num_images] which images show something that moves.
+        points: points of tracks outside dynamic pixels.
+        shows_moving: bool [num_images] which images have dynamic pixels.
 
     Returns:
         int64 [n] their indices, ascending.
@@ -28,5 +28,5 @@ def surely_still(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArra
     if len(points.xyz) == 0:
         return np.empty(0, np.int64)
     count = np.diff(points.offsets)
-    beside = np.logical_and.reduceat(shows_moving[points.image], points.offsets[:-1])
-    return np.flatnonzero(~beside | (count >= _FEWEST_IMAGES))
+    is_doubtful = np.logical_and.reduceat(shows_moving[points.image], points.offsets[:-1])
+    return np.flatnonzero(~is_doubtful | (count >= _MIN_IMAGES))

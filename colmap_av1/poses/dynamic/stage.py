@@ -1,4 +1,4 @@
-"""The stage of `reconstruct` that finds what moves by itself."""
+"""The stage of `reconstruct` that finds dynamic pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
-from colmap_av1.poses.dynamic.regions import mask_of_cells, moving_cells
+from colmap_av1.poses.dynamic.regions import dynamic_cells, mask_of_cells
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.selection import select_tracks
@@ -25,19 +25,20 @@ from colmap_av1.util.progress import no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
 _FILE = "moving.npz"
-# Width in pixels of the cells, one track of each is looked at; of larger pictures more.
+# Width in pixels of a cell, of which one track is examined, in pictures of up to the usual width.
+# Larger pictures have proportionally larger cells.
 _CELL = 8
 _USUAL_WIDTH = 960
-# Images that see a track which is looked at, and of a video at least.
-_FEWEST_IMAGES = 4
+# Fewest images of a track that is examined, and of a video.
+_MIN_IMAGES = 4
 
 
 @dataclass(frozen=True)
 class DynamicResult:
-    """What `moving_stage` found beside the masks it keeps.
+    """What `moving_stage` found, apart from the masks it stores.
 
     Attributes:
-        moving: share of the images' pixels that move by themselves.
+        moving: share of dynamic pixels in all images.
     """
 
     moving: float
@@ -46,7 +47,7 @@ class DynamicResult:
 def moving_stage(
     run: Run, tracks: Tracks, image_set: ImageSet, posed: Kept[PosesResult]
 ) -> Kept[DynamicResult]:
-    """Find the regions of each image that move by themselves."""
+    """Find the dynamic regions of each image."""
 
     def make(partial: Path) -> DynamicResult:
         placed = read_posed_images(run, posed, image_set)
@@ -54,8 +55,8 @@ def moving_stage(
         with run.clock.measure("moving"):
             for video in range(len(image_set.videos)):
                 own = np.flatnonzero(placed.sequence == video)
-                if len(own) >= _FEWEST_IMAGES:
-                    found |= _moving_in_video(run, tracks, placed, own)
+                if len(own) >= _MIN_IMAGES:
+                    found |= _dynamic_masks(run, tracks, placed, own)
                 run.progress("moving", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
         left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
@@ -73,7 +74,7 @@ def moving_stage(
 
 
 def read_moving(stages: Path) -> dict[str, Mask]:
-    """Masks that leave out what moves, by the images' names; images without any have none."""
+    """Masks that exclude dynamic pixels, by image name; only of images that have such pixels."""
     with np.load(stages / _FILE) as file:
         packed = np.split(file["packed"], file["ends"][:-1]) if len(file["names"]) else []
         return {
@@ -113,10 +114,10 @@ def _write(path: Path, masks: Mapping[str, Mask]) -> None:
         )
 
 
-def _moving_in_video(
+def _dynamic_masks(
     run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
 ) -> dict[str, Mask]:
-    """Masks of what moves in the images of a video, by their names."""
+    """Masks that exclude dynamic pixels from the images of a video, by image name."""
     images = [placed.images[i] for i in own]
     views = views_of(images, placed.cameras, [None] * len(own))
     size = views[0].size
@@ -125,7 +126,7 @@ def _moving_in_video(
         preset="sparse",
         max_tracks_per_image=0,
         spacing=float(cell),
-        min_images=_FEWEST_IMAGES,
+        min_images=_MIN_IMAGES,
         max_sigma=0.0,
         wide_tracks=0,
     )
@@ -134,7 +135,7 @@ def _moving_in_video(
     )
     if len(image) == 0:
         return {}
-    # What drifts a little has a point all the same, and so has what moves slowly.
+    # The limits are loose, so that slightly drifting and slowly moving tracks get points too.
     how = TriangulateOptions(
         max_reprojection_error=float(cell), min_angle=0.0, max_depth_error=None, points="survey"
     )
@@ -148,7 +149,7 @@ def _moving_in_video(
         num_threads=run.options.match.run.num_threads,
         progress=no_progress,
     )
-    cells = moving_cells(place_tracks(seen, image, points, views, cell=cell), views)
+    cells = dynamic_cells(place_tracks(seen, image, points, views, cell=cell), views)
     return {
         own_image.name: mask_of_cells(moving, cell, size)
         for own_image, moving in zip(images, cells, strict=True)

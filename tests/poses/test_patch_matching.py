@@ -18,7 +18,7 @@ from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
-from colmap_av1.poses.corners.seen_again import found_again
+from colmap_av1.poses.corners.patch_matching import match_patches
 from colmap_av1.tracks.tracks import Tracks
 
 FOCAL, WIDTH, HEIGHT = 300.0, 320, 240
@@ -121,7 +121,7 @@ def _kept(scene: Scene, tmp_path: Path) -> Iterator[GreyPictures]:
 def look(scene: Scene, pictures: GreyPictures, views: list[PosedCamera] | None = None) -> Tracks:
     """What is found again in the scene."""
     seen: list[int] = []
-    found = found_again(
+    found = match_patches(
         *(scene.corners, scene.view, scene.points),
         views=scene.views if views is None else views,
         frames=np.arange(len(POSES), dtype=np.int32),

@@ -1,11 +1,11 @@
-"""Corners found again in every image that shows their place, by the picture around each.
+"""Patch matching of corners in every image that sees their points.
 
-A corner that is followed from picture to picture drifts, and is lost where something hides it or
-the camera looks away. Once it is a point in space, and poses are nearly right, its place in any
-image is known to a pixel or two, and so is how the picture around it changes by the view: what one
-image shows is looked for in all others, as patches are by Furukawa and Ponce ("Accurate, Dense, and
-Robust Multi-View Stereopsis", 2010). All positions are then against one picture, and places seen
-again share points with what was seen before.
+A corner that is followed from picture to picture drifts, and is lost where it is occluded or leaves
+the picture. Its triangulated point and nearly correct poses predict its position in any image to a
+pixel or two, and the deformation of the patch around it. The patch of one image is therefore
+searched in all others, as Furukawa and Ponce do ("Accurate, Dense, and Robust Multi-View
+Stereopsis", 2010). All positions then refer to one patch, so that nothing drifts, and images of a
+revisited place observe the same points.
 """
 
 from __future__ import annotations
@@ -29,42 +29,44 @@ _Floats = NDArray[np.float64]
 _Indices = NDArray[np.int64]
 _Grey = NDArray[np.uint8]
 
-# Width in pixels of what another image is to show around a point, the window that is compared and
-# some around it, and of what is kept of the image that shows it.
-_SHOWN = 17
-_KEPT = 37
-# Cosine of the angle between two views of a point, and factor by which what is around it grows,
-# beyond which it looks too different.
-_LEAST_COSINE = float(np.cos(np.radians(40.0)))
-_MOST_GROWTH = 2.0
-# Pixels by which a point may lie off its expected place, and by which the way there and back may
-# miss its start.
+# Width in pixels of the area around a point that the searched image must cover, which is the
+# compared window with a margin, and of the patch that is cut out of the source image.
+_WINDOW = 17
+_PATCH = 37
+# Largest viewing angle between the source image and the searched image, as a cosine, and largest
+# magnification of the patch. Beyond them it looks too different.
+_MIN_COSINE = float(np.cos(np.radians(40.0)))
+_MAX_MAGNIFICATION = 2.0
+# Largest distance in pixels of a match from its expected position, and largest forward-backward
+# error.
 _MAX_MOVE = 4.0
 _MAX_RETURN = 0.15
-# Normalised correlation of windows that show the same, at least.
-_LEAST_LIKENESS = 0.8
-# Pixels over which it is measured how a picture changes by the view.
-_REACH = 4.0
-# Points that are looked for in an image, evenly spread over all; bounds the time of long videos.
-_MOST_POINTS = 1000
-# Points of an image, below which it keeps those that were followed: what held it is not let go.
+# Smallest normalised correlation of a match.
+_MIN_CORRELATION = 0.8
+# Step in pixels over which the deformation of a patch is measured.
+_STEP = 4.0
+# Largest number of points searched in an image, evenly spread. It bounds the time of long videos.
+_MAX_POINTS = 1000
+# An image with fewer matches than this keeps its followed corners, so that it does not lose its
+# connection to the others.
 _FEW = 50
-# Images that see a corner at least.
-_LEAST_IMAGES = 3
+# Smallest number of observations of a corner.
+_MIN_IMAGES = 3
 
 
 @dataclass(frozen=True)
 class _Patches:
-    """Points, and the pictures around them.
+    """Points with the patches around them.
 
     Attributes:
         xyz: float64 [n, 3] the points.
-        image: int64 [n] the image that shows what is looked for.
-        ray: float64 [n, 3] unit vectors from there to them.
-        surface: float64 [n, 3, 3] three points of the surface around each: in that image they are
-            seen at its place, `_REACH` pixels right of it, and below it.
-        grey: uint8 [n, _KEPT, _KEPT] the picture around it there.
-        fraction: float64 [n, 2] by how much its place lies off the middle of the middle pixel.
+        image: int64 [n] source image of each patch.
+        ray: float64 [n, 3] unit vectors from the camera centre of the source image to the points.
+        surface: float64 [n, 3, 3] three points on the surface at each point: in the source image
+            they lie at its position, `_STEP` pixels to the right, and `_STEP` pixels below.
+        grey: uint8 [n, _PATCH, _PATCH] the patches.
+        fraction: float64 [n, 2] offset in pixels of the position from the centre of the middle
+            pixel of the patch.
     """
 
     xyz: _Floats
@@ -75,7 +77,7 @@ class _Patches:
     fraction: _Floats
 
 
-def found_again(
+def match_patches(
     corners: Tracks,
     view: _Indices,
     points: TriangulatedPoints,
@@ -85,21 +87,21 @@ def found_again(
     pictures: GreyPictures,
     progress: Callable[[int], None],
 ) -> Tracks:
-    """Corners where all images show them that have a picture.
+    """Locate corners in all images that have a picture.
 
     Args:
         corners: corners as tracks, in pixels of the images.
-        view: int64 [num_observations] image of each of their observations.
-        points: their points.
-        views: all images, with their poses and what of them counts.
+        view: int64 [num_observations] image of each observation.
+        points: points of the corners.
+        views: all images, with their poses and masks.
         frames: int32 [n] their frames.
-        pictures: the grey pictures of images, which may be smaller than these.
+        pictures: grey pictures of the images, which may be downscaled.
         progress: called with the number of images so far.
 
     Returns:
-        A track for each point that three images show: the observation in the middle of those it
-        comes from, and where others show the same. In images where few are found it keeps what
-        was followed.
+        A track for each point with three or more observations: its middle observation, from which
+        the patch is cut, and the matches in other images. Images with few matches keep the
+        followed corners.
     """
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
     image, xy = view[points.observation], corners.xy[points.observation].astype(np.float64)
@@ -125,11 +127,11 @@ def found_again(
 def _as_tracks(
     corners: Tracks, frames: NDArray[np.int32], point: _Indices, image: _Indices, xy: _Floats
 ) -> Tracks:
-    """Observations of points by images as tracks, of those that enough images see."""
+    """Tracks of the points that have enough observations."""
     lengths = np.bincount(point, minlength=1)
     order = np.lexsort((image, point))
-    order = order[lengths[point[order]] >= _LEAST_IMAGES]
-    lengths = lengths[lengths >= _LEAST_IMAGES]
+    order = order[lengths[point[order]] >= _MIN_IMAGES]
+    lengths = lengths[lengths >= _MIN_IMAGES]
     return replace(
         corners,
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
@@ -149,21 +151,21 @@ def _cut(
     views: Sequence[PosedCamera],
     pictures: GreyPictures,
 ) -> _Patches:
-    """Cut out the pictures around points.
+    """Cut out the patches around points.
 
     Args:
         points: the points.
-        middle: int64 [n] the observation of each at which it is cut out.
-        image: int64 [num_observations] image of each of their observations.
-        xy: float64 [num_observations, 2] pixels of these.
+        middle: int64 [n] the observation of each point at which its patch is cut out.
+        image: int64 [num_observations] image of each observation.
+        xy: float64 [num_observations, 2] its position in pixels.
         views: all images.
         pictures: their pictures.
     """
     xyz, point = points.xyz, np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
-    grey = np.empty((len(xyz), _KEPT, _KEPT), np.uint8)
+    grey = np.empty((len(xyz), _PATCH, _PATCH), np.uint8)
     fraction, ray = np.empty((len(xyz), 2)), np.empty((len(xyz), 3))
     surface = np.empty((len(xyz), 3, 3))
-    half, offset = _KEPT // 2, np.arange(_KEPT)
+    half, offset = _PATCH // 2, np.arange(_PATCH)
     for number in np.unique(image[middle]).tolist():
         own, view = np.flatnonzero(image[middle] == number), views[number]
         scale = _scale(view, pictures.size(number))
@@ -180,7 +182,7 @@ def _cut(
         depth = xyz @ rotation[2] + shift[2]
         shown = np.flatnonzero(image == number)
         slope = surface_slopes(at, depth[own], xy[shown] / scale, depth[point[shown]])
-        for k, reach in enumerate(np.array([[0, 0], [_REACH, 0], [0, _REACH]])):
+        for k, reach in enumerate(np.array([[0, 0], [_STEP, 0], [0, _STEP]])):
             far = (depth[own] / (1 + slope @ reach))[:, None]
             surface[own, k] = (view.rays(xy[middle[own]] + reach * scale) * far - shift) @ rotation
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -188,7 +190,7 @@ def _cut(
 
 
 def _scale(view: PosedCamera, size: tuple[int, int]) -> _Floats:
-    """Pixels of an image, along x and y, to one of its picture of a (width, height)."""
+    """Size of an image over the (width, height) of its picture, along x and y."""
     return np.array(view.size) / size
 
 
@@ -201,18 +203,19 @@ def _found_in(
     followed: _Indices,
     at: _Floats,
 ) -> tuple[_Indices, _Floats]:
-    """The points that an image shows as another does.
+    """Search the patches of all points in an image.
 
     Args:
         number: the image.
         patches: the points.
-        view: its camera and pose, and what of it counts.
+        view: its camera, pose and mask.
         pictures: the grey pictures.
-        followed: int64 [k] points that were followed into it.
-        at: float64 [k, 2] their pixels; others are looked for where their poses place them.
+        followed: int64 [k] points whose corners were followed into the image.
+        at: float64 [k, 2] their positions in pixels, where their search starts; the search for the
+            others starts at their projections.
 
     Returns:
-        int64 [m] the points, and float64 [m, 2] their pixels.
+        int64 [m] the points found, and float64 [m, 2] their positions in pixels.
     """
     size = pictures.size(number)
     scale = _scale(view, size)
@@ -233,8 +236,8 @@ def _found_in(
         start=expected.astype(np.float32),
         max_move=_MAX_MOVE,
     )
-    sure = (missed <= _MAX_RETURN) & (likeness >= _LEAST_LIKENESS)
-    margin = _SHOWN // 2
+    sure = (missed <= _MAX_RETURN) & (likeness >= _MIN_CORRELATION)
+    margin = _WINDOW // 2
     sure &= ((found >= margin) & (found < np.array(size) - margin)).all(axis=1)
     xy = found * scale
     sure[sure] = view.keeps(xy[sure])
@@ -244,7 +247,7 @@ def _found_in(
 def _in_view(
     number: int, patches: _Patches, view: PosedCamera, size: tuple[int, int]
 ) -> tuple[_Indices, _Floats, _Floats]:
-    """The points that an image should show much as another does.
+    """The points whose patches should look much the same in an image.
 
     Args:
         number: the image.
@@ -253,8 +256,9 @@ def _in_view(
         size: (width, height) of its picture.
 
     Returns:
-        int64 [m] the points; float64 [m, 2] their places in the picture; float64 [m, 2, 2] how the
-        one around them changes: pixels (x, y) of theirs to one of this along x, and along y.
+        int64 [m] the points; float64 [m, 2] their positions in the picture; float64 [m, 2, 2] the
+        affine deformation of each patch: the columns are its pixels (x, y) per pixel of the
+        picture along x and along y.
     """
     index, _, _ = view.project(patches.xyz)
     index = index[patches.image[index] != number]
@@ -265,21 +269,21 @@ def _in_view(
         return index, np.empty((0, 2)), np.empty((0, 2, 2))
     xy = np.asarray(view.camera.img_from_cam(surface.reshape(-1, 3))).reshape(-1, 3, 2)
     xy /= _scale(view, size)
-    growth = np.stack([xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]], axis=-1) / _REACH
+    growth = np.stack([xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]], axis=-1) / _STEP
     area = np.linalg.det(growth)
-    kept = (area > 0) & (area <= _MOST_GROWTH**2) & _near_views(patches, index, view)
-    margin = _SHOWN // 2
+    kept = (area > 0) & (area <= _MAX_MAGNIFICATION**2) & _near_views(patches, index, view)
+    margin = _WINDOW // 2
     kept &= ((xy[:, 0] >= margin) & (xy[:, 0] <= np.array(size) - margin)).all(axis=1)
     index, at, change = index[kept], xy[kept, 0], np.linalg.inv(growth[kept])
-    # What is kept of the picture around covers what is to be shown of it.
-    farthest = np.abs(change).sum(axis=2).max(axis=1, initial=0.0) * (_SHOWN // 2)
-    kept = np.flatnonzero(farthest <= _KEPT // 2 - 1)
-    kept = kept[evenly_spread(len(kept), _MOST_POINTS)] if len(kept) else kept
+    # The patch must cover the window.
+    farthest = np.abs(change).sum(axis=2).max(axis=1, initial=0.0) * (_WINDOW // 2)
+    kept = np.flatnonzero(farthest <= _PATCH // 2 - 1)
+    kept = kept[evenly_spread(len(kept), _MAX_POINTS)] if len(kept) else kept
     return index[kept], at[kept], change[kept]
 
 
 def _near_views(patches: _Patches, index: _Indices, view: PosedCamera) -> NDArray[np.bool_]:
-    """Whether points are seen from much the same side as where their pictures were cut out."""
+    """Whether the viewing angle between an image and the source of each patch is small enough."""
     ray = patches.xyz[index] - view.centre
     cosine = (patches.ray[index] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
-    return np.asarray(cosine >= _LEAST_COSINE)
+    return np.asarray(cosine >= _MIN_COSINE)
