@@ -88,17 +88,17 @@ def further_models(
     """
     placed = read_posed_images(run, first.last, image_set).images
     left = set(image_set.images.names) - {image.name for image in placed}
-    mapped = first.mapped
     keyed = image_set.some(first.matches.result.key_images)
     found: list[FurtherModel] = []
-    models = mapped.result.other_models
-    names = [set(read_posed_model(run.stages / poses).by_name) for poses in models]
-    for number, (poses, known) in enumerate(zip(models, names, strict=True)):
-        if len(known & left) < LEAST_IMAGES:  # the mapper has mapped these images twice
+    waiting = _other_models(run, first)
+    while waiting:
+        mapped = waiting.pop(0)
+        known = set(mapped.model.by_name)
+        if len(known & left) < LEAST_IMAGES:  # The mapper registered these images twice.
             continue
         own = _run_of_model(run, len(found) + 1)
-        own_poses = _poses_of_model(run, own, first, poses)
-        free = left.difference(*names[number + 1 :])
+        own_poses = _poses_of_model(run, own, first, mapped)
+        free = left.difference(*(other.model.by_name for other in waiting))
         some, key = _named(image_set, known | free), _named(keyed, known)
         tracks = [read_tracks_only(run, video) for video in range(len(run.sources))]
         believed = believed_tracks(run, tracks, image_set)
@@ -115,6 +115,7 @@ def further_models(
             posed = split_at_seams(own, posed, some)
         except ModelError:  # no track agrees with the mapper's poses of these images
             continue
+        waiting += _other_models(own, posed)
         new = _named(image_set, left)
         images = [image.name for image in read_posed_images(own, posed.last, new).images]
         if len(images) < FEWEST_IMAGES:
@@ -134,6 +135,28 @@ def further_models(
         )
     _remove_further_models(run, len(found) + 1)
     return tuple(found), [name for name in image_set.images.names if name in left]
+
+
+@dataclass(frozen=True)
+class _MappedModel:
+    """A further model of a mapping or a split.
+
+    Attributes:
+        digest: digest of the stage that made it.
+        file: its file among the products of that stage.
+        model: its poses.
+    """
+
+    digest: str
+    file: str
+    model: PosedModel
+
+
+def _other_models(run: Run, posed: Posed) -> list[_MappedModel]:
+    return [
+        _MappedModel(posed.mapped.digest, file, read_posed_model(run.stages / file))
+        for file in posed.mapped.result.other_models
+    ]
 
 
 def _usual_scaled(posed: Posed) -> float:
@@ -159,22 +182,22 @@ def _run_of_model(run: Run, number: int) -> Run:
     return own
 
 
-def _poses_of_model(run: Run, own: Run, first: Posed, poses: str) -> Kept[MappedResult]:
-    """Copy the poses of a further model of the mapper to the stages of that model.
+def _poses_of_model(run: Run, own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
+    """Write the poses of a further model to its stages.
 
     A few images do not determine a camera well, so that cameras of the first model are used if it
     has them.
 
     Args:
-        run: the run that mapped.
+        run: the run of the first model.
         own: the run of the further model, see `_run_of_model`.
         first: the first model.
-        poses: file of the further model, in the folder of the stages.
+        mapped: the further model.
     """
 
     def make(partial: Path) -> MappedResult:
         known = read_posed_model(run.stages / first.last.result.poses).cameras
-        model = read_posed_model(run.stages / poses)
+        model = mapped.model
         cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
         write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
         return MappedResult("mapped.npz", len(model.images), {}, first.mapped.result.mapper, ())
@@ -182,7 +205,7 @@ def _poses_of_model(run: Run, own: Run, first: Posed, poses: str) -> Kept[Mapped
     return run_stage(
         own.stages,
         "poses",
-        [first.mapped.digest, first.last.digest, poses],
+        [mapped.digest, first.last.digest, mapped.file],
         MappedResult,
         into=own.stages,
         products=["mapped.npz"],
