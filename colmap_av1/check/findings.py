@@ -73,8 +73,8 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
     if unknown:
         yield Finding(
             "note",
-            f"{unknown} of {len(cameras)} cameras have no focal length prior: the mappers refine "
-            "the stored focal length",
+            f"{unknown} of {len(cameras)} cameras have no focal length prior: the stored value is "
+            "only where the mappers start",
         )
     sizes = {(c.width, c.height) for i, c in cameras.items() if i in set(images.camera_ids)}
     if len(sizes) > 1:

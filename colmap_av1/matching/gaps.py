@@ -317,10 +317,10 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
     others = f" and at {more} more {'place' if more == 1 else 'places'}" if more > 0 else ""
     least = min(gap.share for gap in gaps)
     return (
-        f"few matches, down to {least:.0%} of the usual number, connect {shown}{others}, "
-        "where the camera jerks or frames are missing: COLMAP's mappers may bend the model there "
-        "by one per cent of its extent without any other sign; run reconstruct instead, which "
-        "uses the pictures, or film more slowly"
+        f"few matches, down to {least:.0%} of the usual number, between {shown}{others}, where the "
+        "camera jerks or frames are missing: COLMAP's mappers may bend the model there by one per "
+        "cent of its extent without any other sign; run reconstruct instead, which uses the "
+        "pictures, or film more slowly"
     )
 
 

@@ -338,7 +338,7 @@ def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, 
             pose = np.asarray(found.cam2_from_cam1.matrix())
             yield found.inlier_matches[:, 0], pose, float(np.degrees(found.tri_angle))
     if not all(camera.has_prior_focal_length for camera in inliers.cameras):
-        # The mapper may also use a homography that explains most of the matches.
+        # With assumed focal lengths, the mapper may use a homography that explains most matches.
         flat = pycolmap.estimate_homography_matrix(*inliers.xy, options.ransac)
         if flat is not None:
             rows = np.flatnonzero(flat["inlier_mask"]).astype(np.uint32)

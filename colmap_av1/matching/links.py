@@ -56,8 +56,8 @@ from colmap_av1.util.texts import some_names
 _AROUND_GAP = (0, 1, 2, 4, 7)
 # While the camera moves fast, too few tracks last to determine the scale. All pictures are then
 # matched with their neighbours, as in COLMAP's sequential matcher, and every n-th image is searched
-# for loop closures. If features link two neighbours with this many inliers, their motion is
-# dropped.
+# for loop closures. If features link two neighbours with this many inliers, the motion across them
+# is dropped.
 _FAST_INLIERS = 50
 _LOOP_STEP = 2
 # Distances of the images that a first look compares with the motion: most suspect gaps are
@@ -94,7 +94,8 @@ _MIN_LOOP_INLIERS = 25
 # A loop closure is confirmed by another one between neighbours up to this distance.
 _SUPPORT_REACH = 2
 # Two videos are the same if this number and this share of the examined pictures have their features
-# at the same positions, to within this many pixels. With two cameras, one or two pictures may.
+# at the same positions, to within this many pixels. Videos of two cameras have one or two such
+# pictures at most.
 _FEWEST_SAME = 3
 _SAME_SHARE = 0.3
 _SAME_PLACE = 1.0

@@ -214,7 +214,7 @@ def _verify_pair(
     """
     if len(matches) < max(search.options.min_num_inliers, MIN_MATCHES):
         return _degenerate()
-    # The matched keypoints keep the order of the whole image, which spreads over their part of it.
+    # The order is spread over the whole image, so its subset is spread over the matched part.
     places = a.place.take(matches[:, 0])
     num_refined = min(len(matches), max(MAX_REFINED, search.options.max_samples))
     nearest = np.argpartition(places, num_refined - 1)[:num_refined]
