@@ -1,4 +1,4 @@
-"""The contents of a COLMAP database, image by image and pair by pair, for `check`."""
+"""Read the images and pairs of a COLMAP database for `check`."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from colmap_av1.matching.mapper_limits import (
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, UNUSED_CONFIGS, TwoViewConfig
 
-# The model that gives a pose, by configuration; those of several models, or none, give none.
+# The model that determines the pose, by configuration. Other configurations have no single model.
 _MODEL_OF_CONFIG = {
     TwoViewConfig.CALIBRATED: "E",
     TwoViewConfig.CALIBRATED_RIG: "E",
     TwoViewConfig.UNCALIBRATED: "F",
     **dict.fromkeys(FLAT_CONFIGS, "H"),
 }
-# Pairs whose geometry is computed for the parallax, and the quantile of their angles that is
-# taken for the largest: a wrong model may give any angle.
+# Number of pairs whose triangulation angle is computed, and the quantile of these angles that is
+# reported. The maximum is not used, because a wrong model may give any angle.
 _NUM_DEEPEST = 24
-_LARGEST = 0.9
+_ANGLE_QUANTILE = 0.9
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Parallax:
     Attributes:
         names: names of the images of the widest pair.
         displacement: median distance between its matching keypoints, in pixels.
-        angle: median triangulation angle, in degrees, that the best pairs reach: those whose
-            keypoints move most unlike each other; None where none of them has a model.
-        focal_known: the angle rests on focal lengths that are known beforehand.
-        forward_share: share of these pairs whose motion is along the camera's axis.
+        angle: a high quantile, in degrees, of the triangulation angles of the pairs whose keypoint
+            displacements differ most; None if none of these pairs has a model.
+        focal_known: whether the angle was computed with focal length priors only.
+        forward_share: share of these pairs that move along the optical axis.
     """
 
     names: tuple[str, str]
@@ -56,15 +56,15 @@ class Parallax:
 
 @dataclass(frozen=True)
 class Images:
-    """Images by id, ascending, with what is stored for each.
+    """The images of a database, in the order of their ids.
 
     Attributes:
-        ids: int64 [n].
-        names: their names.
-        camera_ids: their cameras.
-        keypoints: float32 [k, 2] positions of each one's keypoints.
-        columns: columns of each one's keypoints; 0 where there is no row.
-        num_descriptors: descriptors of each one; -1 where there is no row.
+        ids: int64 [n] image ids.
+        names: name of each image.
+        camera_ids: camera id of each image.
+        keypoints: float32 [k, 2] keypoint positions of each image, in pixels.
+        columns: number of keypoint columns of each image; 0 if it has no row of keypoints.
+        num_descriptors: number of descriptors of each image; -1 if it has no row of descriptors.
     """
 
     ids: NDArray[np.int64]
@@ -77,22 +77,22 @@ class Images:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of listed images that have a row, in any of the two tables.
+    """Pairs of listed images that have a row of matches or of a two-view geometry.
 
     Attributes:
         ids: int64 [m] pair ids.
-        index: int64 [m, 2] place of their images in `Images`.
-        num_matches: int64 [m]; -1 where there is no row.
-        num_inliers: int64 [m]; -1 where there is no row.
+        index: int64 [m, 2] indices of the two images in `Images`.
+        num_matches: int64 [m]; -1 if there is no row.
+        num_inliers: int64 [m]; -1 if there is no row.
         config: int64 [m] configuration of the geometry.
-        displacement: float64 [m] median distance of the inliers' keypoints, in pixels.
-        spread: float64 [m] how far these displacements differ, in pixels: parallax does that,
-            and a turn of the camera much less.
-        matched: for each image, bool [k] the keypoints that are inliers of a used pair.
-        num_astray: pairs with matches of keypoints that are not there, verified or not.
-        num_with_itself: pairs of an image with itself.
-        num_swapped: pairs whose first image has the larger id.
-        num_foreign: pairs of images that are not listed, but with inliers enough to be used.
+        displacement: float64 [m] median distance between matching keypoints, in pixels.
+        spread: float64 [m] spread of these displacements, in pixels. Parallax makes it large, a
+            rotation of the camera much less.
+        matched: for each image, bool [k] keypoints that are inliers of a used pair.
+        num_astray: number of pairs with matches, verified or not, of missing keypoints.
+        num_with_itself: number of pairs of an image with itself.
+        num_swapped: number of pairs whose first image has the larger id.
+        num_foreign: number of pairs of unlisted images that have enough inliers to be used.
     """
 
     ids: NDArray[np.int64]
@@ -110,12 +110,12 @@ class Pairs:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Pairs that the mappers of all versions use."""
+        """Pairs that the mappers of all COLMAP versions use, bool [m]."""
         return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, UNUSED_CONFIGS)
 
 
 def layout_of(connection: sqlite3.Connection) -> tuple[str, str]:
-    """Versions of COLMAP that lay out a file so, and those that open it."""
+    """COLMAP versions that write this layout, and versions that open it."""
     oldest = "prior_qw" in columns(connection, "images")
     newest = "pose_prior_id" in columns(connection, "pose_priors")
     if newest:
@@ -155,7 +155,7 @@ def images_with_rows(connection: sqlite3.Connection, path: Path) -> Images:
 
 
 def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) -> Pairs:
-    """Read pair by pair: the matches of a large database do not fit into memory."""
+    """Read the pairs one by one, because all matches of a large database do not fit in memory."""
     place = {int(image_id): i for i, image_id in enumerate(images.ids)}
     num_matches = dict(connection.execute("SELECT pair_id, rows FROM matches").fetchall())
     matched = [np.zeros(len(k), dtype=np.bool_) for k in images.keypoints]
@@ -216,11 +216,11 @@ def parallax_of(
     pairs: Pairs,
     cameras: dict[int, pycolmap.Camera],
 ) -> Parallax | None:
-    """Displacement of the widest pair, and the angles that the best pairs reach."""
+    """Measure the displacement of the widest pair and the triangulation angle of the best pairs."""
     used = np.flatnonzero(pairs.used)
     if used.size == 0:
         return None
-    # The mapper starts with pairs of many inliers; without one, any used pair will do.
+    # The mapper starts with pairs of many inliers. If there are none, all used pairs count.
     strong = used[pairs.num_inliers[used] >= INITIAL_MIN_INLIERS]
     candidates = strong if strong.size else used
     deepest = candidates[np.argsort(-pairs.spread[candidates], kind="stable")]
@@ -247,7 +247,7 @@ def parallax_of(
     return Parallax(
         names=(images.names[i], images.names[j]),
         displacement=float(pairs.displacement[widest]),
-        angle=float(np.quantile(angles, _LARGEST)) if angles else None,
+        angle=float(np.quantile(angles, _ANGLE_QUANTILE)) if angles else None,
         focal_known=known and bool(angles),
         forward_share=float(np.mean(forward)) if forward else 0.0,
     )
@@ -291,7 +291,7 @@ def depth_of(
 def _read_geometry(
     connection: sqlite3.Connection, path: Path, pair_id: int
 ) -> pycolmap.TwoViewGeometry | None:
-    """A stored geometry; None where the model that its kind needs is missing."""
+    """Read a two-view geometry; None if the model that its configuration needs is missing."""
     stored = columns(connection, "two_view_geometries")
     names = [name for name in ("E", "F", "H") if name in stored]
     num_rows, data, config, *blobs = connection.execute(
@@ -308,7 +308,7 @@ def _read_geometry(
         return None
     geometry = pycolmap.TwoViewGeometry()
     if config == TwoViewConfig.CALIBRATED_RIG:
-        # Its essential matrix is one like any other, but COLMAP takes no pose from it.
+        # COLMAP takes no pose from this configuration, although its E is an ordinary one.
         config = TwoViewConfig.CALIBRATED
     geometry.config = pycolmap.TwoViewGeometryConfiguration(config)
     geometry.inlier_matches = matches_from_row(path, pair_id, num_rows, data)

@@ -1,4 +1,4 @@
-"""Whether the poses on either side of each gap between images fit what was matched across it."""
+"""Check whether the verified matches across each gap between images fit the poses of a model."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from colmap_av1.poses.seams import images_in_time
 
 _Floats = NDArray[np.float64]
 
-# A verified match fits the poses to so many pixels, as COLMAP verifies it.
+# A match fits the poses within this Sampson error in pixels, COLMAP's limit for inliers.
 _MAX_ERROR = 4.0
-# Share of the matches across a gap that have to fit: models that are straight have 87 % and more
-# everywhere, one that a mapper had joined wrongly 55 %.
+# Fewest matches across a gap that have to fit, as a share. Correct models have 87 % and more at
+# every gap; a wrongly joined model had 55 %.
 _LEAST_FITTING = 0.75
-# Matches that say anything.
+# Gaps with fewer matches than this are not judged.
 _FEWEST = 30
 
 
@@ -39,8 +39,8 @@ class Crossings:
 
     Attributes:
         pairs: names of the images before and after each gap, in the order of their names.
-        num_matches: int64 [n] matches of an image before it, or that one, with one after it.
-        num_fitting: int64 [n] those of them that fit the relative poses of their images.
+        num_matches: int64 [n] matches between images before and images after each gap.
+        num_fitting: int64 [n] matches that also fit the relative poses of their images.
     """
 
     pairs: tuple[tuple[str, str], ...]
@@ -49,7 +49,7 @@ class Crossings:
 
     @property
     def share(self) -> _Floats:
-        """Share of the matches that fit; 1 where there are too few to say anything."""
+        """Share of the matches that fit; 1 if there are too few to judge."""
         share = self.num_fitting / np.maximum(self.num_matches, 1)
         return np.where(self.num_matches >= _FEWEST, share, 1.0)
 
@@ -60,11 +60,11 @@ class Crossings:
 
     @property
     def warning(self) -> str | None:
-        """What the user should know of a model whose parts are joined wrongly."""
+        """A warning if parts of the model are joined wrongly; None if not."""
         if not self.wrong:
             return None
-        # All that does not fit crosses the gap that is at fault, and those beside it where no image
-        # between has matches.
+        # All matches that do not fit cross the wrong gap. Neighbouring gaps have the same number if
+        # no image between them has matches.
         unfit = self.num_matches - self.num_fitting
         most = max(int(unfit[i]) for i in self.wrong)
         where = [i for i in self.wrong if unfit[i] == most]
@@ -73,18 +73,18 @@ class Crossings:
         others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
         return (
             f"only {self.share[where[0]]:.0%} of the matches across '{first}' and '{second}' fit "
-            f"the poses, usually {np.median(self.share):.0%} do{others}: what is before and what "
-            "follows is joined wrongly there; try the other --mapper or reconstruct, film it more "
-            "slowly, or map the parts on either side apart"
+            f"the poses, usually {np.median(self.share):.0%} do{others}: the parts before and "
+            "after are joined wrongly; try the other --mapper or reconstruct, film more slowly, or "
+            "map the two parts separately"
         )
 
 
 def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> Crossings:
-    """Hold the verified matches of a database against the poses of a model of it.
+    """Compare the verified matches of a database with the poses of a model.
 
     Args:
-        reconstruction: pycolmap.Reconstruction; images are those of the database by their names.
-        database: COLMAP database, which stays as it is.
+        reconstruction: the model; its images are found in the database by name.
+        database: COLMAP database, which is not changed.
 
     Raises:
         DatabaseError: the database cannot be read, or is damaged.
@@ -105,9 +105,9 @@ def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> 
 def _fitting(
     images: list[ModelImage], cameras: pycolmap.CameraMap, database: Path
 ) -> Iterator[tuple[int, int, NDArray[np.bool_]]]:
-    """Each matched pair of images, by their place, i < j, and which of its matches fit the poses.
+    """Yield each matched pair as indices i < j, with a mask of the matches that fit the poses.
 
-    Matches are taken for those of the images' cameras in the model.
+    Keypoints are undistorted with the cameras of the model.
     """
     place = {image.name: k for k, image in enumerate(images)}
     with open_unaltered(database) as connection:
@@ -134,8 +134,8 @@ def _fitting(
             matches = matches_from_row(database, pair_id, *row)
             if (matches >= [rays[a].shape[1], rays[b].shape[1]]).any():
                 raise DatabaseError(
-                    f"{database}: images {a} and {b} match keypoints that are not there: "
-                    "'colmap-av1 check' says what else is wrong"
+                    f"{database}: images {a} and {b} match keypoints that do not exist: run "
+                    "'colmap-av1 check' for a full list of problems"
                 )
             views = [images[of_id[k]] for k in (a, b)]
             focal = np.mean([cameras[view.camera_id].mean_focal_length() for view in views])
@@ -146,5 +146,5 @@ def _fitting(
 
 
 def _errors(a: _Floats, b: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
-    """Sampson distance of matched rays [2, n] by the poses of two images, float64 [n]."""
+    """Sampson error of matched rays [2, n] for the poses of two images, float64 [n]."""
     return sampson_error(essential_of_poses(a, b), xa, xb)

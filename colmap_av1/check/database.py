@@ -1,4 +1,4 @@
-"""A check of what COLMAP's mappers will make of a database, without altering it."""
+"""Check, without changing it, what COLMAP's mappers will do with a database."""
 
 from __future__ import annotations
 
@@ -40,32 +40,32 @@ from colmap_av1.util.graphs import connected_components
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a database holds, and what the mappers will make of it.
+    """Contents of a database, and what the mappers will do with it.
 
     Attributes:
         database: the database file.
         user_version: the number by which COLMAP distinguishes layouts.
-        layout: versions of COLMAP whose layout it is.
+        layout: versions of COLMAP that write this layout.
         readers: versions of COLMAP that open it.
-        num_images: images listed.
-        num_cameras: cameras listed.
-        num_priors: cameras with a focal length known beforehand.
+        num_images: number of images.
+        num_cameras: number of cameras.
+        num_priors: number of cameras with a focal length prior.
         image_sizes: number of images by (width, height) in pixels.
-        num_keypoints: keypoints of all images.
-        num_matched_keypoints: those that are inliers of a pair that mappers use.
-        keypoint_columns: number of images by the columns of their keypoints: 2: x, y; 4: scale
-            and orientation too; 6: an affine shape too.
-        num_described_images: images with descriptors.
-        num_pairs: pairs with inliers.
-        num_used_pairs: those that the mappers use.
-        num_empty_pairs: pairs that matchers tried in vain.
-        num_inliers: inliers of all pairs that mappers use.
-        configs: number of pairs with inliers by COLMAP's name of their geometry.
-        num_connected_images: images of the largest group that used pairs connect.
-        parallax: of the widest pairs; None where no pair is used.
+        num_keypoints: number of keypoints of all images.
+        num_matched_keypoints: number of keypoints that are inliers of a pair that mappers use.
+        keypoint_columns: number of images by the columns of their keypoints: 2 (x, y), 4 (with
+            scale and orientation) or 6 (with an affine shape).
+        num_described_images: number of images with descriptors.
+        num_pairs: number of pairs with inliers.
+        num_used_pairs: number of pairs that the mappers use.
+        num_empty_pairs: number of pairs that were matched without result.
+        num_inliers: number of inliers of all pairs that mappers use.
+        configs: number of pairs with inliers by COLMAP's name of their configuration.
+        num_connected_images: number of images in the largest group that used pairs connect.
+        parallax: parallax of the widest pairs; None if no pair is used.
         depth: whether the pairs determine depth.
-        thin_gaps: gaps between images of a video that few matches cross.
-        findings: what stands out, most severe first.
+        thin_gaps: gaps between images of a video with few matches across them.
+        findings: the findings, most severe first.
     """
 
     database: Path
@@ -93,20 +93,20 @@ class CheckReport:
 
     @property
     def mappable(self) -> bool:
-        """Whether nothing was found that stops the mappers."""
+        """Whether the mappers can use the database: no finding is an error."""
         return all(finding.severity != "error" for finding in self.findings)
 
     @property
     def damaged(self) -> bool:
-        """Whether it holds what no program writes, though mappers may work around it."""
+        """Whether the file is damaged, even if mappers work around the damage."""
         return any(finding.damage for finding in self.findings)
 
 
 def check(database: str | os.PathLike[str]) -> CheckReport:
-    """Read a COLMAP database of any version and say what the mappers will make of it.
+    """Check what the mappers will do with a COLMAP database of any version.
 
-    The file is opened so that neither it nor anything beside it changes: it is not migrated,
-    and no log is made. The thresholds are the defaults of COLMAP's mappers.
+    The database is not changed or migrated, and no file is created beside it. The thresholds are
+    the defaults of COLMAP's mappers.
 
     Args:
         database: path of the file.

@@ -1,4 +1,4 @@
-"""Findings in a database that matter for mapping it."""
+"""Find faults and properties of a database that matter to COLMAP's mappers."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from colmap_av1.util.texts import check_name
 
 Severity = Literal["error", "warning", "note"]
 
-# Fewer keypoints without a match than this share are not mentioned.
+# A smaller share of keypoints without a match is not reported.
 _NOTED_SHARE = 0.01
-# COLMAP's mappers ignore images whose camera is outside these limits: the focal length as a
-# multiple of the longer side, and the absolute value of any distortion parameter.
+# COLMAP's mappers ignore images whose camera is outside these limits: focal length in units of the
+# longer image side, and absolute value of each distortion parameter.
 _FOCAL_RATIOS = (0.1, 10.0)
 _LARGEST_DISTORTION = 1.0
-# Keypoints up to this many pixels outside their image are accepted: rounding puts them there.
+# Keypoints up to this many pixels outside their image are accepted, because of rounding.
 _MARGIN = 1.0
 
 
@@ -42,10 +42,10 @@ class Finding:
     """One finding in a database that matters for mapping it.
 
     Attributes:
-        severity: "error": mappers stop or find nothing; "warning": a part is lost, or some
-            program stops; "note": nothing is wrong.
+        severity: "error": mappers stop or find nothing; "warning": data is lost, or some program
+            stops; "note": nothing is wrong.
         text: one line.
-        damage: no program writes such values: the file is damaged, or parts of several are mixed.
+        damage: whether the file is damaged or mixes data of several databases.
     """
 
     severity: Severity
@@ -54,15 +54,15 @@ class Finding:
 
 
 def _some(names: Sequence[str], what: str) -> str:
-    """A count and an example, such as "3 images (a.png, ...)"."""
+    """Count names and give an example, such as "3 images (a.png, ...)"."""
     plural = "s" if len(names) > 1 else ""
-    # A name may hold anything, line breaks too.
+    # A name may contain any character, including line breaks.
     first = names[0] if names[0].isprintable() and names[0] else repr(names[0])
     return f"{len(names)} {what}{plural} ({first}{', ...' if plural else ''})"
 
 
 def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
-    """Images without a camera, duplicate names, unknown focal lengths."""
+    """Images without a camera, cameras without a focal length prior, sizes, order of names."""
     if len(images.ids) == 0:
         yield Finding("error", "lists no images")
         return
@@ -73,20 +73,22 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
     if unknown:
         yield Finding(
             "note",
-            f"{unknown} of {len(cameras)} cameras have no focal length known beforehand: the "
-            "mappers start from a guess and refine it",
+            f"{unknown} of {len(cameras)} cameras have no focal length prior: the stored value is "
+            "only where the mappers start",
         )
     sizes = {(c.width, c.height) for i, c in cameras.items() if i in set(images.camera_ids)}
     if len(sizes) > 1:
         yield Finding("note", f"images have {len(sizes)} sizes")
     if images.names != sorted(images.names):
-        yield Finding("note", "image ids do not follow the order of names: match by name, not id")
+        yield Finding(
+            "note", "image ids do not follow the order of names: identify images by name, not id"
+        )
 
 
 def value_findings(
     images: Images, pairs: Pairs, cameras: dict[int, pycolmap.Camera]
 ) -> Iterator[Finding]:
-    """Values that no program can use, whatever the rest of the database is like."""
+    """Values that no program can use: names, cameras, positions, pairs."""
     yield from _name_findings(images)
     yield from _camera_findings(cameras)
     yield from _position_findings(images, cameras)
@@ -95,7 +97,9 @@ def value_findings(
         (pairs.num_swapped, "stored under the larger image id first"),
     ):
         if count:
-            yield Finding("warning", f"{count} pairs are {fault}: mappers mix them up", damage=True)
+            yield Finding(
+                "warning", f"{count} pairs are {fault}: mappers confuse their images", damage=True
+            )
 
 
 def _name_findings(images: Images) -> Iterator[Finding]:
@@ -105,8 +109,8 @@ def _name_findings(images: Images) -> Iterator[Finding]:
     if unusable:
         yield Finding(
             "error",
-            f"{_some(unusable, 'image')} with a name outside the image folder, or none that a file "
-            "can have: name it by its path within the folder",
+            f"{_some(unusable, 'image')} with a name outside the image folder or an invalid file "
+            "name: use the path within the folder",
         )
 
 
@@ -124,19 +128,19 @@ def _camera_findings(cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
         if fault:
             yield Finding("error", f"camera {camera_id} has {fault}: mappers stop or find nothing")
             break
-    implausible = focal_length_warning(c for i, c in cameras.items() if not faults[i])
-    if implausible is not None:
-        yield Finding("warning", implausible)
-    unlike = [
+    warning = focal_length_warning(c for i, c in cameras.items() if not faults[i])
+    if warning is not None:
+        yield Finding("warning", warning)
+    implausible = [
         str(i)
         for i, camera in cameras.items()
         if not faults[i] and camera.has_bogus_params(*_FOCAL_RATIOS, _LARGEST_DISTORTION)
     ]
-    if unlike:
+    if implausible:
         yield Finding(
             "warning",
-            f"{_some(unlike, 'camera')} with parameters that do not fit the size of the images: "
-            "mappers leave their images out unless they refine the parameters",
+            f"{_some(implausible, 'camera')} with implausible parameters: mappers ignore their "
+            "images unless they refine the parameters",
         )
 
 
@@ -156,14 +160,14 @@ def _position_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> I
     if outside:
         yield Finding(
             "warning",
-            f"{_some(outside, 'image')} with keypoints outside: is the camera's size that of the "
-            "images the keypoints are of?",
+            f"{_some(outside, 'image')} with keypoints outside the image: compare the camera's "
+            "size with that of the images",
             damage=True,
         )
 
 
 def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[Finding]:
-    """Images without a frame in layouts that have frames."""
+    """Images without a frame, in layouts that have frames."""
     if not (columns(connection, "frames") and columns(connection, "frame_data")):
         return
     rigs = dict(
@@ -181,15 +185,15 @@ def frame_findings(connection: sqlite3.Connection, images: Images) -> Iterator[F
         if bare:
             yield Finding(
                 "error",
-                f"{_some(bare, 'image')} without a frame, others with one: mappers from COLMAP "
-                "3.12 on stop; 'colmap-av1 match' completes the frames",
+                f"{_some(bare, 'image')} without a frame while others have one: mappers of COLMAP "
+                "3.12 and later stop; 'colmap-av1 match' adds the missing frames",
             )
     elif rigs and any(rigs.get(camera_id) != camera_id for camera_id in images.camera_ids):
-        yield Finding("error", "has rigs but no frames: mappers from COLMAP 3.12 on stop")
+        yield Finding("error", "has rigs but no frames: mappers of COLMAP 3.12 and later stop")
 
 
 def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
-    """Images without keypoints, keypoints without matches."""
+    """Images without keypoints, keypoints without matches, unequal numbers of descriptors."""
     counts = [len(k) for k in images.keypoints]
     if counts and not any(counts):
         yield Finding("error", "no image has keypoints: extract and match features first")
@@ -204,8 +208,8 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     elif pairs.num_astray:
         yield Finding(
             "warning",
-            f"{pairs.num_astray} pairs match keypoints that are not there: mappers leave such "
-            "matches out, and the others may be of other keypoints too",
+            f"{pairs.num_astray} pairs match keypoints that do not exist: mappers ignore these "
+            "matches, and the others may belong to the wrong keypoints",
             damage=True,
         )
     empty = [n for n, c in zip(images.names, counts, strict=True) if not c]
@@ -219,8 +223,8 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
     if uneven:
         yield Finding(
             "warning",
-            f"{_some(uneven, 'image')} with another number of descriptors than of keypoints: "
-            "guided matching and vocabulary trees stop, mappers ignore it",
+            f"{_some(uneven, 'image')} with different numbers of descriptors and keypoints: guided "
+            "matching and vocabulary trees stop, mappers ignore it",
         )
     total, matched = sum(counts), sum(int(np.count_nonzero(m)) for m in pairs.matched)
     if total - matched > _NOTED_SHARE * total:
@@ -228,98 +232,105 @@ def keypoint_findings(images: Images, pairs: Pairs) -> Iterator[Finding]:
 
 
 def pair_findings(pairs: Pairs, images: Images) -> Iterator[Finding]:
-    """Pairs that the mappers leave out, and why."""
+    """Pairs that the mappers ignore, and why."""
     used = pairs.used
     unverified = np.count_nonzero((pairs.num_matches >= MIN_INLIERS) & (pairs.num_inliers < 0))
     if unverified:
         yield Finding(
             "warning",
-            f"{unverified} pairs have matches that were never verified: mappers leave them out; "
-            "run a matcher of COLMAP, which verifies them",
+            f"{unverified} pairs have matches that were never verified: mappers ignore them; run "
+            "one of COLMAP's matchers, which verifies them",
         )
     if any(map(len, images.keypoints)) and not used.any():
         yield Finding("error", f"no pair has {MIN_INLIERS} verified matches: mappers find nothing")
     few = np.count_nonzero((pairs.num_inliers > 0) & (pairs.num_inliers < MIN_INLIERS))
     if few:
         yield Finding(
-            "note", f"{few} pairs have fewer than {MIN_INLIERS} inliers: mappers leave them out"
+            "note", f"{few} pairs have fewer than {MIN_INLIERS} inliers: mappers ignore them"
         )
     for config, why in (
-        (TwoViewConfig.UNDEFINED, "their geometry was never estimated: mappers from COLMAP 4.2 on"),
-        (TwoViewConfig.DEGENERATE, "their geometry is degenerate: mappers from COLMAP 4.2 on"),
+        (
+            TwoViewConfig.UNDEFINED,
+            "their geometry was never estimated: mappers of COLMAP 4.2 and later",
+        ),
+        (
+            TwoViewConfig.DEGENERATE,
+            "their geometry is degenerate: mappers of COLMAP 4.2 and later",
+        ),
         (TwoViewConfig.WATERMARK, "they match a watermark: mappers"),
     ):
         count = np.count_nonzero((pairs.num_inliers >= MIN_INLIERS) & (pairs.config == config))
         if count:
             yield Finding(
                 "note" if config == TwoViewConfig.WATERMARK else "warning",
-                f"{count} pairs have inliers, but {why} leave them out",
+                f"{count} pairs have inliers, but {why} ignore them",
             )
     multiple = np.count_nonzero(used & (pairs.config == TwoViewConfig.MULTIPLE))
     if multiple:
         yield Finding(
-            "note", f"{multiple} pairs have several geometries: the global mapper leaves them out"
+            "note", f"{multiple} pairs have several geometries: the global mapper ignores them"
         )
     unpaired = np.count_nonzero(used & (pairs.num_matches < 0))
     if unpaired:
         yield Finding(
             "warning",
-            f"{unpaired} verified pairs have no row in 'matches': standalone GLOMAP leaves them "
-            "out, and matchers of COLMAP match them again",
+            f"{unpaired} verified pairs have no row in 'matches': standalone GLOMAP ignores them, "
+            "and COLMAP's matchers match them again",
         )
     empty = np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))
     if empty:
         yield Finding(
             "note",
-            f"{empty} pairs were matched without result: matchers skip them, writers replace them",
+            f"{empty} pairs were matched without result: COLMAP's matchers skip them, 'colmap-av1 "
+            "match' replaces them",
         )
 
 
 def motion_findings(
     pairs: Pairs, parallax: Parallax | None, depth: DepthEvidence, group: int, num_images: int
 ) -> Iterator[Finding]:
-    """Connection, parallax and forward motion: whether a mapper finds an initial pair."""
+    """Connectivity, parallax and forward motion: whether a mapper finds an initial pair."""
     used = pairs.used
     if parallax is None:
         return
     if group < num_images:
         yield Finding(
             "warning",
-            f"pairs connect at most {group} of {num_images} images: the others stay out of the "
-            "model, or go to another one",
+            f"pairs connect at most {group} of {num_images} images: the others are not registered, "
+            "or become separate models",
         )
     if pairs.num_inliers[used].max() < INITIAL_MIN_INLIERS:
         yield Finding(
             "warning",
-            f"no pair has {INITIAL_MIN_INLIERS} inliers: the incremental mapper starts with "
-            "none unless --Mapper.init_min_num_inliers is lower",
+            f"no pair has {INITIAL_MIN_INLIERS} inliers: the incremental mapper finds no initial "
+            "pair unless --Mapper.init_min_num_inliers is lower",
         )
     if depth.warning is not None:
         yield Finding("warning" if depth.is_observable else "error", depth.warning)
     if parallax.angle is None:
-        yield Finding("note", "parallax is unknown: the widest pairs have no model stored")
+        yield Finding("note", "parallax is unknown: the widest pairs have no stored model")
     elif parallax.angle < INITIAL_LEAST_ANGLE:
         yield Finding(
             "warning",
-            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no start, "
-            "use the global one",
+            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no initial "
+            "pair; use the global mapper",
         )
     elif parallax.angle < INITIAL_MIN_ANGLE:
         yield Finding(
             "note",
-            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts "
-            "only after lowering its limit",
+            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts only after "
+            "it lowers its limit",
         )
     if parallax.focal_known and parallax.forward_share > 0.5:
         yield Finding(
             "warning",
             "the camera moves along its axis: the incremental mapper starts only with "
-            "--Mapper.init_max_forward_motion 1, and the focal length cannot be found",
+            "--Mapper.init_max_forward_motion 1, and the focal length is not observable",
         )
 
 
 def gap_findings(gaps: Sequence[Gap]) -> Iterator[Finding]:
-    """Gaps between images of a video that few matches cross, in one finding."""
+    """Gaps between images of a video with few matches across them, in one finding."""
     text = few_matches_warning(gaps)
     if text is not None:
         yield Finding("warning", text)
@@ -330,8 +341,8 @@ def orphan_findings(connection: sqlite3.Connection, pairs: Pairs) -> Iterator[Fi
     if pairs.num_foreign:
         yield Finding(
             "error",
-            f"{pairs.num_foreign} pairs are of images that are not listed: mappers from COLMAP "
-            "3.12 on stop",
+            f"{pairs.num_foreign} pairs have images that are not listed: mappers of COLMAP 3.12 "
+            "and later stop",
         )
     for table in ("keypoints", "descriptors"):
         if not columns(connection, table):

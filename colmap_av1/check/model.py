@@ -1,4 +1,4 @@
-"""Diagnosis of a COLMAP model: whether its poses fit its points, images and matches."""
+"""Diagnose a COLMAP model: check its poses against its points, images and matches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ModelCheck:
     """Diagnosis of a model.
 
     Attributes:
-        figures: its images, points, errors and focal length.
+        figures: numbers of images and points, errors and focal length.
         seams: the points that join neighbouring images.
         crossings: the matches across neighbouring images; None without a database.
         far_views: the long-range check; None without an image folder.
@@ -38,7 +38,7 @@ class ModelCheck:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All warnings; none if the model holds together."""
+        """All warnings; none if nothing is wrong with the model."""
         far_warning = self.far_views.warning() if self.far_views else None
         return (*((far_warning,) if far_warning is not None else ()), *self.seam_warnings)
 
@@ -50,7 +50,7 @@ def check_model(
     database: Path | None = None,
     progress: Progress = no_progress,
 ) -> ModelCheck:
-    """Check whether a model holds together.
+    """Check whether the poses of a model are consistent.
 
     Args:
         model: the model.
@@ -62,7 +62,7 @@ def check_model(
         ImageError: an image is missing, unreadable or of another size than its camera.
         DatabaseError: the database cannot be read, or is damaged.
     """
-    # First, as it may find that images are missing.
+    # The long-range check comes first, because it raises if images are missing.
     far_views = None if image_path is None else model_far_views(model, image_path, progress)
     return ModelCheck(
         figures=model_figures(model),

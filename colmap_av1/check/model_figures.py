@@ -1,4 +1,4 @@
-"""Figures of a COLMAP model: images, points, errors, focal length."""
+"""Compute figures of a COLMAP model: images, points, errors, focal length."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class ModelFigures:
     """Figures of a model.
 
     Attributes:
-        num_registered: images with a pose.
-        num_points: 3D points.
-        mean_track_length: images that see a point, on average.
-        coverage: share of the images' cells of 16x16 pixels that visible points project into.
-        mean_error: mean of the points' reprojection errors in pixels, as COLMAP states it.
-        median_error: their median.
-        focal_length: in pixels, on average over the cameras.
-        focal_lengths: the shortest and the longest of the cameras, in pixels.
+        num_registered: number of registered images.
+        num_points: number of 3D points.
+        mean_track_length: mean number of observations of a point.
+        coverage: share of the images' cells of 16x16 pixels into which visible points project.
+        mean_error: mean reprojection error of the points in pixels, as in COLMAP.
+        median_error: median reprojection error of the points in pixels.
+        focal_length: mean focal length of the cameras in pixels.
+        focal_lengths: shortest and longest focal length of the cameras in pixels.
     """
 
     num_registered: int
@@ -38,10 +38,10 @@ class ModelFigures:
 
 
 def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
-    """Figures of a pycolmap.Reconstruction, or of the model in a folder.
+    """Compute the figures of a model, given as pycolmap.Reconstruction or as a folder.
 
     Raises:
-        ModelError: the folder holds no readable model with poses.
+        ModelError: the folder has no readable model with poses.
     """
     if isinstance(model, Path):
         model = read_model(model)

@@ -14,7 +14,7 @@ _Floats = NDArray[np.float64]
 # Inlier threshold of GPS positions in metres: their usual scatter within minutes. Positions with
 # larger errors are outliers.
 _MAX_ERROR = 3.0
-# Positions with a smaller spread (RMS, metres) come from a receiver at rest.
+# Positions with a smaller spread (RMS, in metres) come from a receiver at rest.
 _LEAST_SPREAD = 1.0
 _LEAST_POSITIONS = 3
 # Smallest share of inliers, and largest relative error of the scale, of an accepted fit.
@@ -38,8 +38,8 @@ class Similarity:
     """The transform x -> scale * rotation @ x + translation.
 
     Attributes:
-        scale: positive.
-        rotation: float64 [3, 3].
+        scale: positive scale factor.
+        rotation: float64 [3, 3] rotation matrix.
         translation: float64 [3].
     """
 
@@ -64,7 +64,7 @@ class Up:
 
     Attributes:
         direction: float64 [3] unit vector.
-        error: its standard error in radians.
+        error: standard error of the direction in radians.
     """
 
     direction: _Floats
@@ -104,7 +104,7 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
         The fit, or a text with the reason why there is none.
     """
     if len(path) < _LEAST_POSITIONS:
-        return f"only {len(path)} images have one"
+        return f"only {len(path)} images have a position"
     distinct = len(np.unique(positions.round(2), axis=0))
     spread = _spread(positions)
     if distinct < _LEAST_POSITIONS or spread < _LEAST_SPREAD:
@@ -121,7 +121,7 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
         pycolmap.RANSACOptions(max_error=_MAX_ERROR, max_num_trials=_NUM_TRIALS),
     )
     if found is None:
-        return "the camera's path has another shape"
+        return "the camera path has a different shape"
     best = found["tgt_from_src"]
     rough_fit = Similarity(
         float(best.scale), np.asarray(best.rotation.matrix()), np.asarray(best.translation)

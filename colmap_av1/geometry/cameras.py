@@ -1,4 +1,4 @@
-"""Creating and checking pycolmap cameras: model, parameters, initial focal length."""
+"""Create and check pycolmap cameras: model, parameters, initial focal length."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV
 # Initial focal lengths, as a share of the longer image side: 0.9 for phones and drones with about
 # 60 degrees field of view, and 0.5 for fisheye lenses with about 115 degrees. COLMAP's default of
 # 1.2 (45 degrees) often makes its mapper fail on videos of phones.
-_GUESS, _FISHEYE_GUESS = 0.9, 0.5
-# Focal lengths of lenses in longer sides of an image: fields of view from 118 to 11 degrees.
+_INITIAL_SHARE, _INITIAL_FISHEYE_SHARE = 0.9, 0.5
+# Plausible focal lengths in units of the longer image side: fields of view from 118 to 11 degrees.
 _SHORTEST, _LONGEST = 0.3, 5.0
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
@@ -38,7 +38,7 @@ def make_camera(
     pixel_aspect: float = 1.0,
     focal_length: float | None = None,
 ) -> pycolmap.Camera:
-    """Make the camera of new images.
+    """Create the camera of new images.
 
     Without parameters, the focal length is 0.9 times the longer side (0.5 times for fisheye
     models), the principal point is the image centre, and there is no distortion; the camera has no
@@ -53,7 +53,7 @@ def make_camera(
         focal_length: estimated focal length in pixel heights; used if no parameters are given.
 
     Raises:
-        OptionError: the parameters do not fit the model, or its default.
+        OptionError: the parameters do not fit the given or the default model.
     """
     name = options.camera_model
     if name is None:
@@ -62,8 +62,8 @@ def make_camera(
         name = square if is_square(pixel_aspect) else DEFAULT_MODEL_OF_OBLONG_PIXELS
     is_known = focal_length is not None or options.camera_params is not None
     if focal_length is None:
-        guess = _FISHEYE_GUESS if is_fisheye(name) else _GUESS
-        focal_length = guess * max(width * pixel_aspect, height)
+        share = _INITIAL_FISHEYE_SHARE if is_fisheye(name) else _INITIAL_SHARE
+        focal_length = share * max(width * pixel_aspect, height)
     camera = camera_of_model(name, focal_length, width, height)
     if has_two_focal_lengths(camera):
         params = camera.params
@@ -76,7 +76,7 @@ def make_camera(
 
 
 def camera_fault(camera: pycolmap.Camera) -> str | None:
-    """The fault of an invalid pycolmap.Camera, in words that follow "has"; None if it is valid."""
+    """The fault of an invalid camera, as a phrase that follows "has"; None if it is valid."""
     if not 0 < camera.width <= _LONGEST_SIDE or not 0 < camera.height <= _LONGEST_SIDE:
         return f"a size of {camera.width}x{camera.height}"
     if not np.isfinite(camera.params).all():
@@ -87,7 +87,7 @@ def camera_fault(camera: pycolmap.Camera) -> str | None:
 
 
 def focal_length_warning(cameras: Iterable[pycolmap.Camera]) -> str | None:
-    """Warn of a focal length that hardly any lens has: its estimate went astray.
+    """Warn of an implausible focal length, which is a sign of a wrong estimate.
 
     Args:
         cameras: pycolmap.Cameras. Fisheye lenses may have shorter focal lengths than others.
@@ -128,7 +128,7 @@ def check_pixel_aspect(camera: pycolmap.Camera, pixel_aspect: float, what_to_do:
     Args:
         camera: a pycolmap.Camera.
         pixel_aspect: width of a pixel over its height.
-        what_to_do: how to get another model, for the message.
+        what_to_do: the remedy for the message.
     """
     if is_square(pixel_aspect) or has_two_focal_lengths(camera):
         return []

@@ -1,4 +1,4 @@
-"""COLMAP models on disk: reading with pycolmap, and fast writing of arrays."""
+"""Read COLMAP models with pycolmap, and write them quickly from arrays."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class ModelImage:
     """An image of a model.
 
     Attributes:
-        image_id: its id.
+        image_id: id of the image.
         name: path relative to the image folder.
-        camera_id: id of its camera.
+        camera_id: id of the image's camera.
         cam_from_world: float64 [3, 4] pose, x_cam = R x_world + t.
     """
 
@@ -66,7 +66,7 @@ class ModelImage:
 class ModelPoints:
     """Points of a model and their observations, in compressed sparse row form.
 
-    Point p has the observations offsets[p] to before offsets[p + 1].
+    Point p has the observations offsets[p] : offsets[p + 1].
 
     Attributes:
         xyz: float64 [num_points, 3].
@@ -231,7 +231,7 @@ def write_model(
 
 
 def _point_records(points: ModelPoints, elements: NDArray[Any], first: int, last: int) -> bytes:
-    """The binary records, including tracks, of the points from `first` to before `last`."""
+    """The binary records, including tracks, of the points first : last."""
     offsets = points.offsets[first : last + 1]
     lengths = np.diff(offsets)
     heads = np.empty(last - first, dtype=_POINT)
@@ -267,7 +267,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
     ):
         found = sorted(path.glob("**/cameras.bin"))
         inside = next((p for p in found if ".stages" not in p.parts), None)
-        hint = f": did you mean {inside.parent}?" if inside else ": give a folder a mapper wrote"
+        hint = f": did you mean {inside.parent}?" if inside else ": give a mapper's output folder"
         raise ModelError(f"{path}: has no COLMAP model (cameras, images, points3D){hint}")
     for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):
         if not may_read(file):
@@ -290,7 +290,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
     if cameras.is_file() and cameras.stat().st_size < 8 + sum(sizes):
         raise unreadable
     if reconstruction.num_reg_images() == 0:
-        raise ModelError(f"{path}: no image of the model has a pose: give a mapped model")
+        raise ModelError(f"{path}: the model has no registered images: give a mapped model")
     _check_values(path, reconstruction)
     point_ids = list(reconstruction.points3D)
     xyz = np.array([p.xyz for p in reconstruction.points3D.values()]).reshape(-1, 3)
@@ -305,15 +305,15 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
 
 
 def _check_values(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
-    """Refuse invalid names, poses and cameras, which pycolmap does not check."""
+    """Raise if a name, pose or camera is invalid, which pycolmap does not check."""
     map_again = "map again, or give another model"
     for image_id, image in reconstruction.images.items():
         try:
             check_name(image.name)
         except UnicodeDecodeError:
-            raise ModelError(f"{path}: image {image_id} has a name not in UTF-8: rename it") from (
-                None
-            )
+            raise ModelError(
+                f"{path}: the name of image {image_id} is not UTF-8: rename it"
+            ) from None
         except ImageError as error:
             raise ModelError(f"{path}: {error}") from error
         if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():

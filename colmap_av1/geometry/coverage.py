@@ -23,7 +23,7 @@ CELL = 16
 # neighbouring cells have points that are nearer by this factor.
 _NEARER = 1.25
 _AROUND = 8
-# Number of evenly spread images that coverage is measured in, to limit the time for long videos.
+# Largest number of images, evenly spread, in which coverage is measured, to limit the time.
 _MOST_IMAGES = 64
 # Number of points on each side of the image that bound the camera's field of view.
 _EDGE_POINTS = 33
@@ -55,7 +55,7 @@ class PosedCamera:
 
     @property
     def counting_cells(self) -> NDArray[np.bool_]:
-        """Bool [rows, columns]: cells of the image that have valid pixels."""
+        """Cells of the image that have valid pixels, bool [rows, columns]."""
         width, height = self.size
         rows, columns = -(-height // CELL), -(-width // CELL)
         if self.mask is None:
@@ -117,7 +117,7 @@ def views_of(
 
 
 def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
-    """Share of the images' cells of 16x16 pixels that a visible point projects into.
+    """Share of the images' cells of 16x16 pixels into which a visible point projects.
 
     A point that is visible only through a gap in a nearer surface does not count, and neither do
     masked cells. At most 64 images, evenly spread, are measured.

@@ -1,4 +1,4 @@
-"""Points of all tracks for training Gaussian splats, including distant ones."""
+"""Compute points, including distant ones, of all tracks for training Gaussian splats."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def splat_points(
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> TriangulatedPoints:
-    """Points of all tracks that agree with the poses, regardless of their parallax.
+    """Compute points of all tracks that agree with the poses, whatever their parallax.
 
     Distant surfaces fill a large part of many images, and their exact distance matters little. A
     point with an uncertain distance stays on the ray of its middle image, and is moved towards the
@@ -150,10 +150,10 @@ def splat_points(
         focal=views.focal.mean(axis=1),
     )
     far = _far_distance(points, unsure, seen)
-    points = _at_honest_distance(points, unsure, far, seen)
+    points = _at_likely_distance(points, unsure, far, seen)
     far_away = _points_far_away(points, far, seen, options)
-    points = _in_order(points, far_away)
-    points = points.take(np.flatnonzero(~_hanging(points, seen)))
+    points = _merged(points, far_away)
+    points = points.take(np.flatnonzero(~_is_floater(points, seen)))
     num_agreeing = found.num_agreeing + len(far_away.xyz)
     return replace(found, num_agreeing=num_agreeing, **vars(points))
 
@@ -198,7 +198,7 @@ def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
     return max(_FAR * deepest, _FAR_EXTENTS * extent) or _ANY_FAR
 
 
-def _at_honest_distance(points: _Points, unsure: _Floats, far: float, seen: _Seen) -> _Points:
+def _at_likely_distance(points: _Points, unsure: _Floats, far: float, seen: _Seen) -> _Points:
     """Move points along their middle ray towards the far field, within their uncertainty.
 
     The inverse distance is combined with a prior at the far field, whose standard deviation is the
@@ -232,7 +232,7 @@ def _with_errors(points: _Points, seen: _Seen) -> _Points:
 def _points_far_away(
     points: _Points, far: float, seen: _Seen, options: TriangulateOptions
 ) -> _Points:
-    """Far-field points for the tracks without a point that fit one in enough images."""
+    """Far-field points of tracks without a point, if enough observations fit."""
     offsets = seen.observations.offsets
     track = np.searchsorted(offsets, points.observation[points.offsets[:-1]], side="right") - 1
     has_point = np.zeros(len(offsets) - 1, np.bool_)
@@ -257,7 +257,7 @@ def _points_far_away(
     return _with_errors(far_away, seen)
 
 
-def _in_order(one: _Points, two: _Points) -> _Points:
+def _merged(one: _Points, two: _Points) -> _Points:
     """Merge points, in the order of their tracks."""
     both = _Points(
         np.concatenate([one.xyz, two.xyz]),
@@ -268,7 +268,7 @@ def _in_order(one: _Points, two: _Points) -> _Points:
     return both.take(np.argsort(both.observation[both.offsets[:-1]], kind="stable"))
 
 
-def _hanging(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
+def _is_floater(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
     """Whether each point is a floater: nearly alone far in front of its surroundings."""
     votes = _core.hanging_observations(
         **seen.of_points(points),

@@ -1,4 +1,4 @@
-"""Which points of a model have observable depth, and how much of a scene a picture frames."""
+"""Find the points of a model that have observable depth, and the box to frame in pictures."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from colmap_av1.geometry.distant_points import distance_uncertainty
 
 _Floats = NDArray[np.float64]
 
-# Uncertainty of a point's distance, as a share of it, up to which its depth is observable. At a
-# larger share points of one surface are drawn out along their rays.
+# A point's depth is observable below this relative uncertainty of its distance. Above it, points of
+# a surface spread visibly along their rays.
 _OBSERVABLE = 0.1
-# Quantiles of the points that are framed.
+# Quantiles of the points that bound the framed box.
 _FRAMED = (0.02, 0.98)
 
 
 def has_observable_depth(model: pycolmap.Reconstruction) -> NDArray[np.bool_]:
     """Whether the images of a pycolmap.Reconstruction determine the distance of each point.
 
-    The angle between the rays of its first, middle and last observation determines that. The depth
-    of a point without a reprojection error or without observations is assumed, unless no point of
-    the model has any.
+    The test uses the angles between the rays of a point's first, middle and last observation.
+    Points without observations or without a reprojection error count as not observable. If no point
+    has a reprojection error, that criterion is ignored; without any observations, all points count
+    as observable.
 
     Returns:
         bool [num_points], in the order of the points' ids.
@@ -52,7 +53,7 @@ def has_observable_depth(model: pycolmap.Reconstruction) -> NDArray[np.bool_]:
 
 
 def _three_images(track: pycolmap.Track) -> list[int]:
-    """The images of the first, the middle and the last observation; none of an empty track."""
+    """The images of the first, middle and last observation; empty for an empty track."""
     length = track.length()
     return [int(track.element(k).image_id) for k in (0, length // 2, length - 1) if 0 <= k < length]
 
@@ -60,15 +61,15 @@ def _three_images(track: pycolmap.Track) -> list[int]:
 def framed_box(
     points: _Floats, observable: NDArray[np.bool_], centres: _Floats
 ) -> tuple[_Floats, _Floats]:
-    """The box that holds all cameras and nearly all points of observable depth.
+    """The box that contains all cameras and nearly all points with observable depth.
 
     Args:
-        points: float64 [n, d] in the coordinates whose axes the box follows.
-        observable: bool [n], see `has_observable_depth`; all points count if none is.
-        centres: float64 [m, d] the cameras, one at least.
+        points: float64 [n, d] points, in coordinates along the axes of the box.
+        observable: bool [n], see `has_observable_depth`; if none is, all points count.
+        centres: float64 [m, d] camera centres, m > 0, in the same coordinates.
 
     Returns:
-        float64 [d] the lowest corner and the highest one.
+        float64 [d] the lowest and the highest corner.
     """
     low, high = centres.min(axis=0), centres.max(axis=0)
     framed = points[observable] if observable.any() else points

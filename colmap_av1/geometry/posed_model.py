@@ -1,4 +1,4 @@
-"""Cameras, image poses and points of an intermediate model, in one .npz file.
+"""Store the cameras, image poses and points of an intermediate model in one .npz file.
 
 COLMAP's format is not suitable: trainers search a folder, including hidden folders, for
 `cameras.bin`, and could take an intermediate model for the finished one.

@@ -1,4 +1,4 @@
-"""Resection: poses of the images between key images, from the points that these observe."""
+"""Resection: estimate the poses of images between key images from the key images' points."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ class Sightings:
     Attributes:
         rays: float64 [n, 2] undistorted position (x / z, y / z) of each observation.
         xyz: float64 [n, 3] the 3D point of each observation.
-        bounds: int64 [num_images + 1]; image i has the observations bounds[i] to before
-            bounds[i + 1].
+        bounds: int64 [num_images + 1]; image i has the observations bounds[i] : bounds[i + 1].
     """
 
     rays: _Floats
@@ -52,20 +51,20 @@ def sightings_of(
     frames: NDArray[np.int32],
     cameras: Sequence[pycolmap.Camera],
 ) -> Sightings:
-    """Observations, in frames without a pose, of the points of tracks.
+    """Collect the observations, in frames without a pose, of the points of tracks.
 
     Args:
         points: triangulated points of `seen`.
         seen: the tracks in the frames with known poses, from `Tracks.keep_frames`.
         tracks: the same tracks in all frames.
         frames: int32 [num_images] ascending frames without a pose.
-        cameras: the pycolmap.Camera of each of them.
+        cameras: the pycolmap.Camera of each of these frames.
     """
     number = tracks.track
     known = np.zeros(tracks.num_frames, dtype=np.bool_)
     known[seen.frame] = True
     in_seen = np.unique(number[known[tracks.frame]])
-    # A track that slid from one surface to another may have two points: use the first.
+    # A track that slid from one surface to another may have two points: the first is used.
     first = points.observation[points.offsets[:-1]]
     own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)
     point = np.full(tracks.num_tracks, -1, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Triangulating all tracks on known poses, and colouring the points."""
+"""Triangulate all tracks on known poses, and colour the points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from colmap_av1.util.progress import Progress
 
 _Image = NDArray[np.uint8]
 
-# If fewer of the tracks agree with the poses, the model is not of the same video.
+# If a smaller share of the tracks agrees with the poses, the model is not of the same video.
 LEAST_AGREEING = 0.5
 # Smallest number of frames of a track that may give a point. With sufficient parallax, points from
 # three frames are as accurate as points from four or five.
@@ -43,9 +43,9 @@ def chaining_for_points(
         options: options of the user; values that are None are set.
         triangulate: options with the smallest number of observations of a point.
         is_downscaled: whether motion is estimated in downscaled pictures and the tracks are
-            corrected afterwards. Then the spacing is not changed: motion blocks are already as
-            fine as a trainer needs, and more tracks would leave fewer of them corrected, at three
-            times the time and twice the memory.
+            corrected afterwards. The spacing is then not changed: motion blocks are already as
+            fine as a trainer needs, and with more tracks, fewer of them would be corrected, in
+            three times the time and with twice the memory.
     """
     if options.min_length is None:
         min_length = min(_TRACK_LENGTH, triangulate.min_observations)
@@ -130,7 +130,7 @@ def rays_of(
     by_id = {int(camera.camera_id): camera for camera in cameras}
     camera_of_view = np.array([int(camera.camera_id) for camera in cameras])
     rays = np.empty(tracks.xy.shape)
-    # In parts, because intermediate arrays are several times as large.
+    # Done in parts, because intermediate arrays are several times as large.
     for start in range(0, len(rays), _CHUNK):
         part = slice(start, start + _CHUNK)
         xy = tracks.xy[part].astype(np.float64)
@@ -174,8 +174,8 @@ class Colours:
         """Colours, uint8 [num_points, 3] RGB."""
         first, lengths = self._points.offsets[:-1], np.diff(self._points.offsets)
         most = int(lengths.max(initial=1))
-        # Point, luma and observation index in a single key: sorting by one key takes a third of the
-        # time of sorting by several.
+        # Point, luma and observation index are packed in one key, because sorting by one key takes
+        # a third of the time of sorting by several.
         key = np.repeat(np.arange(len(lengths)), lengths) * (_LUMA.sum() * 255 + 1)
         key += self._seen.astype(np.int64) @ _LUMA
         key *= most
@@ -212,7 +212,7 @@ def reprojection_errors(points: ModelPoints, views: Sequence[PosedCamera]) -> ND
 def to_model_points(
     points: TriangulatedPoints, view: NDArray[np.int64], xy: NDArray[np.float64]
 ) -> ModelPoints:
-    """Model points in black; `xy` are the pixels of the points' observations."""
+    """Convert to black model points; `xy` are the pixels of the points' observations."""
     black = np.zeros((len(points.xyz), 3), np.uint8)
     return ModelPoints(
         points.xyz, black, points.error, points.offsets, view[points.observation], xy

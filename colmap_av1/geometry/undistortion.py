@@ -25,7 +25,7 @@ _COLUMNS = 512
 
 
 def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """The pinhole camera of the same size with the widest field of view without empty pixels.
+    """Find the pinhole camera of the same size with the widest field of view and no empty pixels.
 
     Args:
         camera: pycolmap.Camera of any perspective model.
@@ -60,7 +60,7 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
             raise ModelError(
                 f"camera {camera.model_name} {list(camera.params)} cannot be undistorted: give "
                 "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE, or keep the "
-                "distortion by --undistort 0"
+                "distortion with --undistort 0"
             )
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
@@ -74,7 +74,7 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
 def output_cameras(
     cameras: Mapping[int, pycolmap.Camera], *, undistort: bool
 ) -> dict[int, pycolmap.Camera]:
-    """The cameras of the written images by their ids: `pinhole_camera`, or those given.
+    """The cameras of the written images by id: pinhole cameras if `undistort`, else as given.
 
     Raises:
         ModelError: see `pinhole_camera`.
@@ -83,7 +83,7 @@ def output_cameras(
 
 
 def _project(camera: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of undistorted positions (x / z, y / z)."""
+    """Project undistorted positions (x / z, y / z) to pixels."""
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
 
@@ -114,7 +114,7 @@ def undistorted_masks(
         pinholes: the pinhole camera for each camera, by camera id.
     """
 
-    # As images of a camera follow one another, one map is kept: it takes much memory.
+    # Only one map is cached, because it takes much memory and images of a camera are consecutive.
     @functools.lru_cache(maxsize=1)
     def change_of(camera_id: int) -> Undistortion | None:
         return undistortion(of_id[camera_id], pinholes[camera_id], cv2.INTER_NEAREST)
@@ -176,10 +176,11 @@ class Undistortion:
 def undistortion(
     camera: pycolmap.Camera, pinhole: pycolmap.Camera, interpolation: int = cv2.INTER_CUBIC
 ) -> Undistortion | None:
-    """What undistorts the pictures of a camera.
+    """Create the map that undistorts the pictures of a camera.
 
     Returns:
-        None where they stay: the camera has no distortion, or is given as its own `pinhole`.
+        The map; None if the pictures need no change, because the camera has no distortion or
+        `pinhole` has distortion as well.
     """
     if is_undistorted(camera) or not is_undistorted(pinhole):
         return None

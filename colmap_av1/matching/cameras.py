@@ -1,4 +1,4 @@
-"""Cameras of images that have none yet: given, or estimated from tracks and metadata."""
+"""Create the cameras of new images from given intrinsics, tracks and metadata."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.facts import Video
 from colmap_av1.video.metadata.lens import said_focal_length
 
-# Focal lengths of tracks and of containers that differ by less than this factor agree.
-_AGREE = 1.2
+# Focal lengths from tracks and from the container agree if they differ by less than this factor.
+_MAX_FACTOR = 1.2
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Size and lens of the pictures of a video.
+    """Image size and focal length of a video.
 
     Attributes:
         size: (width, height) of the images in pixels.
         pixel_aspect: width of a pixel over its height.
-        focal_length: in pixel heights, from the container; None if it has none.
+        focal_length: in pixel heights, from the container; None if the container has none.
     """
 
     size: tuple[int, int]
@@ -45,7 +45,7 @@ class Shape:
 
 
 def shape_of(video: Video, size: tuple[int, int], pixel_aspect: float) -> Shape:
-    """The shape of images of a video."""
+    """Read the shape of a video's images."""
     return Shape(size, pixel_aspect, said_focal_length(video.tags, size, pixel_aspect))
 
 
@@ -54,7 +54,7 @@ class ImageCameras:
     """Cameras of images.
 
     Attributes:
-        of_images: the camera of each image; images share a camera if it is the same object.
+        of_images: the camera of each image; images that share a camera hold the same object.
         focal_length: estimated focal length of the first video, in pixel heights; None if it was
             not estimated.
         warnings: warnings about the cameras.
@@ -74,14 +74,14 @@ def new_cameras(
     *,
     context: RunContext,
 ) -> ImageCameras:
-    """Make a camera for each video, and for the photos of each camera and size.
+    """Create a camera for each video, and one for the photos of each physical camera and size.
 
-    Given intrinsics apply to videos. Otherwise the focal length of a video is estimated from its
-    tracks, or taken from its container; that of photos is taken from EXIF.
+    Given intrinsics apply to videos only. Without them, the focal length of a video is estimated
+    from its tracks or read from its container. Photos take their focal length from EXIF.
 
     Args:
         paired: the images.
-        image_set: the video of each image, or its photo.
+        image_set: maps each image to its video or photo.
         shapes: the shape of each video.
         photos: the photos.
         options: camera model, given intrinsics and sharing.
@@ -157,7 +157,7 @@ def shared_focal_length(
 
 
 def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
-    """Some of the images, ascending, with the pairs among them."""
+    """Select images, given in ascending order, and the pairs among them."""
     if len(images) == len(paired.keypoints):
         return paired
     place = np.full(len(paired.keypoints), -1, dtype=np.int32)
@@ -172,31 +172,31 @@ def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
 def _initial_focal_length(
     estimated: float | None, shape: Shape, model: str | None
 ) -> tuple[float | None, list[str]]:
-    """The focal length that a camera starts from, and warnings about it.
+    """Choose the initial focal length of a camera; also return warnings about it.
 
-    Tracks show the focal length of the pictures themselves. The container states that of the lens,
-    but the pictures may have been cropped for stabilization.
+    The estimate from tracks is preferred: the container states the focal length of the lens, and
+    stabilization may have cropped the pictures since.
     """
     stated = shape.focal_length
     if stated is None or not is_nearly_pinhole(model):
         return estimated, []
     if estimated is None:
         return stated, [
-            f"the motion does not determine the focal length: it starts from {stated:.0f} px, "
-            "which the container says"
+            "the focal length is not observable from the motion: the initial value is "
+            f"{stated:.0f} px, from the container"
         ]
-    if abs(math.log(estimated / stated)) <= math.log(_AGREE):
+    if abs(math.log(estimated / stated)) <= math.log(_MAX_FACTOR):
         return estimated, []
     return estimated, [
-        f"the focal length is {estimated:.0f} px by the tracks, {stated:.0f} px by the container: "
-        "that of the tracks is used, as the other does not know of crops"
+        f"the focal length is {estimated:.0f} px from the tracks, but {stated:.0f} px from the "
+        "container: the first is used, because the container does not account for cropping"
     ]
 
 
 def _sequences_by_camera(
     num_videos: int, photos: Sequence[Photo], options: CameraOptions
 ) -> list[list[int]]:
-    """The videos and photos of each camera."""
+    """Group the videos and photos by camera."""
     if options.single_camera:
         return [list(range(num_videos + len(photos)))]
     of_photos: dict[object, list[int]] = {}

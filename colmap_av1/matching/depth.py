@@ -1,4 +1,4 @@
-"""Whether matches determine depth, or come from a camera that only turns or zooms."""
+"""Test whether matches determine depth, or the camera only turns or zooms."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from colmap_av1.matching.image_matches import MatchedImages
 
 _Floats = NDArray[np.float64]
 
-# Focal lengths that are tried, in longer sides of the image. With longer ones a turn looks like a
-# camera that moves along a plane.
+# Focal lengths to try, in units of the longer image side. With longer ones, a rotation looks like
+# a translation along a plane.
 _FOCAL_LENGTHS = np.geomspace(0.4, 1.2, 14)
-# Pairs that are looked at, the one with the widest motion in each part of the images, and matches
-# of each.
+# Number of pairs to test (one in each part of the sequence), and matches used and needed per pair.
 _NUM_PAIRS = 40
 _NUM_MATCHES = 100
 LEAST_MATCHES = 30
-# A pair has parallax if this quantile of its residuals is above this length, in longer sides:
-# 0.4 to 0.5 degrees. Up to one pair in ten of a hand-held zoom exceeds it, as the lens changes its
-# distortion. So do more than half of the pairs of a flight over a plain, and nearly all pairs of
-# walks and drives.
+# A pair has parallax if this quantile of its residuals exceeds this length, in units of the longer
+# image side (0.4 to 0.5 degrees). Up to a tenth of the pairs of a hand-held zoom exceed it, because
+# zooming changes the lens distortion. More than half of the pairs of a flight over a plain exceed
+# it, and nearly all pairs of walks and drives.
 _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
-# Depth is not observable if fewer pairs than the first share have parallax, and unreliable if fewer
-# than the second.
-_FEWEST, _FEW = 0.25, 0.4
-# Gauss-Newton steps, and the residual from which on a match counts less, in longer sides: it is
-# halved from step to step.
+# Depth is not observable if a smaller share of the pairs than the first value has parallax, and
+# unreliable if a smaller share than the second has.
+_OBSERVABLE_SHARE, _RELIABLE_SHARE = 0.25, 0.4
+# Number of Gauss-Newton steps, and the scale of the robust loss in units of the longer image side.
+# The scale is halved after each step, down to the last value.
 _NUM_STEPS = 10
 _FIRST_LOSS, _LAST_LOSS = 0.032, 1e-3
-# Changes of a step are limited: radians, and the logarithm of the zoom, which is limited, too.
+# Limits of the change in one step (radians and logarithm of the zoom) and of the zoom's logarithm.
 _LARGEST_STEP, _LARGEST_ZOOM = 0.3, 2.0
-_BEHIND = 1e-3
+# Smallest depth of a rotated ray, to divide by.
+_MIN_DEPTH = 1e-3
 
 
 @dataclass(frozen=True)
 class DepthEvidence:
-    """How many pairs of images show parallax.
+    """Number of image pairs that show parallax.
 
     Attributes:
-        num_pairs: pairs that were looked at, those with the widest motion.
-        num_with_parallax: those whose motion no turn and zoom of the camera explains.
+        num_pairs: pairs that were tested, the ones with the widest motion.
+        num_with_parallax: pairs whose motion no rotation and zoom of the camera explains.
     """
 
     num_pairs: int
@@ -52,18 +52,18 @@ class DepthEvidence:
 
     @property
     def is_observable(self) -> bool:
-        """Whether the matches determine depth at all; so it is if no pair was looked at."""
-        return self.num_with_parallax >= _FEWEST * self.num_pairs
+        """Whether the matches determine depth at all; True if no pair was tested."""
+        return self.num_with_parallax >= _OBSERVABLE_SHARE * self.num_pairs
 
     @property
     def warning(self) -> str | None:
-        """What the user should know."""
+        """A warning about missing or rare parallax; None if there is enough."""
         if not self.is_observable:
             return (
                 "depth is not observable: the camera stands still, or only turns or zooms: film "
                 "while moving sideways, or give a longer part of the video"
             )
-        if self.num_with_parallax < _FEW * self.num_pairs:
+        if self.num_with_parallax < _RELIABLE_SHARE * self.num_pairs:
             return (
                 "in most parts of the images the camera only turns or zooms: the depth of points "
                 "may be unreliable there: film while moving sideways"
@@ -72,7 +72,7 @@ class DepthEvidence:
 
 
 def motion_spread(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """How far the displacements of matches [n, 2] differ, in pixels."""
+    """Spread of the displacements of matches [n, 2], in pixels."""
     motion = b.astype(np.float64) - a
     return float(np.hypot(*np.subtract(*np.quantile(motion, (0.9, 0.1), axis=0))))
 
@@ -84,20 +84,20 @@ def depth_evidence(
     matches: Callable[[int], NDArray[np.integer]],
     cameras: Sequence[pycolmap.Camera | None],
 ) -> DepthEvidence:
-    """Look for parallax in the pairs of images with the widest motion.
+    """Look for parallax in the image pairs with the widest motion.
 
-    A camera that turns and zooms maps one image to another by K2 R K1^-1 (Hartley and Zisserman,
-    8.4.2), whatever the depth. This map is fitted to each pair, for a range of focal lengths of the
-    first image, as a zoom makes any estimate of it meaningless. A plane seen by a camera that moves
-    sideways fits it only with focal lengths beyond this range.
+    If the camera only turns and zooms, K2 R K1^-1 maps one image to the other at any depth (Hartley
+    and Zisserman, 8.4.2). This homography is fitted to each pair for a range of focal lengths of
+    the first image, because a zoom makes an estimated focal length meaningless. A plane seen by a
+    camera that moves sideways fits it only with focal lengths beyond this range.
 
     Args:
         keypoints: float32 [n, 2] of each image, in pixels, first pixel's centre at (0.5, 0.5).
         pairs: [m, 2] indices of images.
         spread: float64 [m] the spread of each pair's motion, see `motion_spread`.
         matches: returns the verified matches of a pair, [n, 2] indices of keypoints.
-        cameras: the camera of each image; its distortion is taken out. Pairs of images without one
-            are left out.
+        cameras: the camera of each image, used to undistort keypoints. Pairs with an image that
+            has no camera are skipped.
     """
     rng = np.random.default_rng(0)
     parallax = []
@@ -137,21 +137,22 @@ def depth_of_images(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) 
 
 
 def _centred(xy: NDArray[np.float32], camera: pycolmap.Camera) -> _Floats:
-    """Undistorted positions from the principal point, in longer sides of the image."""
+    """Undistorted positions relative to the principal point, in units of the longer image side."""
     focal_length = camera.mean_focal_length() / max(camera.width, camera.height)
     rays = np.asarray(camera.cam_from_img(xy.astype(np.float64)), np.float64)
     return np.asarray(rays[:, :2] * focal_length)
 
 
 def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
-    """Distances of matches from the turn and zoom that fits them, for each focal length tried.
+    """Fit a rotation and zoom to matches for each focal length, and return the residuals.
 
     Args:
         a: float64 [n, 2] in the first image, see `_centred`.
         b: float64 [n, 2] in the second image.
 
     Returns:
-        float64 [num_focal_lengths, n] in longer sides; those of a zoom in are divided by it.
+        float64 [num_focal_lengths, n] in units of the longer image side, divided by the zoom if
+        that is above 1.
     """
     focal = _FOCAL_LENGTHS[:, None]
     rays = np.stack(
@@ -162,7 +163,7 @@ def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
         ],
         axis=1,
     )
-    # A similarity is a good first guess, also where the camera rolls.
+    # A similarity is a good initial value, even if the camera rolls.
     complex_a, complex_b = ((x - np.median(x, axis=0)) @ np.array([1.0, 1.0j]) for x in (a, b))
     similarity = np.vdot(complex_a, complex_b) / max(np.vdot(complex_a, complex_a).real, 1e-12)
     roll = float(np.angle(similarity))
@@ -173,13 +174,13 @@ def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
     loss = _FIRST_LOSS
     for step in range(_NUM_STEPS + 1):
         x, y, z = np.moveaxis(rotation @ rays, 1, 0)
-        x, y = x / np.maximum(z, _BEHIND), y / np.maximum(z, _BEHIND)
+        x, y = x / np.maximum(z, _MIN_DEPTH), y / np.maximum(z, _MIN_DEPTH)
         scale = focal * np.exp(zoom)[:, None]
         residual = np.stack([scale * x - b[:, 0], scale * y - b[:, 1]], axis=2)
         distance = np.hypot(residual[..., 0], residual[..., 1])
         if step == _NUM_STEPS:
             break
-        # Derivatives by a turn about each axis, and by the logarithm of the zoom.
+        # Derivatives with respect to a rotation about each axis and the logarithm of the zoom.
         jacobian = scale[..., None, None] * np.stack(
             [
                 np.stack([-x * y, 1 + x * x, -y, x], axis=2),

@@ -1,4 +1,4 @@
-"""The focal length, estimated from tracks by least epipolar errors of image pairs."""
+"""Estimate the focal length by minimizing the epipolar errors of image pairs."""
 
 from __future__ import annotations
 
@@ -15,28 +15,30 @@ from colmap_av1.matching.two_view_models import poselib_camera
 
 _Floats = NDArray[np.float64]
 
-# Focal lengths that are tried, in longer sides of the image: fields of view from 127 to 18 degrees.
+# Focal lengths to try, in units of the longer image side: fields of view from 127 to 18 degrees.
 _SHORTEST, _LONGEST, _NUM_TRIED = 0.25, 3.2, 17
-# Of a fisheye picture, how far from the centre matches count, in longer sides: beyond, errors of
-# a pixel are several on a plane; and the widest angle to the axis, in radians.
-_MIDDLE, _WIDEST = 0.35, 1.4
-# Pairs that are looked at, one of each part of the video, and matches of each; about so many
-# matches show which pair of a part has the widest parallax.
+# A fisheye image is used up to this distance from its centre, in units of the longer image side:
+# farther out, an error of a pixel becomes several pixels on the plane of a pinhole camera.
+_FISHEYE_RADIUS = 0.35
+# Largest angle between a fisheye ray and the optical axis, in radians.
+_WIDEST = 1.4
+# Number of pairs (one in each part of the video) and of matches per pair. About the third number
+# of matches of each candidate is enough to choose the pair with the widest parallax.
 _NUM_PAIRS = 40
 _NUM_MATCHES = 200
 _NUM_GLANCED = 64
 _MIN_PAIRS = 8
 _MIN_MATCHES = 50
-# Error in pixels from which on a match counts less (Cauchy's loss).
+# Scale of the Cauchy loss in pixels.
 _LOSS_SCALE = 0.5
-# A loss far below the precision of tracks means no more than this one.
+# Added to a loss before its logarithm: differences far below the precision of tracks are noise.
 _LEAST_LOSS = 1e-3
-# A pose is searched with some of the matches and refined with all.
+# A pose is estimated from this many matches and refined with all.
 _NUM_SEARCHED = 64
 _RANSAC = {"max_epipolar_error": 2.0, "max_iterations": 20, "min_iterations": 15}
 _REFINEMENT = {"max_iterations": 12, "loss_type": "CAUCHY", "loss_scale": _LOSS_SCALE}
-# By how much the loss has to rise where the focal length is half or twice as long, and how far
-# apart the focal lengths of every second pair and of the others may be, as a factor.
+# The estimate is rejected unless the loss rises by the first factor at half and at twice the focal
+# length, or if the estimates from even and odd pairs differ by more than the second factor.
 _MIN_RISE = 1.03
 _MAX_FACTOR = 1.3
 
@@ -53,11 +55,11 @@ def estimate_focal_length(
 ) -> float | None:
     """Estimate the focal length that all images share.
 
-    For each of a range of focal lengths relative poses are fitted to pairs of wide parallax; the
-    robust loss of their epipolar errors, its geometric mean over the pairs, is least at the true
-    one. A single pair says little, many together do. The principal point counts as the centre, the
-    lens as free of distortion, or as an equidistant fisheye lens, of which the picture's middle is
-    looked at: a first guess for the mapper, a few per cent off.
+    Relative poses are fitted to pairs with wide parallax for a range of focal lengths. The true
+    focal length minimizes the geometric mean over all pairs of the robust epipolar loss; a single
+    pair determines it poorly. The principal point is assumed to be the image centre, and the lens
+    to be free of distortion, or an equidistant fisheye lens, of which only the middle of the image
+    is used. The result is an initial value for the mapper, a few per cent off.
 
     Args:
         keypoints: the images' keypoints.
@@ -65,13 +67,13 @@ def estimate_focal_length(
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
         size: (width, height) of the images in pixels.
         pixel_aspect: width of a pixel over its height.
-        fisheye: the lens is one.
+        fisheye: whether the lens is a fisheye lens.
         seed: the random seed.
 
     Returns:
-        The focal length in pixel heights; None where the motion does not determine it, as
-        where the camera moves along its axis, or in a plane circle around what it looks at, or
-        where there are too few matches.
+        The focal length in pixel heights. None if it is not observable, for example if the camera
+        moves along its axis or in a flat circle around what it looks at, or if there are too few
+        matches.
     """
     shape = np.array([pixel_aspect, 1.0])
     centre = np.array(size) * shape / 2
@@ -84,7 +86,7 @@ def estimate_focal_length(
         xb = keypoints[j].xy[rows[:, 1]].astype(np.float64) * shape - centre
         if fisheye:
             near = np.hypot(*xa.T), np.hypot(*xb.T)
-            middle = np.maximum(*near) <= _MIDDLE * 2 * max(centre)
+            middle = np.maximum(*near) <= _FISHEYE_RADIUS * 2 * max(centre)
             xa, xb = xa[middle], xb[middle]
             if len(xa) < _MIN_MATCHES:
                 continue
@@ -104,8 +106,8 @@ def estimate_focal_length(
                     of_pose = pose_loss(xa, xb, float(tried[k]), seed)
                     loss[row, k] = math.log(of_pose + _LEAST_LOSS)
 
-    # Half of the pairs show roughly where to look with all of them, until the lowest loss of all
-    # and of either half lies between others.
+    # Half of the pairs locate the minimum roughly. Then all pairs are evaluated around the minimum
+    # of all and of either half, until each of these minima lies between evaluated samples.
     measure(range(0, len(views), 2), range(0, _NUM_TRIED, 2))
     rough = loss[::2].mean(axis=0)
     best = {int(np.nanargmin(rough))}
@@ -130,7 +132,7 @@ def estimate_focal_length(
 
 
 def _as_pinhole(x: _Floats, focal_length: float) -> _Floats:
-    """Where a pinhole camera sees what an equidistant lens of its focal length sees at x."""
+    """Map points of an equidistant fisheye image to a pinhole image with the same focal length."""
     away = np.hypot(*x.T)
     angle = np.minimum(away / focal_length, _WIDEST)
     return np.asarray(x * (focal_length * np.tan(angle) / np.maximum(away, 1e-9))[:, None])
@@ -142,7 +144,7 @@ def _widest_pairs(
     matches: Sequence[NDArray[np.uint32]],
     shape: _Floats,
 ) -> list[int]:
-    """The pair with the most parallax in each part of the video, in order."""
+    """Find the pair with the most parallax in each part of the video, in order."""
     widest: dict[int, tuple[float, int]] = {}
     for pair, ((i, j), rows) in enumerate(zip(pairs.tolist(), matches, strict=True)):
         if len(rows) < _MIN_MATCHES:
@@ -158,7 +160,7 @@ def _widest_pairs(
 
 
 def _median(values: NDArray[Any]) -> NDArray[Any]:
-    """The median along the first axis, for few values in a fraction of the time of NumPy's."""
+    """The median along the first axis; for few values much faster than `numpy.median`."""
     ordered = np.sort(values, axis=0)
     half = len(values) // 2
     return np.asarray((ordered[half] + ordered[-half - 1]) / 2)
@@ -178,7 +180,7 @@ def pose_loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float
 
 
 def lowest(at: _Floats, value: _Floats) -> float | None:
-    """Where a curve is lowest, by a parabola; None at an end. Samples that are NaN are left out."""
+    """Find the minimum of a curve with a parabola, skipping NaN; None if it is at an end."""
     k = int(np.nanargmin(value))
     if k in (0, len(at) - 1):
         return None

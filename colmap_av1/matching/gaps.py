@@ -1,7 +1,7 @@
-"""Gaps: neighbouring images of a video that motion connects badly, and why.
+"""Find gaps: neighbouring images of a video that motion connects badly.
 
-Before images are matched, the share of inter coded units shows where an encoder found no motion.
-After that, the number of matches across a gap shows how well it is connected.
+Before images are matched, a low share of inter-coded units shows that the encoder found no motion.
+After matching, the number of matches across a gap shows how well its images are connected.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from colmap_av1.options import LinkOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.spread import evenly_spread
 
-# Frames on either side that a frame is compared with.
+# Number of frames on either side that a frame is compared with.
 _NEIGHBOURS = 8
 # A frame has a low inter share if it is below the first value, or below the second value times the
-# median of its neighbours. Where a camera jerks or a picture is blurred, an encoder finds no motion
-# and codes the picture anew: 2 to 24 % inter units where the frames around have 45 to 95 %, or half
-# of their share where it finds what merely compresses well. Nearly all ordinary frames have more.
+# median of its neighbours. If the camera jerks or a picture is blurred, the encoder finds no motion
+# and codes the picture anew: 2 to 24 % inter units where the neighbours have 45 to 95 %, or half of
+# their share if it uses vectors that merely compress well. Nearly all ordinary frames have more.
 # Nearly no ordinary frame is below the third value times the median.
 _LEAST_INTER_SHARE = 0.25
 _LEAST_OF_NEIGHBOURS = 0.55
 _CERTAINLY_LESS = 0.4
-# At this median share of inter units, motion is trusted. 85 % is usual; a drive has 50 to 60 %.
+# With this median share of inter units, motion is trusted. 85 % is usual; a drive has 50 to 60 %.
 _HIGH_INTER_SHARE = 0.6
-# Gaps that are probed below that.
+# Number of gaps to probe if the share is lower.
 _NUM_PROBES = 6
 # The motion of a video needs no probes if neighbouring images have this many matches and this share
-# of inliers (medians). A drive has 2,000 and 99.8 %. Where a camera is too fast for an encoder's
-# search, there are 20 matches, or 150 with 90 % inliers.
+# of inliers (medians). A drive has 2,000 and 99.8 %. A camera that is too fast for the encoder's
+# motion search gives 20 matches, or 150 with 90 % inliers.
 _RIGID_MATCHES = 300
 _RIGID_SHARE = 0.98
-# Few matches cross a gap if there are fewer than this share of the usual number. Where a camera
-# jerks it is 5 to 37 %; on clips without jerks 53 % and more, matched along motion or by SIFT.
-# Models that COLMAP's mappers bent at a jerk by 0.7 to 1 % of their extent had 5 to 25 %.
+# A gap has few matches if they are fewer than this share of the usual number. Camera jerks leave 5
+# to 37 %, clips without jerks have 53 % and more, with matches from motion or from SIFT. Models
+# that COLMAP's mappers bent at a jerk by 0.7 to 1 % of their extent had 5 to 25 %.
 _FEW = 0.4
-# The usual number is that of up to this many gaps before and after.
+# The usual number comes from up to this many gaps before and after.
 _NEARBY = 10
-# A stretch of frames is fast if only a small share of the tracks in each frame lasts for ten more
-# frames, or had lasted for ten: below the first share throughout, and below the second in at least
-# one frame. The median share is 12 % on a walk with fast turns (`cafe`). The smallest is 16 % on a
-# drive at 10 frames a second (`street`), whose tracks still connect the images well, and 23 % on a
-# hand-held clip (`log_building`).
+# A stretch of frames is fast if few tracks of a frame last for ten more frames or began ten frames
+# before: a share below the first value in every frame, and below the second in at least one. The
+# median share is 12 % on a walk with fast turns (`cafe`). The minimum is 16 % on a drive at 10
+# frames per second (`street`), whose tracks still connect the images well, and 23 % on a hand-held
+# clip (`log_building`).
 _LASTING_SHARE, _FEW_LASTING = 0.2, 0.15
 _LASTING_FRAMES = 10
-# Gaps that a warning names.
+# Number of gaps that a warning names.
 _NUM_NAMED = 3
 
 GapReason = Literal["low inter share", "few tracks", "contradicted", "no overlap"]
@@ -125,10 +125,10 @@ def low_inter_gaps(
 
 
 def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
-    """Find frames around which tracks end soon, as the camera turns or moves fast.
+    """Find frames in which most tracks are short, because the camera turns or moves fast.
 
     Args:
-        tracks: all tracks of a video. A selection has other shares.
+        tracks: all tracks of a video, not a selection.
 
     Returns:
         bool [num_frames].
@@ -146,13 +146,13 @@ def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
         return np.zeros(count, np.bool_)
     lasting = last - first >= _LASTING_FRAMES
     first_lasting, last_lasting = first[lasting], last[lasting]
-    # Where all tracks end at once, as at a jerk, they last on one side of it.
+    # All tracks end at a jerk, but they still last on one side of it.
     most = np.maximum(
         num_seen(first_lasting, last_lasting - _LASTING_FRAMES),
         num_seen(first_lasting + _LASTING_FRAMES, last_lasting),
     )
     share = most / np.maximum(num_seen(first, last), 1)
-    # Tracks in some frames alone, as those of images, say nothing of the frames beyond these.
+    # Frames before the first and after the last track take the share of the nearest frame with one.
     begin, end = int(first.min()), int(last.max())
     share[:begin], share[end + 1 :] = share[begin], share[end]
     around = np.pad(share, _LASTING_FRAMES // 2, mode="edge")
@@ -173,8 +173,8 @@ def may_link(
 ) -> bool:
     """Whether pictures are examined if no two images share enough tracks.
 
-    They may connect the images, or show why there are no tracks. A video that is shorter than
-    `min_length`, the fewest frames of a track, needs no pictures for that.
+    The pictures may connect the images, or show why there are no tracks. That reason is clear
+    without them if the video is shorter than `min_length`, the fewest frames of a track.
     """
     lacks_tracks = tracks.num_tracks == 0 and tracks.num_frames >= min_length
     return links.links == "sift" or (
@@ -185,10 +185,10 @@ def may_link(
 def probed_gaps(
     inter_share: NDArray[np.float32], low: NDArray[np.bool_], options: LinkOptions
 ) -> list[int]:
-    """Gaps whose motion is compared with pictures to decide whether to trust the whole video's.
+    """Choose gaps at which to compare motion with the pictures, to decide whether to trust it.
 
-    Empty if most units are inter coded. Where a camera is too fast for an encoder's search, the
-    encoder takes what compresses well, and that need not be motion.
+    Empty if most units are inter-coded. If the camera is too fast for the encoder's motion search,
+    the encoder uses whatever vectors compress well, which need not be motion.
     """
     if options.links == "none" or len(inter_share) < 2:
         return []
@@ -205,7 +205,7 @@ class SuspectGaps:
     Attributes:
         certain: bool [num_images - 1] gaps with a low inter share.
         maybe: bool [num_images - 1] gaps with a lowered inter share that may be ordinary.
-        probes: other gaps, that stand for all gaps of their video.
+        probes: other gaps, a sample of all gaps of their video.
     """
 
     certain: NDArray[np.bool_]
@@ -219,7 +219,7 @@ def suspect_gaps(
     inter_share: NDArray[np.float32],
     options: LinkOptions,
 ) -> SuspectGaps:
-    """Find the gaps whose motion may be wrong. No motion crosses from one video to another."""
+    """Find the gaps whose motion may be wrong; the gap between two videos is never one of them."""
     certain = np.zeros(max(len(image_set.sequence) - 1, 0), dtype=np.bool_)
     maybe, probes = np.zeros_like(certain), list[int]()
     for video in range(len(image_set.videos)):
@@ -255,20 +255,20 @@ def few_match_gaps(
     names: Sequence[str],
     videos: Sequence[Hashable],
 ) -> tuple[Gap, ...]:
-    """Find gaps that far fewer matches cross than the gaps before and after.
+    """Find gaps with far fewer matches across them than across the gaps before and after.
 
-    Gaps that nothing crosses are left out: there the images become separate models.
+    Gaps without any matches are left out: the images on either side become separate models.
 
     Args:
-        pairs: integers [m, 2] indices of images, of the pairs that mappers use.
-        num_inliers: integers [m] their verified matches.
+        pairs: integers [m, 2] image indices of the pairs that mappers use.
+        num_inliers: integers [m] verified matches of each pair.
         names: names of the images; their natural order is the order in time.
-        videos: for each image what identifies its video, see `videos_of`.
+        videos: identifies the video of each image, see `videos_of`.
     """
     rows: dict[Hashable, list[int]] = {}
     for i in natural_order(names):
         rows.setdefault(videos[i], []).append(i)
-    # Videos one after the other, so that no pair of one video crosses a gap of another.
+    # Order the images by video, so that no pair of one video crosses a gap of another.
     order = [i for own in rows.values() for i in own]
     place, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
     place[order] = np.arange(len(order))
@@ -292,10 +292,10 @@ def few_match_gaps(
 
 
 def _share_of_usual(across: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Matches across each gap over those across gaps nearby, on the side where these are fewer.
+    """Matches across each gap over the most across nearby gaps, on the side where that is less.
 
-    A gap that nothing crosses ends the comparison, as another model begins there. Its own share
-    is 1.
+    The comparison stops at a gap without matches, because another model begins there. The share of
+    such a gap is 1.
     """
     share = np.ones(len(across))
     joined = np.flatnonzero(across)
@@ -309,7 +309,7 @@ def _share_of_usual(across: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
-    """The warning about gaps that few matches cross; None if there are none."""
+    """Warn of gaps with few matches; None if there are none."""
     if not gaps:
         return None
     shown = ", ".join(f"'{gap.before}' and '{gap.after}'" for gap in gaps[:_NUM_NAMED])
@@ -317,15 +317,15 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
     others = f" and at {more} more {'place' if more == 1 else 'places'}" if more > 0 else ""
     least = min(gap.share for gap in gaps)
     return (
-        f"few matches, down to {least:.0%} of the usual number, cross between {shown}{others}, "
-        "where the camera jerks or frames are missing: COLMAP's mappers may bend the model there "
-        "by one per cent of its extent without any other sign; run reconstruct instead, which "
-        "uses the pictures, or film more slowly"
+        f"few matches, down to {least:.0%} of the usual number, between {shown}{others}, where the "
+        "camera jerks or frames are missing: COLMAP's mappers may bend the model there by one per "
+        "cent of its extent without any other sign; run reconstruct instead, which uses the "
+        "pictures, or film more slowly"
     )
 
 
 def matching_warnings(matched: MatchedImages, image_set: ImageSet) -> list[str]:
-    """Warnings about gaps between images of a video that few matches cross."""
+    """Warn of gaps with few matches between images of a video."""
     used, counts = used_pairs(matched)
     gaps = few_match_gaps(
         matched.pairs[used], counts[used], image_set.images.names, image_set.sequence.tolist()

@@ -1,4 +1,4 @@
-"""Images matched along tracks, and the matches verified."""
+"""Match images along tracks and verify the matches."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PairedImages:
 
     @property
     def track_lengths(self) -> NDArray[np.int64]:
-        """Number of images that see each of the tracks that the keypoints belong to."""
+        """Number of images that observe each track of the keypoints."""
         counts = np.bincount(np.concatenate([k.track for k in self.keypoints]))
         return counts[counts > 0].astype(np.int64)
 
@@ -71,13 +71,13 @@ def pair_images(
     """Match the images of a video along its tracks.
 
     Args:
-        video: the file that messages name.
+        video: path of the video, for messages.
         tracks: tracks of the whole video.
         chosen: the images.
         options: which images are paired.
         min_length: fewest frames of a track.
         context: its clock and progress get the stage "pairs".
-        needed: refuse a video in which no two images share enough tracks.
+        needed: raise if no two images share enough tracks.
 
     Raises:
         VideoError: no two images share enough tracks.
@@ -87,8 +87,8 @@ def pair_images(
         pairs = schedule_pairs(keypoints, options)
         if needed and tracks.num_frames < min_length:
             raise VideoError(
-                f"{video}: tracks are of {min_length} frames or more, the video has "
-                f"{tracks.num_frames}: give a longer video, or --min_length 2"
+                f"{video}: the video has {tracks.num_frames} frames, a track needs {min_length}: "
+                "give a longer video, or --min_length 2"
             )
         if needed and len(pairs) == 0:
             raise nothing_to_match(video, options)
@@ -100,7 +100,7 @@ def pair_images(
 
 
 def nothing_to_match(video: Path | str, options: PairOptions) -> VideoError:
-    """The error if no two images have enough matches."""
+    """The error to raise if no two images have enough matches."""
     return VideoError(
         f"{video}: no two images share {options.min_matches} tracks, so there is nothing to "
         "match: use more frames as images, or see 'colmap-av1 info --video' for what the stream "
@@ -109,10 +109,10 @@ def nothing_to_match(video: Path | str, options: PairOptions) -> VideoError:
 
 
 def join_videos(videos: Sequence[PairedImages], image_set: ImageSet) -> PairedImages:
-    """All images, those of each video paired among themselves.
+    """Join the images of all videos, and add the photos without keypoints.
 
     Args:
-        videos: the images of each video. A single one without photos is returned as it is.
+        videos: the images of each video. A single video without photos is returned unchanged.
         image_set: all images.
     """
     if image_set.num_sequences == 1:
@@ -147,7 +147,7 @@ def verify_images(
 
     Args:
         paired: the images and their matches.
-        cameras: the camera of all images, or one for each.
+        cameras: one camera for all images, or one for each.
         options: thresholds and effort.
         context: its clock and progress get the stage "verification".
     """
@@ -167,7 +167,7 @@ def verify_images(
 
 
 def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
-    """Whether COLMAP's mapper would take most pairs for forward motion and not start with them.
+    """Whether COLMAP's mapper would reject most pairs as initial pairs because of forward motion.
 
     Only pairs with known intrinsics have a direction of motion.
     """
@@ -176,13 +176,13 @@ def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
 
 
 def used_pairs(matched: MatchedImages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which pairs mappers use, bool [m], and the number of inliers of each pair, int64 [m]."""
+    """Return which pairs mappers use, bool [m], and the inliers of each pair, int64 [m]."""
     counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
     configs = [geometry.config for geometry in matched.geometries]
     return (counts >= MIN_INLIERS) & ~np.isin(configs, UNUSED_CONFIGS), counts
 
 
 def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
-    """For each image the number of its connected component: int32 [num_images]."""
+    """Label each image with its connected component, int32 [num_images]."""
     used, _ = used_pairs(matched)
     return connected_components(len(matched.keypoints), matched.pairs[used])

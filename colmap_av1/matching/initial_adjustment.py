@@ -1,4 +1,4 @@
-"""Pairs from which COLMAP's incremental mapper would adjust a camera far off."""
+"""Find initial pairs whose bundle adjustment in COLMAP's mapper makes the intrinsics diverge."""
 
 from __future__ import annotations
 
@@ -24,30 +24,32 @@ from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 
 _Floats = NDArray[np.float64]
 
-# The mapper looks for a first pair in the images of most matches, in as many at a time as there
-# are cores, and takes what is found first; where nothing is, in all others.
-_NUM_FIRST_IMAGES, _NUM_LOOKED = 16, 100
-# It searches a pair's pose anew, at random and with so many trials at least, within 4 px: what it
-# takes at one time it leaves at another where it is this close to its limits, as a factor of the
-# inliers and the angle and in forward motion.
+# The mapper looks for an initial pair among the images with the most matches, one image per core at
+# a time, and takes the first it finds; if it finds none, it goes on to the other images. Here, at
+# least the first number of images and at most the second are tried.
+_NUM_FIRST_IMAGES, _MAX_IMAGES = 16, 100
+# The mapper estimates a pair's pose anew by RANSAC: fewest trials, and largest error in pixels.
 _NUM_TRIALS, _MAX_ERROR = 30, 4.0
+# Estimates of each pair's pose, with different seeds.
 _NUM_SEEDS = 2
+# The mapper may accept or reject a pair this close to its limits at random: a factor of the inliers
+# and the angle, and a difference in forward motion.
 _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
-# Matches that show whether to search at all, and the share of the angle that they have to.
-_NUM_GLANCED = 64
-_LEAST = 0.75
-# Share of its triangulation angle that the rotation of a pair may be off by, and by which two
-# searches find the same pose.
+# A quick test with about this many inliers rejects pairs below this share of the angle.
+_NUM_QUICK = 64
+_QUICK_SHARE = 0.75
+# Rotations differ if the angle between them exceeds this share of the triangulation angle: from a
+# known rotation, and between two estimates of the same pair.
 _WRONG, _SAME = 0.25, 0.05
-# How far a focal length may be adjusted, as a factor, and a distortion parameter, by addition. The
-# mapper registers no images beside such whose parameters passed 1.
-_FAR, _DISTORTED = 2.0, 0.5
-# The limits of the mapper itself: focal lengths in longer sides of the image, distortion
+# Intrinsics diverge if a focal length changes by more than this factor, or a distortion parameter
+# by more than this difference. The mapper registers no images once distortion exceeds 1.
+_MAX_FOCAL_FACTOR, _MAX_DISTORTION_CHANGE = 2.0, 0.5
+# The mapper's limits: focal lengths in units of the longer image side, distortion
 # (min_focal_length_ratio, max_focal_length_ratio, max_extra_param).
-_SANE = 0.1, 10.0, 1.0
-# Points that show where the adjustment of a pair ends.
+_MAPPER_LIMITS = 0.1, 10.0, 1.0
+# About this many points are adjusted.
 _NUM_ADJUSTED = 200
-# As the mapper where there are few images.
+# The mapper's settings for few images.
 _NUM_ITERATIONS, _GRADIENT_TOLERANCE = 100, 0.1
 
 
@@ -56,9 +58,9 @@ class PairInliers:
     """The inliers of a pair.
 
     Attributes:
-        cameras: that of the first image and of the second.
+        cameras: the cameras of the first and the second image.
         xy: float64 [n, 2] of each image, in pixels.
-        x: float64 [2, n] of each image, normalised coordinates without distortion.
+        x: float64 [2, n] of each image, normalised undistorted coordinates.
     """
 
     cameras: tuple[pycolmap.Camera, pycolmap.Camera]
@@ -83,38 +85,41 @@ def inliers_of(
         matched.keypoints[image].xy[chosen].astype(np.float64)
         for image, chosen in zip(pair, geometry.inlier_matches.T, strict=True)
     )
-    return _seen((cameras[pair[0]], cameras[pair[1]]), (a, b))
+    return _in_front((cameras[pair[0]], cameras[pair[1]]), (a, b))
 
 
-def _seen(
+def _in_front(
     cameras: tuple[pycolmap.Camera, pycolmap.Camera], xy: tuple[_Floats, _Floats]
 ) -> PairInliers:
-    """The matches that have a ray in front of both cameras."""
+    """Select the matches that have a ray in front of both cameras."""
     a, b = (
         np.asarray(camera.cam_from_img(own), dtype=np.float64)
         for camera, own in zip(cameras, xy, strict=True)
     )
-    # Some pixels of a wide lens have none.
+    # Some pixels of a wide lens have no such ray.
     known = np.isfinite(a + b).all(axis=1)
     return PairInliers(cameras, (xy[0][known], xy[1][known]), (a[known].T, b[known].T))
 
 
 def pose_of_homography(H: _Floats, inliers: PairInliers) -> _Floats:
-    """The pose that COLMAP's mapper takes from a homography, float64 [3, 4]."""
+    """Decompose a homography into a pose as COLMAP's mapper does, float64 [3, 4]."""
     matrices = [camera.calibration_matrix() for camera in inliers.cameras]
     found = pycolmap.pose_from_homography_matrix(H, *matrices, *(own.T for own in inliers.rays))
     return np.asarray(found["cam2_from_cam1"].matrix())
 
 
 def pose_of_essential(E: _Floats, inliers: PairInliers) -> _Floats:
-    """The pose by an essential matrix that has most inliers in front, float64 [3, 4]."""
+    """Decompose an essential matrix into the pose with the most points in front of both cameras.
+
+    Returns float64 [3, 4].
+    """
     a, b = (np.ascontiguousarray(own.T) for own in inliers.x)
     _, rotation, translation, _ = cv2.recoverPose(E, a, b, np.eye(3))
     return np.column_stack([rotation, translation])
 
 
 def triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
-    """Triangulation angle of the matches in degrees, by the rotation to the second camera."""
+    """Median triangulation angle of matches in degrees, given the rotation to the second camera."""
     cosine = ((rotation @ rays[0]) * rays[1]).sum(axis=0)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 
@@ -127,16 +132,16 @@ def _angle_between(rotation: _Floats, other: _Floats) -> float:
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Poses that those of pairs are compared with.
+    """Known poses, which the poses of pairs are compared with.
 
     Attributes:
-        cam_from_world: float64 [3, 4] of each image; None where it is not known; empty: none is.
+        cam_from_world: float64 [3, 4] of each image, None if not known; empty if none is known.
     """
 
     cam_from_world: Sequence[_Floats | None] = ()
 
     def rotation(self, pair: Sequence[int]) -> _Floats | None:
-        """The rotation from the first camera of a pair to the second; None: it is not known."""
+        """The rotation from the first camera of a pair to the second; None if not known."""
         if not self.cam_from_world:
             return None
         first, second = (self.cam_from_world[image] for image in pair)
@@ -145,14 +150,14 @@ class KnownPoses:
         return np.asarray(second[:, :3] @ first[:, :3].T)
 
     def contradict(self, pair: Sequence[int], rotation: _Floats, angle: float) -> bool:
-        """Whether a rotation of a pair is wrong by much of the triangulation angle it leads to."""
+        """Whether a pair's rotation is off by a large share of its triangulation angle."""
         known = self.rotation(pair)
         return known is not None and _angle_between(rotation, known) > _WRONG * angle
 
     def misleading_pairs(
         self, matched: MatchedImages, cameras: Sequence[pycolmap.Camera]
     ) -> list[int]:
-        """Find pairs with a wrong two-view pose whose angle is wide enough for an initial pair.
+        """Find pairs with a wrong pose and an angle that is wide enough for an initial pair.
 
         Args:
             matched: the images.
@@ -166,12 +171,14 @@ class KnownPoses:
                 continue
             if self.rotation(pair) is None:
                 continue
-            glanced = _glanced(matched, cameras, pair, geometry)
-            pose = _pose(geometry, glanced)
+            some = _some_inliers(matched, cameras, pair, geometry)
+            pose = _pose(geometry, some)
             if pose is None:
                 continue
-            angle = triangulation_angle(pose[:, :3], glanced.rays)
-            if angle >= _LEAST * INITIAL_LEAST_ANGLE and self.contradict(pair, pose[:, :3], angle):
+            angle = triangulation_angle(pose[:, :3], some.rays)
+            if angle >= _QUICK_SHARE * INITIAL_LEAST_ANGLE and self.contradict(
+                pair, pose[:, :3], angle
+            ):
                 found.append(k)
         return found
 
@@ -181,21 +188,21 @@ def runaway_starts(
     cameras: Sequence[pycolmap.Camera],
     known: KnownPoses = KnownPoses(),
 ) -> list[int]:
-    """Find pairs that would begin a model with a camera that is adjusted far off.
+    """Find initial pairs with which bundle adjustment makes the intrinsics diverge.
 
-    The mapper adjusts focal length and distortion to its first two images alone. Where a hundred
-    matches leave these open, they may end anywhere: no third image joins, and the mapper writes
-    the two as its first model. Pairs are looked at in the mapper's order, those of each image up
-    to one that it takes for certain and that holds.
+    The mapper first adjusts focal length and distortion to two images alone. If their matches do
+    not determine these, the values may end anywhere: no third image registers, and the mapper
+    writes the two images as its first model. Pairs are tried in the mapper's order, for each image
+    up to the first pair that the mapper certainly accepts and that is stable.
 
     Args:
         matched: the images.
         cameras: the camera of each image.
-        known: poses that a pair's own must not contradict.
+        known: known poses, which the pose of a pair must not contradict.
 
     Returns:
-        Indices of pairs. Empty without known poses if no pair that is looked at holds: the mapper
-        then fares no better with another.
+        Indices of pairs. Empty if no poses are known and no tried pair is stable, as no other pair
+        would then be a better start.
     """
     starts: dict[int, _Start | None] = {}
     num_certain = 0
@@ -205,19 +212,19 @@ def runaway_starts(
         for k in of_image:
             if k not in starts:
                 pair = matched.pairs[k].tolist()
-                starts[k] = _look(matched, cameras, pair, matched.geometries[k], known)
+                starts[k] = _try_start(matched, cameras, pair, matched.geometries[k], known)
             start = starts[k]
-            if start is not None and start.holds and start.is_certain:
+            if start is not None and start.is_stable and start.is_certain:
                 num_certain += 1
                 break
-    holds = {k: start.holds for k, start in starts.items() if start is not None}
-    if not (known.cam_from_world or any(holds.values())):
+    stable = {k: start.is_stable for k, start in starts.items() if start is not None}
+    if not (known.cam_from_world or any(stable.values())):
         return []
-    return [k for k in sorted(holds) if not holds[k]]
+    return [k for k in sorted(stable) if not stable[k]]
 
 
 def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Iterator[list[int]]:
-    """The pairs of each image that the mapper looks at first, those of most matches first."""
+    """Yield the pairs of each image in the order in which the mapper tries images and pairs."""
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
     used = np.where(counts >= MIN_INLIERS, counts, 0)
     pairs = matched.pairs.reshape(-1, 2)
@@ -225,7 +232,7 @@ def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Ite
     for side in pairs.T:
         np.add.at(totals, side, used)
     known = np.array([camera.has_prior_focal_length for camera in cameras], dtype=bool)
-    for image in np.lexsort((-totals, ~known))[:_NUM_LOOKED]:
+    for image in np.lexsort((-totals, ~known))[:_MAX_IMAGES]:
         own = np.flatnonzero((pairs == image).any(axis=1) & (counts >= INITIAL_MIN_INLIERS))
         yield own[np.argsort(-counts[own], kind="stable")].tolist()
 
@@ -235,42 +242,44 @@ class _Start:
     """A pair with which the mapper may begin.
 
     Attributes:
-        holds: the cameras stay near what they were.
-        is_certain: the mapper begins with it at any time.
+        is_stable: bundle adjustment keeps the intrinsics near their initial values.
+        is_certain: the mapper accepts the pair with any seed.
     """
 
-    holds: bool
+    is_stable: bool
     is_certain: bool
 
 
-def _look(
+def _try_start(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     pair: Sequence[int],
     geometry: TwoViewGeometry,
     known: KnownPoses,
 ) -> _Start | None:
-    """Begin with a pair as the mapper does; None where it leaves it."""
-    glanced = _glanced(matched, cameras, pair, geometry)
-    pose = _pose(geometry, glanced)
-    if pose is None or not _is_wide(pose, triangulation_angle(pose[:, :3], glanced.rays), _LEAST):
+    """Begin a model with a pair as the mapper does; None if the mapper rejects the pair."""
+    some = _some_inliers(matched, cameras, pair, geometry)
+    pose = _pose(geometry, some)
+    if pose is None or not _is_wide(
+        pose, triangulation_angle(pose[:, :3], some.rays), _QUICK_SHARE
+    ):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
     rotations, certain = list[_Floats](), list[bool]()
     for rows, pose, angle in _poses(inliers):
-        # Another search may take what this one leaves.
+        # A pose just below the limits is tried, too: with another seed the mapper may accept it.
         if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
             continue
         rotation = pose[:, :3]
         if known.contradict(pair, rotation, angle):
-            return _Start(holds=False, is_certain=False)
-        # An adjustment ends where one from nearly the same pose did.
+            return _Start(is_stable=False, is_certain=False)
+        # Adjustment from nearly the same pose has the same result, so it is not repeated.
         if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
-            holds = _holds(inliers, rows, pose)
-            if holds is None:
+            is_stable = _is_stable(inliers, rows, pose)
+            if is_stable is None:
                 continue
-            if not holds:
-                return _Start(holds=False, is_certain=False)
+            if not is_stable:
+                return _Start(is_stable=False, is_certain=False)
         rotations.append(rotation)
         enough = len(rows) >= _MARGIN * INITIAL_MIN_INLIERS
         certain.append(enough and _is_wide(pose, angle, _MARGIN))
@@ -279,20 +288,20 @@ def _look(
     return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
 
 
-def _glanced(
+def _some_inliers(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     pair: Sequence[int],
     geometry: TwoViewGeometry,
 ) -> PairInliers:
-    """Some of the inliers of a pair."""
-    step = max(1, len(geometry.inlier_matches) // _NUM_GLANCED)
+    """About `_NUM_QUICK` of the inliers of a pair."""
+    step = max(1, len(geometry.inlier_matches) // _NUM_QUICK)
     some = replace(geometry, inlier_matches=geometry.inlier_matches[::step])
     return inliers_of(matched, cameras, pair, some)
 
 
 def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
-    """The pose by a pair's geometry, float64 [3, 4]."""
+    """The pose of a pair from its two-view geometry, float64 [3, 4]; None if it has no matrix."""
     if geometry.config in FLAT_CONFIGS and geometry.H is not None:
         return pose_of_homography(geometry.H, inliers)
     E = geometry.E
@@ -303,16 +312,16 @@ def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
 
 
 def _is_wide(pose: _Floats, angle: float, margin: float) -> bool:
-    """Whether views are far enough apart for the mapper, and not along the axis, or nearly so."""
+    """Whether a pair meets the mapper's limits of angle and forward motion, within a margin."""
     most = INITIAL_MAX_FORWARD_MOTION + (_FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN)
     return bool(angle >= margin * INITIAL_MIN_ANGLE and abs(pose[2, 3]) <= most)
 
 
 def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:
-    """Poses that the mapper may begin with: rows of their inliers, [R | t], angle in degrees."""
+    """Yield poses the mapper may begin with: rows of the inliers, [R | t], angle in degrees."""
     own = np.arange(len(inliers.xy[0]), dtype=np.uint32)
-    # A focal length that is a guess counts as known: COLMAP 4.2 would estimate it with the pose, by
-    # a solver that some pairs crash.
+    # Assumed focal lengths count as known: otherwise COLMAP 4.2 estimates them together with the
+    # pose, and its solver crashes on some pairs.
     a, b = (pycolmap.Camera(camera.todict()) for camera in inliers.cameras)
     a.has_prior_focal_length = b.has_prior_focal_length = True
     options = pycolmap.TwoViewGeometryOptions()
@@ -320,7 +329,7 @@ def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, 
     options.ransac.max_error = _MAX_ERROR
     for seed in range(_NUM_SEEDS):
         pycolmap.set_random_seed(seed)
-        if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 there is one for all
+        if hasattr(options.ransac, "random_seed"):  # before COLMAP 4 only the global seed exists
             options.ransac.random_seed = seed
         views = (a, inliers.xy[0], b, inliers.xy[1])
         found = pycolmap.estimate_two_view_geometry(*views, np.column_stack([own, own]), options)
@@ -329,7 +338,7 @@ def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, 
             pose = np.asarray(found.cam2_from_cam1.matrix())
             yield found.inlier_matches[:, 0], pose, float(np.degrees(found.tri_angle))
     if not all(camera.has_prior_focal_length for camera in inliers.cameras):
-        # Where it does not estimate one, it takes a homography that explains most of the matches.
+        # With assumed focal lengths, the mapper may use a homography that explains most matches.
         flat = pycolmap.estimate_homography_matrix(*inliers.xy, options.ransac)
         if flat is not None:
             rows = np.flatnonzero(flat["inlier_mask"]).astype(np.uint32)
@@ -338,8 +347,8 @@ def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, 
             yield rows, pose, triangulation_angle(pose[:, :3], rays)
 
 
-def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
-    """Whether the cameras stay near what they were; None where too few points come about."""
+def _is_stable(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
+    """Whether bundle adjustment keeps the intrinsics; None if too few points are triangulated."""
     x = [own[:, rows] for own in inliers.x]
     points = cv2.triangulatePoints(np.eye(3, 4), pose, *x)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -348,7 +357,7 @@ def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> boo
     points = np.where(inside[:, None], points, 0.0)
     seen = points @ pose[:, :3].T + pose[:, 3]
     inside &= (points[:, 2] > 0) & (seen[:, 2] > 0)
-    # Angles between lines of sight, in the second camera.
+    # Triangulation angles, between the vectors from both cameras to a point.
     sides = np.stack([seen - pose[:, 3], seen])
     lengths = np.linalg.norm(sides, axis=2)
     cosine = (sides[0] * sides[1]).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-12)
@@ -363,19 +372,22 @@ def _holds(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> boo
 
 
 def _is_near(found: pycolmap.Camera | None, given: pycolmap.Camera) -> bool:
-    if found is None or given.has_bogus_params(*_SANE):
+    if found is None or given.has_bogus_params(*_MAPPER_LIMITS):
         return False
     focal = given.focal_length_idxs()
     extra = given.extra_params_idxs()
     factors = found.params[focal] / given.params[focal]
     added = np.abs(found.params[extra] - given.params[extra])
-    return bool(((factors < _FAR) & (factors > 1 / _FAR)).all() and (added < _DISTORTED).all())
+    return bool(
+        ((factors < _MAX_FOCAL_FACTOR) & (factors > 1 / _MAX_FOCAL_FACTOR)).all()
+        and (added < _MAX_DISTORTION_CHANGE).all()
+    )
 
 
 def _adjusted(
     inliers: PairInliers, pose: _Floats, points: _Floats, rows: Sequence[int]
 ) -> pycolmap.Reconstruction:
-    """Adjust the pair as the mapper does: both images, what they see, focal lengths, distortion."""
+    """Adjust poses, points, focal lengths and distortion of a pair as the mapper does."""
     model = pycolmap.Reconstruction()
     cameras = list({id(camera): camera for camera in inliers.cameras}.values())
     for number, camera in enumerate(cameras, 1):

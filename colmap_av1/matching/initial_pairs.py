@@ -1,4 +1,4 @@
-"""Pairs that would make a bad initial pair for COLMAP's incremental mapper."""
+"""Demote pairs that would make a bad initial pair for COLMAP's incremental mapper."""
 
 from __future__ import annotations
 
@@ -28,15 +28,17 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 
 # If no pair meets the mapper's limits for an initial pair, it halves them: first the inliers, then
-# the angle.
-_START = INITIAL_MIN_INLIERS // 2
-_ANGLE = INITIAL_MIN_ANGLE / 2
-# If the parallax of near views is below the mapper's noise limit of 4 px, the pose of the
-# homography has two to ten times the angle of the essential matrix's, and two to twenty times the
-# error of most matches. If it is right, the angles agree to a third.
-_MUCH_WIDER = 1.5
-_MUCH_WORSE = 1.5
-_SHARE = 0.9
+# the angle in degrees.
+_MIN_INLIERS = INITIAL_MIN_INLIERS // 2
+_MIN_ANGLE = INITIAL_MIN_ANGLE / 2
+# The pose of the homography is wrong if its triangulation angle and its error both exceed those of
+# the essential matrix by these factors. If the parallax of nearby images is below the mapper's
+# noise limit of 4 px, the angle is two to ten times as large and the error of most matches two to
+# twenty times. If the pose is right, the angles differ by less than a third.
+_ANGLE_FACTOR = 1.5
+_ERROR_FACTOR = 1.5
+# The error of a pose is this quantile of its matches' errors.
+_ERROR_QUANTILE = 0.9
 
 
 def demote_bad_initial_pairs(
@@ -48,24 +50,24 @@ def demote_bad_initial_pairs(
     """Limit the inliers of pairs that would make a bad initial pair.
 
     COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
-    (`EstimateTwoViewGeometryPose`). If the matches contradict this pose, or the adjustment of the
-    pair alone moves its camera far off, a model that begins with the pair fails after a few images,
-    and the mapper still writes it first. A demoted pair keeps enough inliers to connect its images;
-    tracks continue through the pairs between.
+    (`EstimateTwoViewGeometryPose`). If the matches contradict this pose, or if bundle adjustment of
+    the pair alone makes the intrinsics diverge, a model that begins with the pair fails after a few
+    images, and the mapper still writes it first. A demoted pair keeps enough inliers to connect its
+    images; tracks continue through the pairs between.
 
     Args:
-        matched: the images. Pairs without an essential matrix, as no focal length is known, are not
-            tested for the pose of the homography.
+        matched: the images. The pose of the homography is tested only for pairs with an essential
+            matrix, which needs known focal lengths.
         cameras: the camera of each image.
         clock: gets the stage "verification".
-        poses: float64 [3, 4] cam_from_world of each image, of those where it is known; empty: none
-            is. A pair whose matches give another pose is demoted, too.
+        poses: float64 [3, 4] cam_from_world of each image, None if not known; empty if no pose is
+            known. Pairs whose own pose disagrees with these are demoted, too.
     """
     geometries = list(matched.geometries)
     with clock.measure("verification"):
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):
-                # The few inliers decide as well as all.
+                # The remaining inliers decide as well as all of them.
                 few = _thinned(geometry)
                 if _is_contradicted(few, inliers_of(matched, cameras, pair, few)):
                     geometries[k] = few
@@ -82,7 +84,7 @@ def _may_start(geometry: TwoViewGeometry) -> bool:
         geometry.config in FLAT_CONFIGS
         and geometry.E is not None
         and geometry.H is not None
-        and len(geometry.inlier_matches) >= _START
+        and len(geometry.inlier_matches) >= _MIN_INLIERS
     )
 
 
@@ -93,22 +95,22 @@ def _is_contradicted(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
     assert geometry.H is not None
     pose = pose_of_homography(geometry.H, inliers)
     angle = triangulation_angle(pose[:, :3], inliers.rays)
-    if angle < _ANGLE:
+    if angle < _MIN_ANGLE:
         return False
     rotation = pose_of_essential(of_pair, inliers)[:, :3]
-    if angle < _MUCH_WIDER * triangulation_angle(rotation, inliers.rays):
+    if angle < _ANGLE_FACTOR * triangulation_angle(rotation, inliers.rays):
         return False
     of_pose = essential_of_poses(np.eye(3, 4), pose)
-    return _error(of_pose, inliers.x) > _MUCH_WORSE * _error(of_pair, inliers.x)
+    return _error(of_pose, inliers.x) > _ERROR_FACTOR * _error(of_pair, inliers.x)
 
 
 def _error(E: _Floats, x: Sequence[_Floats]) -> float:
-    """Sampson error that most matches are below, in focal lengths."""
-    return float(np.quantile(sampson_error(E, x[0], x[1]), _SHARE))
+    """A high quantile of the Sampson errors, in focal lengths."""
+    return float(np.quantile(sampson_error(E, x[0], x[1]), _ERROR_QUANTILE))
 
 
 def _thinned(geometry: TwoViewGeometry) -> TwoViewGeometry:
-    """The geometry with some of its inliers, spread over all of them."""
+    """Keep some of the inliers, evenly spread, too few for an initial pair."""
     count = len(geometry.inlier_matches)
-    chosen = evenly_spread(count, _START - 1, rounded=True)
+    chosen = evenly_spread(count, _MIN_INLIERS - 1, rounded=True)
     return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])

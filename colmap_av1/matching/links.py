@@ -1,11 +1,11 @@
-"""SIFT links: matches of SIFT features where motion does not connect images of the same place.
+"""SIFT links: matches of SIFT features between images that motion does not connect.
 
-Motion vectors connect neighbours in time. At gaps (a camera jerks, a picture is blurred) and at
-loop closures, a few pictures get SIFT features. The features across a gap also decide whether the
-motion across it is kept.
+Motion vectors connect images that are neighbours in time. At gaps (the camera jerks, a picture is
+blurred) and at loop closures, SIFT features are extracted from a few pictures. The features across
+a gap also decide whether the motion across it is kept.
 
 The steps: plan which pictures are examined and which pairs are tried; match their features; compare
-the motion across gaps with them; merge them with the matches of tracks.
+them with the motion across gaps; merge them with the matches of tracks.
 """
 
 from __future__ import annotations
@@ -51,90 +51,94 @@ from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import some_names
 
 # --- Which pictures are examined.
-# Images on either side of a gap, by their distance from it. The nearest see most in common, the
-# others give the scale.
+# Images to examine on either side of a gap, by their distance from it. The nearest have the most in
+# common, the others determine the scale.
 _AROUND_GAP = (0, 1, 2, 4, 7)
-# Where the camera moves fast, few tracks carry the scale: the pictures of all images are matched
-# with those of their neighbours, as COLMAP's sequential matcher does, and loops are looked for by
-# every second image. Motion is left out where pictures link neighbours by this many inliers.
+# While the camera moves fast, too few tracks last to determine the scale. All pictures are then
+# matched with their neighbours, as in COLMAP's sequential matcher, and every n-th image is searched
+# for loop closures. If features link two neighbours with this many inliers, the motion across them
+# is dropped.
 _FAST_INLIERS = 50
 _LOOP_STEP = 2
-# Images that a first look compares with the motion: most suspect gaps are ordinary.
+# Distances of the images that a first look compares with the motion: most suspect gaps are
+# ordinary.
 _FIRST_LOOK = (0, 2)
-# Loops are looked for in images whose distance is this share of the span that tracks reach ...
+# Loop closures are searched in images at this share of the span that tracks reach ...
 _LOOP_SHARE = 0.2
-# ... in videos that are longer than tracks reach by this factor, and have this many images.
+# ... in videos longer than that span by this factor, with at least this many images.
 _LONG = 8
 _LEAST_IMAGES = 120
-# Least distance of these images, which bounds the time; and their least number in each of several
-# videos.
+# Smallest distance between these images, which bounds the time, and their smallest number in each
+# of several videos.
 _LEAST_STEP = 3
 _LEAST_LOOP_IMAGES = 12
-# Up to this many pairs, all are matched: retrieval takes no less time.
-_MOST_OF_ALL = 200
-# Images of each video, and photos, that get all of SIFT's features, which takes five times as long.
-_MOST_THOROUGH = 12
+# Up to this number of pairs, all are matched, because retrieval would not be faster.
+_MAX_EXHAUSTIVE_PAIRS = 200
+# Number of images of each video, and of photos, in which all SIFT features are extracted. That
+# takes five times as long as light features.
+_MAX_FULL_IMAGES = 12
 # An image that is linked to another video is also matched with this many neighbours, which gives
 # its features depth.
 _NEIGHBOURS = 2
 # Distance between videos in the order that `_supported` uses; larger than `_SUPPORT_REACH`.
-_APART = 100
-# If the images of a video without any motion have fewer features than this, they show nothing:
-# others have hundreds. Number of images that are examined for this.
+_VIDEO_OFFSET = 100
+# A video without any motion has no detail if its images have fewer features than this; others have
+# hundreds. The second value is the number of images examined.
 _FEW_FEATURES = 20
-_NUM_GLANCED = 3
+_NUM_SAMPLES = 3
 
 # --- Which links and which motion are kept.
-# Least inliers across a gap. A loop needs more, as nothing else shows that the camera was there.
+# Fewest inliers across a gap. A loop closure needs more, because nothing else confirms it.
 _MIN_GAP_INLIERS = 20
 _MIN_LOOP_INLIERS = 25
-# A loop is confirmed by another one between neighbours up to this distance.
+# A loop closure is confirmed by another one between neighbours up to this distance.
 _SUPPORT_REACH = 2
-# Two videos are the same if this many of the examined pictures, and this share of them, have their
-# features in the same place, in pixels. A second camera comes this near for one or two pictures.
+# Two videos are the same if this number and this share of the examined pictures have their features
+# at the same positions, to within this many pixels. Videos of two cameras have one or two such
+# pictures at most.
 _FEWEST_SAME = 3
 _SAME_SHARE = 0.3
 _SAME_PLACE = 1.0
-# The motion across a gap is kept if this share of its matches agrees with the geometry of the
-# pictures within this many pixels: 98 to 100 % of true motion does, at most three quarters of what
-# only compresses well.
+# The motion across a gap is kept if this share of its matches agrees with the two-view geometry of
+# the pictures to within this many pixels: 98 to 100 % of true motion does, but at most three
+# quarters of vectors that merely compress well.
 _MIN_AGREEING = 0.85
 _MAX_ERROR = 3.0
-# Mappers register an image by 30 points, of which matches of two images give a part: with this many
-# inliers across a gap they always do.
+# Mappers need 30 points to register an image, and only a part of the matches of two images become
+# points. With this number of inliers across a gap they always succeed.
 _SURE_INLIERS = 100
-# Motion that agrees with the pictures is enough at this share of the usual inliers of neighbours.
+# Motion that the pictures confirm is kept with this share of the usual inliers of neighbours.
 _ENOUGH_OF_USUAL = 0.3
-# If this many probed gaps of a video are contradicted by pictures, all its motion is wrong.
+# If the pictures contradict this many probed gaps of a video, all its motion is wrong.
 _NUM_WRONG_PROBES = 2
 
 # --- Merging.
-# A feature within this many pixels of a track's keypoint is the same keypoint.
+# A feature this close to a track's keypoint, in pixels, is the same keypoint.
 _JOIN_DISTANCE = 1.0
 # Expected error of a feature in pixels.
 _SIGMA = 0.5
 
-# Gaps that a warning names.
+# Number of gaps that a warning names.
 _NUM_NAMED = 4
 
 
 @dataclass(frozen=True)
 class LinkReport:
-    """What linking found.
+    """Result of linking. Frames are counted through all videos.
 
     Attributes:
         num_images: images whose pictures were examined.
-        looked_again: loops were looked for.
+        looked_again: whether loop closures were searched.
         num_tried: pairs whose features were matched.
         num_links: pairs that were linked.
-        num_revisits: those of them that close a loop.
-        num_between: those between different videos or photos.
+        num_revisits: linked pairs that close a loop.
+        num_between: linked pairs of different videos or photos.
         gaps: gaps that motion does not bridge, in order.
-        fast: first and last frames of stretches in which the camera moves fast and all pictures
-            were matched with those of their neighbours; frames are counted through.
-        videos: (name, first frame) of each video if there are several; frames are counted through.
+        fast: first and last frame of each stretch in which the camera moves fast and all pictures
+            were matched with their neighbours.
+        videos: (name, first frame) of each video if there are several.
         parts: the names of the videos in each connected group, if there are several groups.
-        unlinked_photos: names of photos that nothing connects with a video.
+        unlinked_photos: names of photos that nothing connects to a video.
         same_videos: (name, name) of videos that show the same pictures.
     """
 
@@ -152,15 +156,15 @@ class LinkReport:
     same_videos: tuple[tuple[str, str], ...] = ()
 
     def frames_of_gaps(self, reason: GapReason = "low inter share") -> list[tuple[int, int]]:
-        """Frames on either side of the gaps with a reason; all gaps have the default one."""
+        """Frames on either side of each gap with a reason; every gap has the default reason."""
         return [gap.frames for gap in self.gaps if gap.frames and reason in gap.reasons]
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about images that nothing connects and about videos that are the same."""
+        """Warnings about unconnected images and about videos that are the same."""
         same = (
-            f"'{first}' and '{second}' show the same pictures, as encodings of one video do: give "
-            "one of them, the other adds nothing but time"
+            f"'{first}' and '{second}' show the same pictures, like two encodings of one video: "
+            "give only one of them, the other takes time and adds nothing"
             for first, second in self.same_videos
         )
         return (*self._gap_warnings(), *self._part_warnings(), *self._photo_warnings(), *same)
@@ -175,9 +179,9 @@ class LinkReport:
             shown.append(f"{before} and {after} of '{name}'" if name else f"{before} and {after}")
         more = f" and {len(gaps) - _NUM_NAMED} more pairs" if len(gaps) > _NUM_NAMED else ""
         return (
-            f"nothing connects frames {', '.join(shown)}{more}: the "
-            "camera jerks, or the pictures are blurred or cut there, and show nothing in common; "
-            "the images on either side become separate models",
+            f"nothing connects frames {', '.join(shown)}{more}: the camera jerks, or a picture is "
+            "blurred, or there is a cut, and the pictures have nothing in common; the images on "
+            "either side become separate models",
         )
 
     def _part_warnings(self) -> tuple[str, ...]:
@@ -185,11 +189,11 @@ class LinkReport:
             return ()
         if self.num_images == 0:
             names = ", ".join(f"'{name}'" for part in self.parts for name in part)
-            return (f"links none leaves {names} unconnected: they become separate models",)
+            return (f"{names} are not connected with --links none: they become separate models",)
         groups = " from ".join(", ".join(f"'{name}'" for name in part) for part in self.parts)
         return (
             f"nothing in the pictures connects {groups}: they become {len(self.parts)} separate "
-            "models; film what both see, or match videos of different scenes apart",
+            "models; film what both have in view, or match videos of different scenes separately",
         )
 
     def _photo_warnings(self) -> tuple[str, ...]:
@@ -197,13 +201,13 @@ class LinkReport:
             return ()
         names = some_names(self.unlinked_photos)
         return (
-            f"{len(self.unlinked_photos)} photos show nothing that a video shows, and are "
-            f"connected to none: {names}",
+            f"{len(self.unlinked_photos)} photos have nothing in common with any video and are "
+            f"not connected: {names}",
         )
 
 
 def gap_in_video(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> tuple[str, int, int]:
-    """Name of the video of a gap and the two frames counted in it; '' for a single video."""
+    """Name of a gap's video ('' for a single video), and the gap's frames counted in that video."""
     name, first = next((v for v in reversed(videos) if v[1] <= gap[0]), ("", 0))
     return name, gap[0] - first, gap[1] - first
 
@@ -215,7 +219,7 @@ class LinkedImages:
     Attributes:
         matched: the images with all keypoints and verified matches.
         tracks: the links as tracks through the frames of the images that have features.
-        report: what was found.
+        report: report on the links.
     """
 
     matched: MatchedImages
@@ -245,16 +249,16 @@ def link_images(
     Args:
         image_set: the images of videos and photos.
         matched: the images, matched along tracks.
-        cameras: the camera of each image; images share a camera if it is the same object.
+        cameras: the camera of each image; images that share a camera hold the same object.
         inter_share: float32 [num_frames], see `TrackedVideo`; any numbers for photos.
-        pictures: gives the pictures of images.
+        pictures: returns the pictures of images.
         fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
-        pairs: fewest matches of a pair, for the message.
+        pairs: offsets of neighbours in fast stretches, and fewest matches for messages.
         verify: how links are verified.
-        links: whether and where links are wanted.
+        links: whether and where images are linked.
         context: its clock gets the stage "links", its progress "links" and "link matches".
-        name: what messages call the videos.
-        images_apart: number of images that each of these stands for, if they are a selection.
+        name: name of the videos in messages.
+        images_apart: if the images are a selection, the number of images that each represents.
 
     Raises:
         VideoError: neither motion nor pictures connect any two images.
@@ -292,7 +296,7 @@ def link_images(
     if links.links != "none" and (suspect.maybe.any() or suspect.probes):
         first = _first_look(suspect, image_set)
         also = plan.wanted if plan.effort == "light" else []
-        features_of([*first.wanted, *also], "light")  # decode the videos once
+        features_of([*first.wanted, *also], "light")  # decodes the videos only once
         gaps = gaps | _confirmed_gaps(link(first).report, suspect, matched, image_set)
         plan = plan_links(image_set, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
@@ -301,7 +305,7 @@ def link_images(
         nothing = Tracks.empty(image_set.num_frames, _largest_size(cameras))
         linked = LinkedImages(matched, nothing, _with_parts(LinkReport(), matched, image_set))
     if linked.report.frames_of_gaps("no overlap" if plan.loop else "few tracks"):
-        # What lies on either side of a cut may continue anywhere in the videos.
+        # The scene on either side of a cut may reappear anywhere in the videos.
         loop = sorted({*plan.loop, *_spread_over_videos(image_set, matched, images_apart)})
         if loop != plan.loop:
             plan = replace(plan, loop=loop)
@@ -311,12 +315,12 @@ def link_images(
         linked = link(thorough_plan(plan, image_set))
     if len(linked.matched.pairs) == 0:
         if links.links != "none" and not found["light"]:
-            features_of(evenly_spread(len(image_set.sequence), _NUM_GLANCED, rounded=True), "light")
+            features_of(evenly_spread(len(image_set.sequence), _NUM_SAMPLES, rounded=True), "light")
         sizes = [len(features.xy) for features in found["light"].values()]
         if sizes and np.median(sizes) < _FEW_FEATURES:
             raise VideoError(
-                f"{name}: its pictures show hardly any detail, {np.median(sizes):.0f} features "
-                "each, so there is nothing to match: film what has texture, in light and in focus"
+                f"{name}: the pictures have hardly any detail to match ({np.median(sizes):.0f} "
+                "features each): film a scene with texture, well lit and in focus"
             )
         raise nothing_to_match(name, pairs)
     examined = found["light"].keys() | found["full"].keys()
@@ -331,13 +335,13 @@ class Plan:
     """Which pictures are examined.
 
     Attributes:
-        gaps: int64 [n] gaps that motion does not bridge, by the image before each.
-        around: the images whose pictures are matched across each.
-        loop: images in which loops are looked for.
+        gaps: int64 [n] gaps that motion does not bridge, by the image before each gap.
+        around: the images whose pictures are matched across each gap.
+        loop: images in which loop closures are searched.
         between: images that are compared with those of other videos and photos.
         fast: stretches of images in which the camera moves fast; all are matched with their
             neighbours.
-        effort: effort of the search for features.
+        effort: effort of feature extraction.
     """
 
     gaps: NDArray[np.int64]
@@ -362,15 +366,15 @@ class Plan:
 def images_to_link(
     inter_share: NDArray[np.float32], frames: NDArray[np.int32], options: LinkOptions
 ) -> NDArray[np.bool_]:
-    """Images of a video whose pictures are needed at suspect gaps, before any are matched.
+    """Predict, before matching, which images of a video need pictures because of suspect gaps.
 
     Args:
-        inter_share: see `TrackedVideo`.
+        inter_share: float32 [num_frames], see `TrackedVideo`.
         frames: int32 [num_images] frame of each image.
-        options: whether links are wanted.
+        options: whether images are linked.
 
     Returns:
-        bool [num_images]; all if any motion has to be probed.
+        bool [num_images]; all True if the motion has to be probed.
     """
     chosen = np.zeros(len(frames), dtype=np.bool_)
     low = low_inter_gaps(inter_share, frames)
@@ -391,7 +395,7 @@ def _images_around(gap: int, images: range, distances: Sequence[int] = _AROUND_G
 
 
 def _first_look(suspect: SuspectGaps, image_set: ImageSet) -> Plan:
-    """A look at few images on either side of suspect gaps: do they confirm the motion?"""
+    """Plan to examine a few images on either side of each suspect gap."""
     around = {
         gap: _images_around(gap, image_set.images_of(int(image_set.sequence[gap])), _FIRST_LOOK)
         for gap in np.flatnonzero(suspect.maybe).tolist()
@@ -404,12 +408,12 @@ def _first_look(suspect: SuspectGaps, image_set: ImageSet) -> Plan:
 def _confirmed_gaps(
     report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
 ) -> NDArray[np.bool_]:
-    """Suspect gaps whose motion the first look contradicts, or that few tracks cross.
+    """Find suspect gaps whose motion the first look contradicts, or that few tracks cross.
 
-    If several probes of a video are contradicted, all its gaps count.
+    If several probes of a video are contradicted, all its gaps are included.
 
     Args:
-        report: of the first look.
+        report: report of the first look.
         suspect: the gaps that were examined.
         matched: the images, matched along tracks.
         image_set: the images.
@@ -444,14 +448,14 @@ def plan_links(
     *,
     fast: NDArray[np.bool_],
 ) -> Plan:
-    """Choose the pictures at gaps, for loops in long videos, and between videos.
+    """Choose the pictures to examine at gaps, for loop closures in long videos, and between videos.
 
     Args:
         image_set: the images.
         matched: the images, matched along tracks.
         gaps: bool [num_images - 1] gaps that motion does not bridge.
         images_apart: see `link_images`.
-        options: whether and where links are wanted.
+        options: whether and where images are linked.
         fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
     """
     if options.links == "none":
@@ -485,7 +489,7 @@ def plan_links(
 
 
 def _stretches(chosen: NDArray[np.bool_], image_set: ImageSet) -> tuple[range, ...]:
-    """Ranges of consecutive images of one video that are chosen: bool [num_images]."""
+    """Ranges of consecutive images of one video where `chosen`, bool [num_images], is True."""
     found: list[range] = []
     for video in range(len(image_set.videos)):
         images = image_set.images_of(video)
@@ -496,12 +500,12 @@ def _stretches(chosen: NDArray[np.bool_], image_set: ImageSet) -> tuple[range, .
 
 
 def thorough_plan(plan: Plan, image_set: ImageSet) -> Plan:
-    """The plan with all of SIFT's features in fewer images, for what few links connect."""
+    """Extract all SIFT features, in fewer images, because light features gave too few links."""
     firsts = [image_set.images_of(video).start for video in range(len(image_set.videos) + 1)]
     between: list[int] = []
     for first, last in pairwise([*firsts, len(image_set.sequence)]):
         own = [image for image in plan.between if first <= image < last]
-        between += own[:: max(1, -(-len(own) // _MOST_THOROUGH))]
+        between += own[:: max(1, -(-len(own) // _MAX_FULL_IMAGES))]
     return replace(plan, between=between, effort="full")
 
 
@@ -519,7 +523,7 @@ def _spread_over_videos(
 def _spread_images(
     image_set: ImageSet, matched: MatchedImages, video: int, images_apart: float
 ) -> list[int]:
-    """Images of a video at such a distance that tracks reach over several of them."""
+    """Select evenly spaced images of a video, at a fraction of the span that tracks reach."""
     images = image_set.images_of(video)
     least = round(_LEAST_STEP / images_apart)
     step = max(1, least, round(_LOOP_SHARE * _reach(matched, images)))
@@ -529,12 +533,12 @@ def _spread_images(
 
 
 def _reach(matched: MatchedImages, images: range) -> int:
-    """The span in images that the tracks of half of the images of a video reach."""
+    """The median span, in images, that the tracks of an image of a video reach."""
     reach = np.ones(len(images), dtype=np.int64)
     for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
         if i in images and len(geometry.inlier_matches):
             reach[i - images.start] = max(reach[i - images.start], j - i)
-    # The last third of the images may reach the end of the video.
+    # The end of the video may cut off the reach of the last third of the images.
     return max(1, int(np.median(reach[: max(1, 2 * len(reach) // 3)])))
 
 
@@ -554,7 +558,7 @@ class Links:
     geometries: list[TwoViewGeometry]
 
     def joined(self, other: Links) -> Links:
-        """These links and those of other pairs."""
+        """These links together with those of other pairs."""
         pairs = np.concatenate([self.pairs, other.pairs])
         geometries = [*self.geometries, *other.geometries]
         order = np.lexsort((pairs[:, 1], pairs[:, 0])).tolist()
@@ -575,7 +579,7 @@ def _link(
 ) -> LinkedImages:
     """Link the images of a plan by their features, see `link_images`.
 
-    In fast stretches, images are matched with those at distances of `offsets`.
+    In fast stretches, each image is matched with the images at the distances `offsets`.
     """
 
     def matched_pairs(pairs: set[tuple[int, int]]) -> Links:
@@ -598,9 +602,9 @@ def _link(
         matched_pairs(tried), loops | between, sorted({*plan.loop, *plan.between}), image_set
     )
     found = {tuple(pair) for pair in links.pairs.tolist()}
-    beside = _pairs_beside(links, plan.between, image_set) - tried
-    if beside:
-        links = links.joined(matched_pairs(beside))
+    neighbours = _neighbour_pairs(links, plan.between, image_set) - tried
+    if neighbours:
+        links = links.joined(matched_pairs(neighbours))
     contradicted = contradicted_gaps(plan.gaps, links, matched, cameras)
     in_fast = {image for images in plan.fast for image in images[:-1]}
     linked = [
@@ -612,7 +616,7 @@ def _link(
     report = LinkReport(
         num_images=len(plan.wanted),
         looked_again=bool(plan.loop),
-        num_tried=len(tried | beside),
+        num_tried=len(tried | neighbours),
         num_links=len(links.pairs),
         num_revisits=len(loops & found),
         num_between=len(between & found),
@@ -639,7 +643,7 @@ def features_of_images(
     effort: Literal["light", "full"],
     context: RunContext,
 ) -> dict[int, Features]:
-    """Features of the pictures of images outside masked pixels, in pixels of the images."""
+    """Extract features outside masked pixels; positions are in pixels of the images."""
     found: dict[int, Features] = {}
     for image, picture in pictures(wanted):
         features = extract_features(picture, options.max_link_features, effort)
@@ -660,7 +664,7 @@ def _loop_pairs(
     *,
     seed: int,
 ) -> set[tuple[int, int]]:
-    """Pairs of images of one video that look alike and that tracks do not connect."""
+    """Find similar images of one video that tracks do not connect."""
     pairs: set[tuple[int, int]] = set()
     for video in range(len(image_set.videos)):
         images = image_set.images_of(video)
@@ -686,24 +690,26 @@ def _pairs_between(
     *,
     seed: int,
 ) -> set[tuple[int, int]]:
-    """Pairs of images of different videos or photos: all if these are few, else similar ones."""
+    """Pair images of different videos or photos: all if there are few pairs, else similar ones."""
     present = np.array([image for image in images if image in features], dtype=np.int64)
     if len(present) < 2:
         return set()
     sequence = image_set.sequence[present]
     allowed = sequence[:, None] != sequence
     pairs = np.argwhere(np.triu(allowed)).tolist()
-    if len(pairs) > _MOST_OF_ALL:
+    if len(pairs) > _MAX_EXHAUSTIVE_PAIRS:
         pairs = similar_images(
             [features[i] for i in present.tolist()], allowed, options.link_candidates, seed=seed
         ).tolist()
     return {(int(present[a]), int(present[b])) for a, b in pairs}
 
 
-def _pairs_beside(links: Links, images: Sequence[int], image_set: ImageSet) -> set[tuple[int, int]]:
-    """Pairs of neighbours in a video that are both linked to other videos.
+def _neighbour_pairs(
+    links: Links, images: Sequence[int], image_set: ImageSet
+) -> set[tuple[int, int]]:
+    """Pair neighbouring images of a video that are both linked to other videos.
 
-    A feature that is linked to a single image of another video would have no depth there.
+    These pairs give depth to features that are linked to a single image of another video.
     """
     sequence = image_set.sequence
     between = [pair for pair in links.pairs.tolist() if sequence[pair[0]] != sequence[pair[1]]]
@@ -724,7 +730,7 @@ def match_pairs(
     verify: VerifyOptions,
     context: RunContext,
 ) -> Links:
-    """Match the features of image pairs and keep what agrees with a rigid scene.
+    """Match the features of image pairs and verify the matches.
 
     Pairs with an image that has no entry in `features` are left out.
     """
@@ -756,17 +762,19 @@ def match_pairs(
 def _supported(
     links: Links, loops: set[tuple[int, int]], images: Sequence[int], image_set: ImageSet
 ) -> Links:
-    """The links without loops that no neighbouring loop confirms.
+    """Drop loop closures that no neighbouring loop closure confirms.
 
     Args:
         links: the links.
         loops: pairs of images that close a loop or connect videos.
-        images: the images of these, ascending; those near each other in the list see nearly the
-            same.
-        image_set: the images. Photos have no neighbours: a third image that is linked to
-            both confirms theirs.
+        images: the images of these pairs, ascending; images close together in the list have nearly
+            the same view.
+        image_set: the images. Photos have no neighbours: their links are confirmed by a third
+            image that is linked to both.
     """
-    place = {image: k + _APART * int(image_set.sequence[image]) for k, image in enumerate(images)}
+    place = {
+        image: k + _VIDEO_OFFSET * int(image_set.sequence[image]) for k, image in enumerate(images)
+    }
     photos = set(range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence)))
     pairs = [(i, j) for i, j in links.pairs.tolist()]
     sure = {
@@ -783,15 +791,15 @@ def _supported(
 
     def is_supported(i: int, j: int) -> bool:
         a, b = place[i], place[j]
-        beside = ((a + da, b + db) in places for da in around for db in around if da or db)
-        return any(beside) or bool({i, j} & photos and linked[i] & linked[j])
+        near = ((a + da, b + db) in places for da in around for db in around if da or db)
+        return any(near) or bool({i, j} & photos and linked[i] & linked[j])
 
     supported = {pair for pair in sure if is_supported(*pair)}
     kept = [k for k, pair in enumerate(pairs) if pair not in loops or pair in supported]
     return Links(links.pairs[kept], [links.geometries[k] for k in kept])
 
 
-# --- What the links show of gaps and videos.
+# --- Evidence of the links about gaps and videos.
 
 
 def contradicted_gaps(
@@ -800,7 +808,7 @@ def contradicted_gaps(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
 ) -> list[int]:
-    """Gaps whose motion the pictures contradict or do not confirm."""
+    """Find the gaps whose motion the pictures contradict or do not confirm."""
     of_pair = {pair: k for k, pair in enumerate(map(tuple, matched.pairs.tolist()))}
     contradicted = []
     for gap in gaps.tolist():
@@ -828,7 +836,7 @@ def contradicted_gaps(
 def _gaps_after_linking(
     gaps: NDArray[np.int64], contradicted: Sequence[int], merged: MatchedImages, image_set: ImageSet
 ) -> tuple[Gap, ...]:
-    """The gaps of a plan with their reasons."""
+    """List the gaps of a plan with their reasons."""
     group = connected_images(merged)
     sequence = image_set.sequence[merged.pairs]
     found = []
@@ -855,7 +863,7 @@ def _same_videos(
     cameras: Sequence[pycolmap.Camera],
     image_set: ImageSet,
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs of videos that show the same pictures, as encodings of one video do."""
+    """Find pairs of videos that show the same pictures, like two encodings of one video."""
     alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
         pair = int(image_set.sequence[i]), int(image_set.sequence[j])
@@ -881,7 +889,7 @@ def _same_videos(
 
 
 def _with_parts(report: LinkReport, merged: MatchedImages, image_set: ImageSet) -> LinkReport:
-    """The report with what is connected of several videos and photos."""
+    """Add the connected groups of several videos and photos to the report."""
     if image_set.num_sequences == 1:
         return report
     num_videos = len(image_set.videos)
@@ -903,7 +911,7 @@ def _with_parts(report: LinkReport, merged: MatchedImages, image_set: ImageSet) 
 
 
 def _connected_sequences(matched: MatchedImages, image_set: ImageSet) -> list[list[int]]:
-    """The videos and photos that pairs of images connect, largest group of images first."""
+    """Group videos and photos that image pairs connect, the group with the most images first."""
     count = image_set.num_sequences
     # A sequence and a component of images are connected if they have an image in common.
     edges = np.column_stack([image_set.sequence, count + connected_images(matched)])
@@ -914,7 +922,7 @@ def _connected_sequences(matched: MatchedImages, image_set: ImageSet) -> list[li
 
 
 def _largest_size(cameras: Sequence[pycolmap.Camera]) -> tuple[int, int]:
-    """(width, height) that holds the pictures of all cameras."""
+    """Smallest (width, height) that holds the pictures of all cameras."""
     return max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
 
 
@@ -927,7 +935,7 @@ def merge_links(
     features: dict[int, Features],
     left_out: Sequence[int],
 ) -> MatchedImages:
-    """Add linked features and their matches; leave out motion across some gaps."""
+    """Add linked features and their matches, and drop motion across the gaps `left_out`."""
     used: dict[int, set[int]] = {}
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
         used.setdefault(i, set()).update(geometry.inlier_matches[:, 0].tolist())
@@ -952,7 +960,7 @@ def merge_links(
         ).astype(np.uint32)
         own = replace(geometry, inlier_matches=inliers)
         if (i, j) in rows:
-            rows[i, j] = _both(*rows[i, j], inliers, own)
+            rows[i, j] = _joined_matches(*rows[i, j], inliers, own)
         else:
             rows[i, j] = inliers, own
     order = sorted(rows)
@@ -970,7 +978,7 @@ def _with_features(
 ) -> tuple[ImageKeypoints, NDArray[np.int64]]:
     """Add some features to keypoints; also return the index of each feature, -1 if not added.
 
-    A feature that lies on a track's keypoint joins it; the nearest if there are several.
+    A feature that lies on a track's keypoint joins it; if there are several, the nearest does.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
 
@@ -995,16 +1003,16 @@ def _with_features(
     )
 
 
-def _both(
+def _joined_matches(
     matches: NDArray[np.uint32],
     geometry: TwoViewGeometry,
     link_matches: NDArray[np.uint32],
     link: TwoViewGeometry,
 ) -> tuple[NDArray[np.uint32], TwoViewGeometry]:
-    """A pair's matches along tracks and by its link, with the geometry that has more inliers."""
+    """Join the matches of tracks and of a link; keep the geometry that has more inliers."""
 
     def joined(a: NDArray[np.uint32], b: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        # A keypoint has one match in an image; that of its track goes first.
+        # A keypoint has one match per image; the match of its track takes precedence.
         free = ~np.isin(b[:, 0], a[:, 0]) & ~np.isin(b[:, 1], a[:, 1])
         return np.concatenate([a, b[free]])
 
@@ -1022,7 +1030,7 @@ def links_as_tracks(
     num_frames: int,
     size: tuple[int, int],
 ) -> Tracks:
-    """The links as tracks: connected features, without those seen twice in a frame."""
+    """Convert links to tracks of connected features; drop tracks with two features in a frame."""
     images = sorted(features)
     counts = [len(features[i].xy) for i in images]
     first = dict(zip(images, np.concatenate([[0], np.cumsum(counts)])[:-1].tolist(), strict=True))

@@ -32,7 +32,7 @@ class SelectedTracks:
     """The tracks of a video along which its images are matched.
 
     Attributes:
-        path: the file that messages name.
+        path: path of the video, for messages.
         tracks: the selected tracks.
         inter_share: float32 [num_frames], see `TrackedVideo`.
         fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
@@ -51,7 +51,7 @@ class ImageMatchOptions:
     Attributes:
         pairs: which images are paired.
         verify: how pairs are verified.
-        links: where images are linked by their pictures.
+        links: where images are linked by SIFT features.
         min_length: fewest frames of a track.
     """
 
@@ -66,13 +66,12 @@ class ImageMatches:
     """Verified matches of all images.
 
     Attributes:
-        cameras: the camera of each image; images share a camera if it is the same object.
+        cameras: the camera of each image; images that share a camera hold the same object.
         focal_length: estimated focal length, see `ImageCameras`.
-        matched: keypoints, matches and two-view geometries, those of links included.
-        links: what linking found.
+        matched: keypoints, matches and two-view geometries, including those of links.
+        links: report on the links.
         link_tracks: the links as tracks.
-        track_lengths: int64 [num_tracks] images that see each of the tracks that images are matched
-            along.
+        track_lengths: int64 [num_tracks] number of images that observe each track.
         depth: whether the matches determine depth.
         warnings: warnings about the cameras and the links.
     """
@@ -99,18 +98,18 @@ def match_images(
     name: str,
     images_apart: float = 1.0,
 ) -> ImageMatches:
-    """Match images along their tracks, verify the matches, and link what motion does not connect.
+    """Match images along tracks, verify the matches, and link images that motion does not connect.
 
     Args:
         image_set: the images.
         videos: the tracks of each video.
         no_motion: float32 [num_photos] the inter shares of the photos.
-        cameras: returns the cameras of the images, that may depend on their matches.
-        pictures: gives the pictures of images, for links.
+        cameras: returns the cameras of the images, which may depend on the matches.
+        pictures: returns the pictures of images, for links.
         options: options of pairs, verification and links.
         context: its clock gets the stages "pairs", "verification" and "links".
-        name: what messages call the videos.
-        images_apart: number of images that each of these stands for, if they are a selection.
+        name: name of the videos in messages.
+        images_apart: if the images are a selection, the number of images that each represents.
 
     Raises:
         VideoError: nothing connects any two images.

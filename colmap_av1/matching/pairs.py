@@ -1,4 +1,4 @@
-"""Keypoints of the written images, and the image pairs that are matched."""
+"""Collect the keypoints of images and choose the image pairs to match."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks, order_by_frame
 
-# Spans up to this many images pair every image. A longer one starts only at every n-th
-# image, n growing with the span, so the number of pairs stays linear in the number of
-# images even where tracks live as long as the video.
+# Spans up to this many images are paired at every image. Longer spans are paired at every n-th
+# image only, where n grows with the span, so the number of pairs stays linear in the number of
+# images even if tracks last for the whole video.
 _UNTHINNED_SPAN = 64
-# Distances in images at which all pairs that share tracks are taken.
+# Distances in images at which all pairs that share enough tracks are kept.
 NEAR = tuple(range(1, 11))
-# Mean number of pairs per image that all together may not exceed by more than these.
+# Largest mean number of pairs per image, unless the pairs at near distances alone are more.
 _MOST_PAIRS = 30
 
 
 @dataclass(frozen=True)
 class ImageKeypoints:
-    """Keypoints of one written image: one for each track it sees.
+    """Keypoints of one image, one for each track that it observes.
 
     Attributes:
         frame: display index of the image's video frame.
@@ -41,7 +41,7 @@ class ImageKeypoints:
 def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoints]:
     """Collect the track observations of the frames that become images.
 
-    A track seen in fewer than two of the frames matches nothing and is left out.
+    Tracks with fewer than two observations in these frames are left out.
 
     Args:
         tracks: tracks of the whole video.
@@ -51,17 +51,17 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
         One entry per frame, in the same order.
 
     Raises:
-        ImageError: a frame is not one of the video's, or frames are not ascending.
+        ImageError: a frame is outside the video, or frames are not ascending.
     """
     chosen = np.asarray(frames, dtype=np.int64).reshape(-1)
     if chosen.size and (chosen.min() < 0 or chosen.max() >= tracks.num_frames):
         raise ImageError(
-            f"images stand for frames {chosen.min()} to {chosen.max()}, but the video has "
+            f"the images are frames {chosen.min()} to {chosen.max()}, but the video has "
             f"{tracks.num_frames} frames: give images of this video only"
         )
     if np.any(np.diff(chosen) <= 0):
         raise ImageError(
-            "two images stand for the same frame or run backwards: give one image per frame, "
+            "two images are the same frame or are not in display order: give one image per frame, "
             "in display order"
         )
 
@@ -74,7 +74,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     often_enough = np.bincount(track[seen], minlength=num_tracks) >= 2
     kept = np.flatnonzero(seen & often_enough[track])
 
-    # Observations come by track, so a stable sort by image leaves tracks ascending.
+    # Observations are ordered by track, so a stable sort by image keeps tracks ascending.
     kept = kept[order_by_frame(image[kept], chosen.size)]
     bounds = np.searchsorted(image[kept], np.arange(chosen.size + 1))
     return [
@@ -94,16 +94,17 @@ def covisible_pairs(
     near: Sequence[int] = NEAR,
     most_pairs: int = _MOST_PAIRS,
 ) -> NDArray[np.int32]:
-    """Choose image pairs that share tracks, at any distance, as where a place is seen again.
+    """Choose image pairs that share tracks, at any distance, including revisited places.
 
-    If the pairs are too many, only the one that shares the most tracks is kept of each group of
-    similar pairs.
+    If there are too many pairs, similar pairs are grouped and only the pair that shares the most
+    tracks is kept of each group.
 
     Args:
         keypoints: the keypoints of the images, in display order.
         min_matches: fewest tracks that the images of a pair share.
         near: distances in images at which all pairs are kept.
-        most_pairs: mean number of pairs per image; more where those of `near` are more.
+        most_pairs: largest mean number of pairs per image, unless the pairs at the distances
+            `near` alone are more.
 
     Returns:
         int32 [m, 2] indices into `keypoints`, first < second, in ascending order.
@@ -121,7 +122,7 @@ def covisible_pairs(
     most = max(most_pairs * len(keypoints), np.count_nonzero(always) + len(keypoints))
     step = 1
     while True:
-        # The best pair of each square of pairs (first, second).
+        # Divide the pairs (first, second) into squares, and keep the best pair of each.
         square = (first // step) * (len(keypoints) + 1) + second // step
         order = np.lexsort((second, first, -count, square))
         best = np.zeros(len(first), np.bool_)
@@ -150,12 +151,12 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
 def schedule_pairs(
     keypoints: Sequence[ImageKeypoints], options: PairOptions | None = None
 ) -> NDArray[np.int32]:
-    """Choose the image pairs to write: every distance for near images, growing ones for far.
+    """Choose the image pairs to write: every distance for near images, growing distances for far.
 
-    Long spans carry the parallax an incremental mapper starts from; the last one is the
-    longest at which two images still share enough tracks. The triangulator follows written
-    pairs only, so short spans are paired at every image. The number of pairs is linear in
-    the number of images.
+    Long spans have the parallax that an incremental mapper needs to start; the last one is the
+    longest at which two images still share enough tracks. The triangulator follows written pairs
+    only, so short spans are paired at every image. The number of pairs is linear in the number of
+    images.
 
     Args:
         keypoints: the images' keypoints, in display order.
@@ -196,7 +197,7 @@ def schedule_pairs(
                 reached = span
             else:
                 failed = span
-        # Tracks are gapless, or nearly: spans hold up to the longest one and fail beyond.
+        # Tracks have few gaps, so images share tracks up to the longest span and not beyond it.
         longest: list[tuple[int, int]] = []
         while failed - reached > 1:
             span = (reached + failed) // 2
@@ -224,7 +225,7 @@ def _longest_track_span(keypoints: Sequence[ImageKeypoints]) -> int:
     if track.size == 0:
         return 0
     image = np.repeat(np.arange(len(keypoints)), [k.track.size for k in keypoints])
-    # Images ascend, so the last write wins for `last`, and for `first` once reversed.
+    # Images ascend, so the last write wins for `last`, and in reverse order for `first`.
     first = np.zeros(int(track.max()) + 1, dtype=np.int64)
     last = np.zeros_like(first)
     first[track[::-1]] = image[::-1]

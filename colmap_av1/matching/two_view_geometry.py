@@ -1,4 +1,4 @@
-"""The two-view geometry of an image pair, and COLMAP's configurations of it."""
+"""The two-view geometry of an image pair and its configurations in COLMAP."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TwoViewConfig(IntEnum):
     CALIBRATED_RIG = 9
 
 
-# Configurations whose pairs the mappers of COLMAP 4.2 leave out, and those without depth.
+# Configurations whose pairs the mappers of COLMAP 4.2 ignore, and those without depth.
 UNUSED_CONFIGS = (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE, TwoViewConfig.WATERMARK)
 FLAT_CONFIGS = (
     TwoViewConfig.PLANAR,
@@ -36,7 +36,7 @@ FLAT_CONFIGS = (
 
 
 def config_name(config: int) -> str:
-    """COLMAP's name of a configuration; the number itself where COLMAP has no name for it."""
+    """COLMAP's name of a configuration; the number if COLMAP has no name for it."""
     return TwoViewConfig(config).name if config in set(TwoViewConfig) else str(config)
 
 
@@ -48,7 +48,7 @@ class TwoViewGeometry:
         config: configuration.
         inlier_matches: uint32 [n, 2] the inliers, in the order of the matches.
         E: float64 [3, 3] essential matrix on normalised, undistorted coordinates, or None.
-        F: float64 [3, 3] fundamental matrix on pixels, or None, also where E explains so many
+        F: float64 [3, 3] fundamental matrix on pixels, or None, including if E explains so many
             matches that F was not needed.
         H: float64 [3, 3] homography on pixels, or None.
         qvec: float64 [4] (w, x, y, z) rotation from the first camera to the second, or None.

@@ -1,8 +1,9 @@
-"""The models of a pair of images: its essential, fundamental and homography matrix.
+"""Estimate the models of an image pair: essential matrix, fundamental matrix and homography.
 
-Nearly all matches of tracks are right, so a linear fit or few iterations of PoseLib's robust
-estimators on matches that are spread over the image find a model; more of them refine it and all
-are tested against it. Where few are right, the robust estimators iterate longer by themselves.
+Nearly all matches of tracks are right. A linear fit, or a few iterations of PoseLib's robust
+estimators, on some matches spread over the image is therefore enough to find a model. More matches
+refine it, and all are tested against it. If few matches are right, the robust estimators run more
+iterations.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from colmap_av1.options.matching import MIN_MATCHES
 
 _Floats = NDArray[np.float64]
 
-# Iterations of a robust estimator at least; more follow where few matches agree.
+# Fewest iterations of a robust estimator; it runs more if few matches are inliers.
 _MIN_ITERATIONS = 15
-# Share of inliers below which COLMAP spends no more iterations on a model.
+# COLMAP limits the number of iterations to what this inlier ratio needs.
 _MIN_INLIER_RATIO = 0.25
-# Matches a model is refined on, and steps of refinement.
+# Number of matches on which a model is refined, and limits of the refinement.
 MAX_REFINED = 500
 _REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
-# What keeps sums of points that coincide or lie on a line apart from 0.
+# Keeps denominators above 0 if points coincide or lie on a line.
 _ROUNDING = 1e-12
 _IDENTITY = np.eye(3)
 # Keeps a division by a gradient of 0 finite.
 _SMALLEST = np.finfo(np.float64).tiny
-# A model with this share of the matches is not searched any longer.
+# A model with this share of inliers is not searched again.
 _TRUSTED_SHARE = 0.95
-# A search finds no more inliers than a quick fit by this share of the matches, and hardly ever
-# less by that one.
-_SEARCH_GAINS, _SEARCH_LOSES = 0.1, 0.04
-# COLMAP's homographies leave out this many times as many matches as those that are found here:
-# with it, pairs of six real and rendered videos are planar or not as COLMAP says most often.
-_COLMAP_LEAVES_OUT = 1.08
+# RANSAC finds at most the first share of the matches more inliers than a quick fit, and hardly ever
+# the second share fewer.
+_RANSAC_GAIN, _RANSAC_LOSS = 0.1, 0.04
+# COLMAP's homographies have this many times as many outliers as those found here. With this factor,
+# the decision whether a pair is planar agrees best with COLMAP's on six real and rendered videos.
+_COLMAP_OUTLIER_FACTOR = 1.08
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ class Model:
     """A model and its inliers.
 
     Attributes:
-        matrix: float64 [3, 3] in the coordinates the matches were tested in; None where none
-            was found.
+        matrix: float64 [3, 3] in the coordinates the matches were tested in; None if no model was
+            found.
         inliers: bool [n].
         count: number of inliers.
         pose: PoseLib's pose of an essential matrix.
@@ -66,10 +67,10 @@ class MatchedPoints:
     """Matched points of a pair, all in the same coordinates.
 
     Attributes:
-        a: float64 [2, n] those in the first image.
-        b: float64 [2, n] those in the second image.
-        spread_a: float64 [2, k] the first of an order that is spread over the image.
-        spread_b: float64 [2, k] likewise.
+        a: float64 [2, n] points in the first image.
+        b: float64 [2, n] points in the second image.
+        spread_a: float64 [2, k] a sample of `a` in an order that is spread over the image.
+        spread_b: float64 [2, k] the matching points of `b`.
     """
 
     a: _Floats
@@ -78,17 +79,17 @@ class MatchedPoints:
     spread_b: _Floats
 
     def first(self, count: int) -> tuple[_Floats, _Floats]:
-        """The first matches of the spread order, float64 [2, m] in each image."""
+        """The first matches of the sample, float64 [2, m] in each image."""
         return self.spread_a[:, :count], self.spread_b[:, :count]
 
 
 def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> MatchedPoints:
-    """The points with those of some of them that are spread over the image.
+    """Select a sample of matched points.
 
     Args:
         a: float64 [2, n] points in the first image.
         b: float64 [2, n] points in the second image.
-        order: int64 [k] indices of the spread ones.
+        order: int64 [k] indices of the sample, in an order that is spread over the image.
     """
     return MatchedPoints(a, b, a.take(order, axis=1), b.take(order, axis=1))
 
@@ -106,11 +107,11 @@ class Search:
     seed: int
 
     def part(self, share: float) -> int:
-        """Number of matches in a share of a full sample."""
+        """Number of matches in a share of the full sample."""
         return max(MIN_MATCHES, round(share * self.options.max_samples))
 
     def ransac(self, min_iterations: int) -> dict[str, Any]:
-        """The options as PoseLib takes them."""
+        """The options in PoseLib's form."""
         return {
             "max_epipolar_error": self.options.max_error,
             "max_reproj_error": self.options.max_error,
@@ -122,11 +123,11 @@ class Search:
 
 
 def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float, float]) -> Model:
-    """The essential matrix of a pair, on undistorted pixels from the principal points.
+    """Estimate the essential matrix, on undistorted pixels relative to the principal points.
 
     Args:
         points: the matches.
-        search: how to look for it.
+        search: how the model is estimated.
         focal_lengths: of the first and the second image, in pixels.
     """
     if points.spread_a.shape[1] < MIN_MATCHES:
@@ -139,7 +140,7 @@ def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float,
         tested = _test(epipolar_inliers, _essential(pose, *focal_lengths), points, search)
         return replace(tested, pose=pose)
 
-    # A part of the sample is enough: what is found is refined on more than all of it.
+    # A part of the sample is enough, because the result is refined on more matches.
     xa, xb = points.first(search.part(0.5))
     pose, _ = poselib.estimate_relative_pose(
         xa.T, xb.T, *cameras, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
@@ -149,7 +150,7 @@ def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float,
 
 
 def find_fundamental(points: MatchedPoints, search: Search) -> Model:
-    """The fundamental matrix of a pair."""
+    """Estimate the fundamental matrix of a pair."""
     if points.spread_a.shape[1] < MIN_MATCHES:
         return _no_model(points)
 
@@ -171,22 +172,22 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
 
 
 def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Model:
-    """The homography of a pair, as exact as the decision between it and its rival needs.
+    """Estimate the homography of a pair, as exactly as the choice between it and its rival needs.
 
-    A search until no better one is found is the costliest part of all and seldom decides: a
-    quick fit shows whether the inliers come near the rival's.
+    RANSAC is by far the most expensive step and rarely changes the choice, so it runs only if the
+    number of inliers of a quick fit is close to the decisive number.
 
     Args:
         points: the matches.
-        search: how to look for it.
-        num_rival: inliers of the model it competes with.
+        search: how the model is estimated.
+        num_rival: number of inliers of the competing model.
     """
     if points.spread_a.shape[1] < MIN_MATCHES:
         return _no_model(points)
     num_matches = points.a.shape[1]
     xa, xb = points.first(search.options.max_samples)
     H = _affine_fit(xa, xb)
-    # The first loss brings matches near that are to agree, the second drops all others.
+    # The first loss lets outliers pull less, the second ignores them.
     for loss, steps in (("CAUCHY", 2), ("TRUNCATED", 3)):
         robust = {
             **_REFINEMENT,
@@ -197,7 +198,7 @@ def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Mo
         H, _ = poselib.refine_homography(xa.T, xb.T, H, robust)
     found = _test(transfer_inliers, H, points, search)
     decisive = planar_share(search.options) * num_rival / num_matches
-    if not -_SEARCH_GAINS < found.count / num_matches - decisive < _SEARCH_LOSES:
+    if not -_RANSAC_GAIN < found.count / num_matches - decisive < _RANSAC_LOSS:
         return found
     ransac = search.ransac(_MIN_ITERATIONS)
     ransac["max_iterations"] = _num_iterations(decisive, search.options)
@@ -206,8 +207,8 @@ def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Mo
 
 
 def planar_share(options: VerifyOptions) -> float:
-    """Share of the rival's inliers that a homography found here needs, to decide as COLMAP does."""
-    return 1 - (1 - options.max_h_inlier_ratio) / _COLMAP_LEAVES_OUT
+    """Share of the rival's inliers that makes a pair planar, adjusted to agree with COLMAP."""
+    return 1 - (1 - options.max_h_inlier_ratio) / _COLMAP_OUTLIER_FACTOR
 
 
 def _again_on_inliers(
@@ -230,7 +231,7 @@ def _again_on_inliers(
 
 
 def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
-    """The loss that refinement lowers: it ranks models that have the same inliers."""
+    """The loss that refinement minimizes; it also ranks models with the same inliers."""
     if model.matrix is None:
         return math.inf
     algebraic, gradient = epipolar_terms(model.matrix, points.spread_a, points.spread_b)
@@ -239,24 +240,24 @@ def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
 
 
 def poselib_camera(focal_length: float) -> dict[str, Any]:
-    """A camera as PoseLib takes it, with the principal point at the origin."""
+    """A camera in PoseLib's form, with the principal point at the origin."""
     # PoseLib does not use the size.
     params = [focal_length, 0.0, 0.0]
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
 
 
 def _essential(pose: Any, focal_a: float, focal_b: float) -> _Floats:
-    """The essential matrix of a pose, for undistorted pixels from the principal points."""
+    """The essential matrix of a pose, on undistorted pixels relative to the principal points."""
     R, t = np.asarray(pose.R), np.asarray(pose.t).reshape(3)
     E = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]]) @ R
     return np.asarray(E / np.outer([focal_b, focal_b, 1.0], [focal_a, focal_a, 1.0]))
 
 
 def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
-    """The fundamental matrix with least squares (Hartley and Zisserman, 11.1 and 11.4).
+    """Fit the fundamental matrix by least squares (Hartley and Zisserman, 11.1 and 11.4).
 
-    A second solution gives every match the weight of its Sampson error, and less where that is
-    above a pixel.
+    A second fit weights each match for its Sampson error, and reduces the weight of errors above a
+    pixel.
     """
     a, to_a = _normalised(xa)
     b, to_b = _normalised(xb)
@@ -265,12 +266,12 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
     algebraic, gradient = epipolar_terms(F, a[:2], b[:2])
     weight = 1 / (gradient + (algebraic / to_b[0, 0]) ** 2 + _ROUNDING)
     F = np.linalg.eigh((rows * weight) @ rows.T)[1][:, 0].reshape(3, 3)
-    # Refinement takes the nearest matrix of rank two.
+    # The rank is not enforced here: refinement starts from the nearest matrix of rank two.
     return np.asarray(to_b.T @ F @ to_a)
 
 
 def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
-    """Points [2, n] normalised, as homogeneous ones, and the normalising matrix [3, 3]."""
+    """Normalise points [2, n]; return them homogeneous, with the normalising matrix [3, 3]."""
     centre = x.sum(axis=1) / x.shape[1]
     moved = x - centre[:, None]
     scale = 1 / (math.sqrt(np.vdot(moved, moved) / x.size) + _ROUNDING)
@@ -281,16 +282,16 @@ def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
 
 
 def _homogeneous(x: _Floats) -> _Floats:
-    """Points [2, n] with a third coordinate 1, [3, n]."""
+    """Append a third coordinate 1 to points [2, n], giving [3, n]."""
     extended = np.ones((3, x.shape[1]))
     extended[:2] = x
     return extended
 
 
 def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
-    """Iterations after which a homography with this share of inliers is found or absent.
+    """Number of RANSAC iterations to find a homography with this inlier ratio.
 
-    COLMAP searches no longer either, so a close case ends alike.
+    COLMAP uses the same number, so close cases are decided alike.
     """
     clean = max(inlier_ratio, _MIN_INLIER_RATIO) ** 4
     if clean >= 1 or options.confidence >= 1:
@@ -301,10 +302,10 @@ def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
 
 
 def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
-    """The affine map, as a 3x3 matrix, that takes `xa` to `xb` with the least squares."""
+    """Fit the affine map from `xa` to `xb` by least squares, as a 3x3 matrix."""
     a = _homogeneous(xa)
     square = a @ a.T
-    # A little more than that, so points on a line have a solution.
+    # Regularized, so that points on a line have a solution.
     square += _ROUNDING * np.trace(square) * _IDENTITY
     return np.vstack([np.linalg.solve(square, a @ xb.T).T, _IDENTITY[2]])
 
@@ -316,7 +317,7 @@ def _no_model(points: MatchedPoints) -> Model:
 def _test(
     inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: MatchedPoints, search: Search
 ) -> Model:
-    """The matrix at unit norm with its inliers; None where an estimator found no model."""
+    """Scale a matrix to unit norm and find its inliers; no model unless it is finite and not 0."""
     matrix = np.asarray(matrix, dtype=np.float64)
     norm = float(np.linalg.norm(matrix))
     if not (math.isfinite(norm) and norm > 0):
@@ -348,16 +349,16 @@ def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floa
 
 
 def essential_of_poses(a: _Floats, b: _Floats) -> _Floats:
-    """The essential matrix of two images by their poses [3, 4], x_cam = R x_world + t."""
+    """The essential matrix of two images from their poses [3, 4], x_cam = R x_world + t."""
     rotation = b[:, :3] @ a[:, :3].T
     x, y, z = b[:, 3] - rotation @ a[:, 3]
     return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
 
 
 def transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
-    """Matches that H maps to within `max_error` of their place in the second image."""
+    """Matches that H maps to within `max_error` of their position in the second image."""
     mapped = H[:, :2] @ xa + H[:, 2:]
-    # Multiplied out by the third coordinate, so no point at infinity divides by zero.
+    # Multiplied by the third coordinate, so that points at infinity cause no division by zero.
     x = mapped[0] - xb[0] * mapped[2]
     y = mapped[1] - xb[1] * mapped[2]
     return np.asarray(x**2 + y**2 <= (max_error * mapped[2]) ** 2)

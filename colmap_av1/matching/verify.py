@@ -1,8 +1,7 @@
-"""Two-view geometry of image pairs: which matches agree with a rigid scene, and how.
+"""Geometric verification of image pairs.
 
-The decisions between the models and all thresholds are those of COLMAP 4.2's own geometric
-verification (`TwoViewGeometryOptions`), so a database filled here and one filled by COLMAP's
-matchers mean the same.
+The thresholds and the choice between models are those of COLMAP 4.2's geometric verification
+(`TwoViewGeometryOptions`), so the database means the same as one filled by COLMAP's matchers.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ from colmap_av1.util.digests import seed_of
 
 _Floats = NDArray[np.float64]
 
-# Pairs from which on another thread pays: between PoseLib's steps threads wait for the
-# interpreter, and two of them take a third more CPU time to be done a tenth to a quarter sooner.
+# Number of pairs that justifies another thread. Threads wait for the interpreter between PoseLib's
+# steps: two threads use a third more CPU time to finish a tenth to a quarter sooner.
 _PAIRS_FOR_A_THREAD = 2000
-# Pairs that a thread verifies before it hands them over.
+# Number of pairs that a thread verifies in one task.
 _PAIRS_AT_A_TIME = 16
-# Cells of an image that one point each is taken from before any gives its second.
+# Number of cells into which an image is divided to spread a sample of points.
 _NUM_CELLS = 128
 
 
@@ -60,18 +59,19 @@ def verify_pairs(
 ) -> list[TwoViewGeometry]:
     """Find the two-view geometry of every pair.
 
-    A pair of cameras with a focal length prior is CALIBRATED where the essential matrix
-    explains nearly as many matches as the fundamental matrix, any other UNCALIBRATED; where
-    a homography explains nearly as many, PLANAR_OR_PANORAMIC; with too few inliers DEGENERATE.
+    If both cameras have a focal length prior and the essential matrix explains nearly as many
+    matches as the fundamental matrix, the pair is CALIBRATED, otherwise UNCALIBRATED. If a
+    homography explains nearly as many, it is PLANAR_OR_PANORAMIC. With too few inliers it is
+    DEGENERATE.
 
     Args:
         keypoints: the images' keypoints.
         pairs: int32 [m, 2] indices into `keypoints`.
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
-        cameras: the camera of all images, or one for each; images share a camera where theirs
-            are the same object.
+        cameras: one camera for all images, or one for each; images that share a camera hold the
+            same object.
         options: thresholds and effort; the defaults of VerifyOptions if None.
-        num_threads: threads; None: one per CPU that the process may use.
+        num_threads: number of threads; if None, at most one per CPU that the process may use.
         seed: seed of the robust estimators.
         progress: called with the number of pairs done so far, from this thread, in order.
 
@@ -80,20 +80,20 @@ def verify_pairs(
         `seed` only, not on the number of threads.
 
     Raises:
-        OptionError: a camera is not a perspective one.
+        OptionError: a camera maps no keypoint to a ray in front of it.
     """
     options = options if options is not None else VerifyOptions()
     if isinstance(cameras, pycolmap.Camera):
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):
         raise ValueError("give one camera for each image and one array of matches for each pair")
-    views: dict[int, _View] = {}  # from the first pair that needs one to the last
+    views: dict[int, _View] = {}  # kept from the first pair that needs an image to the last
     last_pair = {int(image): index for index, pair in enumerate(pairs) for image in pair}
 
     def view(image: int) -> _View:
         found = views.get(image)
         if found is None:
-            # Where two threads make it at a time, both make the same.
+            # If two threads compute it at the same time, both results are equal.
             found = views[image] = _view(keypoints[image], cameras[image], seed_of(seed, image))
         return found
 
@@ -106,7 +106,7 @@ def verify_pairs(
         return found
 
     geometries: list[TwoViewGeometry] = []
-    # Threads that hand over every pair by itself would be busy with that.
+    # Tasks of single pairs would spend most of their time on scheduling.
     indices = range(len(pairs))
     parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
     num_threads = min(threads_or_cpus(num_threads), 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
@@ -129,17 +129,17 @@ def verify_pairs(
 
 @dataclass(frozen=True)
 class _View:
-    """Keypoints of an image as the estimators take them.
+    """Keypoints of an image, prepared for the estimators.
 
     Attributes:
         camera: the image's camera.
         xy: float32 [n, 2] keypoints.
-        flat: float64 [2, n] undistorted keypoints in pixels from the principal point; None
+        flat: float64 [2, n] undistorted keypoints in pixels relative to the principal point; None
             without a focal length prior.
         focal: mean focal length in pixels.
-        to_flat: float64 [3, 3] takes pixels without distortion to `flat`.
-        place: int32 [n] place of each keypoint in an order that is spread over the image from
-            its beginning on.
+        to_flat: float64 [3, 3] maps undistorted pixels to `flat`.
+        place: int32 [n] rank of each keypoint in an order whose beginnings are all spread over the
+            image.
     """
 
     camera: pycolmap.Camera
@@ -172,8 +172,8 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
 def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
     """Order points so that any beginning of the order is spread over the image.
 
-    The image is divided into cells; every cell gives one random point before any gives its
-    second, and so on.
+    The image is divided into cells. The order takes one random point of every cell, then a second
+    one, and so on.
 
     Args:
         x: float64 [n, 2] points in pixels.
@@ -181,14 +181,14 @@ def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.in
         seed: seed of the random order within a cell.
 
     Returns:
-        int32 [n] place of each point in the order.
+        int32 [n] rank of each point in the order.
     """
     edge = math.sqrt(size[0] * size[1] / _NUM_CELLS)
     num_columns, num_rows = (math.ceil(length / edge) for length in size)
     column = np.clip(x[:, 0] / edge, 0, num_columns - 1).astype(np.uint16)
     row = np.clip(x[:, 1] / edge, 0, num_rows - 1).astype(np.uint16)
     order = np.random.default_rng(seed).permutation(len(x))
-    # NumPy sorts numbers of 16 bits many times as fast as longer ones.
+    # NumPy sorts 16-bit integers many times faster than longer ones.
     cell = (row * np.uint16(num_columns) + column)[order]
     by_cell = np.argsort(cell, kind="stable")
     sorted_cell = cell[by_cell]
@@ -207,14 +207,14 @@ def _verify_pair(
     matches: NDArray[np.uint32],
     search: Search,
 ) -> TwoViewGeometry:
-    """Choose the model of one pair as COLMAP 4.2 does (EstimateTwoViewGeometry's rules).
+    """Choose the model of one pair by the rules of COLMAP 4.2's EstimateTwoViewGeometry.
 
-    Its test for watermarks is left out: the matches of a wide picture that pans slowly pass
-    it, and the mapper would lose the pairs of neighbours that tracks are made of.
+    COLMAP's watermark test is left out: it also flags slow pans of a wide view, and the mapper
+    would then lose the pairs of neighbours that connect the tracks.
     """
     if len(matches) < max(search.options.min_num_inliers, MIN_MATCHES):
         return _degenerate()
-    # A beginning of the order that was made for the whole image stays spread in its part.
+    # The order is spread over the whole image, so its subset is spread over the matched part.
     places = a.place.take(matches[:, 0])
     num_refined = min(len(matches), max(MAX_REFINED, search.options.max_samples))
     nearest = np.argpartition(places, num_refined - 1)[:num_refined]
@@ -231,7 +231,7 @@ def _degenerate() -> TwoViewGeometry:
 def _verify_calibrated(
     a: _View, b: _View, matches: NDArray[np.uint32], order: NDArray[np.int64], search: Search
 ) -> TwoViewGeometry:
-    """The geometry of a pair whose focal lengths are known."""
+    """The geometry of a pair with known focal lengths."""
     options = search.options
     num_needed = options.min_num_inliers
     assert a.flat is not None
@@ -242,8 +242,8 @@ def _verify_calibrated(
     flat = spread_points(flat_a, flat_b, order)
     E = find_pose(flat, search, (a.focal, b.focal))
 
-    # F cannot have more inliers than there are matches: where E comes that close, the pair
-    # is calibrated whatever F says.
+    # F cannot have more inliers than there are matches. If E has nearly that many, the pair is
+    # calibrated and F is not needed.
     F = None
     num_F = 0
     if E.count < num_needed or E.count <= options.min_e_f_inlier_ratio * len(matches):
@@ -252,7 +252,7 @@ def _verify_calibrated(
 
     calibrated = E.count >= num_needed and E.count > options.min_e_f_inlier_ratio * num_F
     rival = E if calibrated or F is None or num_F < num_needed else F
-    # A plane maps to a plane without distortion only.
+    # Distorted points of a plane are not related by a homography, so undistorted ones are used.
     H = find_homography(flat, search, rival.count)
     if calibrated:
         config = TwoViewConfig.CALIBRATED
@@ -270,11 +270,11 @@ def _verify_calibrated(
         if H.count > chosen.count:
             chosen = H
 
-    # A pose means nothing where a homography explains the matches as well.
+    # A pose is meaningless if a homography explains the matches as well.
     qvec = tvec = None
     if config == TwoViewConfig.CALIBRATED:
         qvec = np.asarray(E.pose.q, dtype=np.float64).reshape(4)
-        # PoseLib's steps along the sphere of directions leave it a little.
+        # PoseLib's refinement does not keep the translation at exactly unit length.
         tvec = _unit(np.asarray(E.pose.t, dtype=np.float64).reshape(3))
     return TwoViewGeometry(
         config=config,
@@ -288,7 +288,7 @@ def _verify_calibrated(
 
 
 def _inliers(matches: NDArray[np.uint32], model: Model) -> NDArray[np.uint32]:
-    """The inliers of a model; the same object where all matches are."""
+    """The inliers of a model; the same array if all matches are inliers."""
     chosen = matches if model.count == len(matches) else matches.compress(model.inliers, axis=0)
     return chosen.astype(np.uint32, copy=False)
 
@@ -304,9 +304,8 @@ def _verify_uncalibrated(
 ) -> TwoViewGeometry:
     """The geometry of a pair without known focal lengths.
 
-    Where both images have the same camera, COLMAP 4.2 looks for a relative pose with a shared
-    focal length. F has one degree of freedom more and is found in less time; what agrees with
-    one agrees with the other.
+    If both images have the same camera, COLMAP 4.2 estimates a relative pose with a shared focal
+    length. F has one more degree of freedom and is faster to estimate, with the same inliers.
     """
     options = search.options
     pixels = spread_points(*_pixels(a, b, matches), order)
@@ -329,7 +328,7 @@ def _verify_uncalibrated(
 
 
 def _on_rays(E: _Floats, a: _View, b: _View) -> _Floats:
-    """The essential matrix of normalised coordinates from `find_pose`'s."""
+    """Convert the essential matrix of `find_pose` to normalised coordinates."""
     return _unit(E * np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0]))
 
 
@@ -345,17 +344,17 @@ def agreeing_matches(
     *,
     max_error: float,
 ) -> NDArray[np.bool_]:
-    """Which other matches agree with the geometry that was found for a pair of images.
+    """Test which matches agree with the two-view geometry of their image pair.
 
     Args:
         geometry: the geometry, from the first image to the second.
         xa: float32 [n, 2] pixels in the first image.
-        xb: float32 [n, 2] pixels in the second one.
-        cameras: camera of the first image and of the second one.
+        xb: float32 [n, 2] pixels in the second image.
+        cameras: cameras of the first and the second image.
         max_error: largest Sampson (E, F) or transfer (H) error in pixels.
 
     Returns:
-        bool [n]; where a homography explains the pair as well, what agrees with it counts, too.
+        bool [n]. If the pair is planar or panoramic, matches that agree with H count, too.
     """
     a, b = xa.T.astype(np.float64), xb.T.astype(np.float64)
     agrees = np.zeros(a.shape[1], dtype=np.bool_)

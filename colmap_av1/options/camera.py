@@ -1,4 +1,4 @@
-"""Options of the camera of new images."""
+"""Camera options of new images."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from colmap_av1.options.fields import Options, option
 if TYPE_CHECKING:
     import pycolmap
 
-# Models of new cameras where none is given: COLMAP's own choice; where the focal length is
-# estimated, one with two distortion parameters, as distortion beyond one bends focal length and
-# path; and the simplest with two focal lengths and distortion.
+# Default models of new cameras. The first is COLMAP's own. If the focal length is estimated, a
+# second distortion parameter is used, because unmodelled distortion biases the focal length and
+# bends the path. The third is the simplest model with distortion and two focal lengths.
 DEFAULT_MODEL = "SIMPLE_RADIAL"
 DEFAULT_MODEL_OF_KNOWN_FOCAL_LENGTH = "RADIAL"
 DEFAULT_MODEL_OF_OBLONG_PIXELS = "OPENCV"
-# Time from the first row of a picture to the last that no camera takes, in milliseconds.
+# Largest accepted time from the first row of a picture to the last, in milliseconds.
 _LONGEST_READ_OUT = 100
 
 
@@ -31,30 +31,29 @@ class CameraOptions(Options):
 
     camera_model: str | None = option(
         None,
-        "one of COLMAP's camera models; None: RADIAL where the focal length can be estimated from "
-        "the tracks, else SIMPLE_RADIAL; OPENCV, which has two focal lengths, where pixels are not "
-        "square",
+        "one of COLMAP's camera models; None: RADIAL if the focal length can be estimated from the "
+        "tracks, else SIMPLE_RADIAL; OPENCV, which has two focal lengths, if pixels are not square",
         common=True,
     )
     camera_params: str | None = option(
         None,
-        "its parameters in COLMAP's order, such as 'f,cx,cy,k'; None: the focal length estimated "
-        "from the tracks, else 0.9 times the longer side, 0.5 times with fisheye models, to be "
-        "refined; principal point in the centre",
+        "camera parameters in COLMAP's order, such as 'f,cx,cy,k'; None: the focal length is "
+        "estimated from the tracks, else it starts at 0.9 times the longer side (fisheye models: "
+        "0.5 times) and is refined; the principal point is the image centre",
         common=True,
     )
     single_camera: bool | None = option(
         None,
-        "1: one camera for all images; 0: one for each; None: one for each video, and for the "
-        "photos of each camera and size",
+        "1: one camera for all images; 0: one for each image; None: one for each video, and one "
+        "for the photos of each camera and size",
     )
 
     rolling_shutter: str = option(
         "none",
-        "estimate: from the tracks, the time in which the shutter reads the rows of a picture, and "
-        "move keypoints to where they are in the middle of it, where that explains the tracks "
-        "better; or that time in milliseconds, below 0 where rows are read from the bottom; none: "
-        "all rows are taken at once",
+        "estimate: estimate from the tracks how long the shutter takes to read the rows of a "
+        "picture, and move keypoints to the middle of the read-out if that fits the tracks better; "
+        "or this time in milliseconds, negative if rows are read from the bottom; none: assume a "
+        "global shutter",
     )
 
     def __post_init__(self) -> None:
@@ -63,10 +62,10 @@ class CameraOptions(Options):
         if self.camera_model is not None:
             models = [self.camera_model]
         elif self.camera_params is not None:
-            # Which of them depends on the pixels' shape.
+            # The default model depends on the pixel aspect, which is not known yet.
             models = [DEFAULT_MODEL, DEFAULT_MODEL_OF_OBLONG_PIXELS]
         else:
-            return  # nothing that pycolmap would have to be imported for
+            return  # avoids importing pycolmap
         cameras = [camera_of_model(name) for name in models]
         if self.camera_params is not None:
             num_given = self.camera_params.count(",") + 1
@@ -75,7 +74,7 @@ class CameraOptions(Options):
 
 
 def _check_shutter(wanted: str) -> None:
-    """Refuse a read-out time that is none."""
+    """Raise if a read-out time is invalid."""
     if wanted in ("estimate", "none"):
         return
     try:
@@ -92,12 +91,12 @@ def _check_shutter(wanted: str) -> None:
 def camera_of_model(
     name: str, focal_length: float = 1.0, width: int = 1, height: int = 1
 ) -> pycolmap.Camera:
-    """A pycolmap.Camera of one of COLMAP's models, principal point in the centre.
+    """Create a camera of one of COLMAP's models, with the principal point in the centre.
 
     Raises:
         OptionError: there is no such model, or it has no focal length.
     """
-    import pycolmap  # noqa: PLC0415 - slow to import, and options are not
+    import pycolmap  # noqa: PLC0415 - slow to import
 
     models = pycolmap.CameraModelId.__members__
     if name not in models or name == "INVALID":
@@ -107,17 +106,17 @@ def camera_of_model(
     camera: pycolmap.Camera = create(0, models[name], focal_length, width, height)
     if len(camera.focal_length_idxs()) == 0:
         raise OptionError(
-            f"camera model {name} has no focal length, so it does not fit a "
-            "video: give a perspective or fisheye model such as SIMPLE_RADIAL"
+            f"camera model {name} has no focal length: give a perspective or fisheye model such as "
+            "SIMPLE_RADIAL"
         )
     return camera
 
 
 def parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:
-    """The parameters of a pycolmap.Camera's model from COLMAP's spelling.
+    """Parse comma-separated camera parameters, in COLMAP's order.
 
     Raises:
-        OptionError: they do not fit the model.
+        OptionError: the parameters do not fit the camera's model.
     """
     wanted = f"{camera.model.name} takes {len(camera.params)} numbers, {camera.params_info}"
     try:
@@ -125,7 +124,7 @@ def parse_camera_params(text: str, camera: pycolmap.Camera) -> list[float]:
     except ValueError:
         raise OptionError(f"cannot read camera_params {text!r}: {wanted}") from None
     if len(params) != len(camera.params) or not all(map(math.isfinite, params)):
-        raise OptionError(f"camera_params {text!r} do not fit: {wanted}")
+        raise OptionError(f"camera_params {text!r} do not fit the model: {wanted}")
     if min(params[i] for i in camera.focal_length_idxs()) <= 0:
-        raise OptionError(f"camera_params {text!r} hold a focal length of 0 or less: {wanted}")
+        raise OptionError(f"camera_params {text!r} have a focal length of 0 or less: {wanted}")
     return params

@@ -22,7 +22,7 @@ OnExisting = Literal["error", "append", "replace"]
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """The options of finding or making the AV1 stream of a video, see `MatchOptions`."""
+    """Options for finding or creating the AV1 stream of a video, see `MatchOptions`."""
 
     read: ReadOptions = ReadOptions()
     encode: EncodeOptions = EncodeOptions()
@@ -32,7 +32,7 @@ class SourceOptions:
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """The options of tracking a video, see `MatchOptions`."""
+    """Options for tracking a video, see `MatchOptions`."""
 
     read: ReadOptions = ReadOptions()
     tracks: TrackOptions = TrackOptions()
@@ -48,7 +48,7 @@ class MatchOptions(Options):
     images: ImageOptions = part(ImageOptions())
     masks: MaskOptions = part(MaskOptions())
     encode: EncodeOptions = part(EncodeOptions())
-    # Its threads are the run's where it has none of its own.
+    # `read.num_threads` defaults to the run's, see `reading`.
     read: ReadOptions = part(ReadOptions(), unused=("num_threads",))
     tracks: TrackOptions = part(TrackOptions())
     refine: RefineOptions = part(RefineOptions())
@@ -60,22 +60,22 @@ class MatchOptions(Options):
     run: RunOptions = part(RunOptions())
     on_existing: OnExisting = option(
         "error",
-        "where listed images have keypoints or matches already: error: refuse the database; "
-        "append: add the new ones after them; replace: remove them",
+        "if listed images already have keypoints or matches: error: stop; append: add the new ones "
+        "after the existing ones; replace: remove the existing ones",
         common=True,
     )
     keep_stream: str | os.PathLike[str] | None = option(
         None,
-        "file that keeps the AV1 stream of a video that is not AV1, for further runs; None: the "
-        "output folder of reconstruct and compare keeps it, other commands keep none",
+        "file in which to keep the AV1 stream of a converted video, for further runs; None: "
+        "reconstruct and compare keep it in the output folder, other commands do not keep it",
     )
     reencode: bool = option(
-        False, "convert an AV1 video as well where its structure is poor for matching"
+        False, "also convert an AV1 video if its structure is poor for matching"
     )
 
     @property
     def files(self) -> tuple[str | os.PathLike[str] | None, ...]:
-        """The files and folders that are read beside videos and images; None: not given."""
+        """The files and folders that are read in addition to videos and images; None: not given."""
         return self.images.frame_list, self.masks.mask_path
 
     @property
@@ -87,7 +87,7 @@ class MatchOptions(Options):
 
     @property
     def source(self) -> SourceOptions:
-        """How the AV1 stream of a video is found or made."""
+        """How the AV1 stream of a video is found or created."""
         return SourceOptions(self.reading, self.encode, self.keep_stream, self.reencode)
 
     @property
@@ -98,7 +98,7 @@ class MatchOptions(Options):
 
 @dataclass(frozen=True)
 class ReconstructOptions(Options):
-    """Options of `reconstruct`; of `match`, all but the selection of tracks applies."""
+    """Options of `reconstruct`, including those of `match` except the selection of tracks."""
 
     title: ClassVar[str] = "reconstruction"
 
@@ -116,18 +116,19 @@ class ReconstructOptions(Options):
     )
     image_type: Literal["jpg", "png"] | None = option(
         None,
-        "format of the images of videos; None: that of image_name, else jpg; photos keep theirs",
+        "format of video images; None: from the extension of image_name, else jpg; photos keep "
+        "their format",
     )
     moving: Literal["keep", "drop", "mask"] = option(
         "drop",
-        "what moves by itself, such as people and cars: drop: it gets no points; mask: nor does it "
-        "in the masks written for trainers; keep: it is not looked for",
+        "dynamic objects, such as people and cars: drop: they get no points; mask: they are also "
+        "masked in the images for trainers; keep: do not detect them",
         common=True,
     )
     max_images: int = option(
         300,
-        "images of a video with more frames, spread evenly in parallax and as close together as "
-        "tracks need to connect them, where no option says which frames are images",
+        "if no option chooses the frames: number of images for longer videos, evenly spaced in "
+        "parallax and close enough for tracks to connect them",
         least=3,
         common=True,
     )
@@ -136,23 +137,23 @@ class ReconstructOptions(Options):
         super().__post_init__()
         if self.match.camera.single_camera is False and not self.mapping.adjust:
             raise OptionError(
-                "single_camera is 0, but only the adjustment estimates the cameras: leave out "
+                "single_camera 0 needs the bundle adjustment to estimate the cameras: leave out "
                 "--adjust 0"
             )
         name = self.match.images.image_name
         if name.count(".") > 1:
             raise OptionError(
-                f"image_name '{name}': give one without a dot but that of the extension"
+                f"image_name '{name}' has several dots: use only the dot of the extension"
             )
         if self.image_type is not None and "." in name:
             raise OptionError(
-                f"image_name '{name}' has an extension, which is the format: leave out image_type "
-                "or the extension"
+                f"image_name '{name}' already has an extension: leave out image_type or the "
+                "extension"
             )
 
     @property
     def with_extension(self) -> ReconstructOptions:
-        """The same with the extension of the images in `image_name`, in place of `image_type`."""
+        """A copy with the image format as the extension of `image_name`, without `image_type`."""
         images = self.match.images
         if "." in images.image_name:
             return self
@@ -162,7 +163,7 @@ class ReconstructOptions(Options):
 
 @dataclass(frozen=True)
 class DensifyOptions(Options):
-    """Options of `densify`; of `match`, all of reading, tracks and existing images apply."""
+    """Options of `densify`, including those of `match` for reading, tracks and existing images."""
 
     title: ClassVar[str] = "dense points"
 

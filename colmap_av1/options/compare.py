@@ -13,7 +13,7 @@ from colmap_av1.options.commands import MatchOptions
 from colmap_av1.options.fields import Options, option, part
 from colmap_av1.options.model import TriangulateOptions
 
-# The trainer that is built in; others are commands with these placeholders.
+# The built-in trainer. Other trainers are commands with these placeholders.
 GSPLAT = "gsplat"
 PLACEHOLDERS = (
     "data",
@@ -25,9 +25,9 @@ PLACEHOLDERS = (
     "milestones",
     "name",
 )
-# Programs that run the word after -c.
+# Programs that execute the word after -c.
 _SHELL = re.compile(r"(.*/)?((ba|da|k|z)?sh|python[0-9.]*)")
-# Words that only a shell understands.
+# Words that only a shell interprets.
 _OPERATOR = re.compile(r"&|&&|\||\|\||;|\d*[<>].*")
 
 
@@ -37,17 +37,17 @@ class LearnedOptions(Options):
 
     title: ClassVar[str] = "learned features"
 
-    max_keypoints: int = option(2048, "most keypoints of an image", least=16)
+    max_keypoints: int = option(2048, "largest number of keypoints per image", least=16)
     max_image_size: int = option(
         1024, "images are scaled down to this many pixels along the longer side", least=64
     )
     learned_every: int = option(
-        1, "match every n-th image only; the others are left without a pose", least=1
+        1, "match only every n-th image; the others are not registered", least=1
     )
     learned_offsets: tuple[int, ...] | None = option(
         None,
-        "distances between the images of a pair, counted in images that are matched; None: all "
-        "pairs of up to 30 images, else 1,2,4,8",
+        "distances between the images of a pair, counted in matched images; None: all pairs of up "
+        "to 30 images, else 1,2,4,8",
         least=1,
     )
 
@@ -59,7 +59,7 @@ class LearnedOptions(Options):
 
 @dataclass(frozen=True)
 class CompareOptions(Options):
-    """Options of `compare`; those of `match` apply but for track selection and existing rows."""
+    """Options of `compare`, with those of `match` except track selection and existing rows."""
 
     title: ClassVar[str] = "comparison"
 
@@ -73,31 +73,31 @@ class CompareOptions(Options):
         ("av1", "av1-refined", "sift-exhaustive", "sift-sequential"),
         "front-ends to compare, in this order: av1, av1-sparse, av1-dense, av1-refined, "
         "av1-refined-sparse, av1-refined-dense, sift-exhaustive, sift-sequential, disk-lightglue, "
-        "aliked-lightglue, and matches of other programs in hloc's layout as "
-        "NAME=FEATURES.h5:MATCHES.h5",
+        "aliked-lightglue; and NAME=FEATURES.h5:MATCHES.h5 for matches of other programs in hloc's "
+        "format",
         common=True,
     )
     all_tracks: bool = option(
-        True, "for each of this package's models, add one with all tracks on the same poses"
+        True, "for each model of this package, add one with all tracks and the same poses"
     )
     trainer: str | None = option(
         None,
-        "trains 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a "
-        "command with {data}, the folder of that half, and as needed {test}, that of the other "
-        "half, {gaussians}, a .ply of initial Gaussians of the points, {output}, {renders}, which "
-        "receives the renderings of the test images, {iterations}, {milestones}, as in 1000,3000, "
-        "after each of which it then renders into {renders}/1000 and so on, and {name}; a shell "
-        "reads it only where it is sh -c 'LINE' sh {data} ..., \"$1\" in LINE",
+        "train 3D Gaussians on half of each model's images: gsplat, which needs CUDA, or a command "
+        "with {data}, the folder of that half. Further placeholders: {test}, the folder of the "
+        "other half; {gaussians}, a .ply of initial Gaussians; {output}; {renders}, the folder for "
+        "renderings of the test images; {iterations}; {milestones}, such as 1000,3000, after which "
+        "to render into {renders}/1000 and so on; {name}. No shell is used unless the command is "
+        "sh -c 'LINE' sh {data} ..., where LINE uses \"$1\"",
         common=True,
     )
     iterations: int = option(30_000, "iterations of the training", least=1)
     milestones: tuple[int, ...] = option(
         (1000, 3000, 7000, 15_000),
-        "iterations after which renderings are measured as well, of gsplat or of a command with "
+        "also measure renderings after these iterations, with gsplat or a command with "
         "{milestones}",
         least=1,
     )
-    split: bool = option(False, "write the two halves even where nothing is trained")
+    split: bool = option(False, "write the two halves even without training")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,29 +106,29 @@ class CompareOptions(Options):
 
 
 def words_of_trainer(trainer: str) -> list[str]:
-    """The words of a trainer's command, split as a shell does, with their placeholders.
+    """Split a trainer's command into words as a shell does, and check its placeholders.
 
     Raises:
-        OptionError: it cannot be split, a placeholder is unknown or has a format, {data} is
-            missing, or a shell would have to read it, or would read a value as code.
+        OptionError: the command cannot be split, a placeholder is unknown or has a format, {data}
+            is missing, the command needs a shell, or a shell would execute a value as code.
     """
     known = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)
-    way_out = "quote it as for a shell"
+    remedy = "quote it as for a shell"
     try:
         words = shlex.split(trainer)
-        way_out = "write {{ for a brace"
+        remedy = "write {{ for a brace"
         fields = [field for word in words for field in _fields(word)]
     except ValueError as error:
-        raise OptionError(f"trainer '{trainer}': {error}: {way_out}") from error
+        raise OptionError(f"trainer '{trainer}': {error}: {remedy}") from error
     names = {name for name, _, _ in fields}
     if not names <= set(PLACEHOLDERS) or "data" not in names:
         raise OptionError(
-            f"trainer '{trainer}': give '{GSPLAT}', or a command with {{data}} and others of "
-            f"{known}"
+            f"trainer '{trainer}' lacks {{data}} or has an unknown placeholder: give '{GSPLAT}', "
+            f"or a command with {{data}} and any of {known}"
         )
     formatted = next((name for name, spec, conversion in fields if spec or conversion), None)
     if formatted is not None:
-        raise OptionError(f"trainer '{trainer}': give {{{formatted}}} without a format")
+        raise OptionError(f"trainer '{trainer}': {{{formatted}}} has a format: give it without one")
     _check_shell(trainer, words)
     return words
 
@@ -140,18 +140,18 @@ def _fields(word: str) -> list[tuple[str, str | None, str | None]]:
 
 
 def _check_shell(trainer: str, words: list[str]) -> None:
-    """Refuse a command that only a shell understands, and values within a shell's line."""
+    """Raise if the command needs a shell, or has a placeholder inside a shell's code."""
     example = 'sh -c \'train "$1" && render "$1" "$2"\' sh {data} {renders}'
     shell = next((i for i, word in enumerate(words) if _SHELL.fullmatch(word)), len(words))
     option = next((i for i in range(shell, len(words)) if re.match(r"-\w*c", words[i])), len(words))
     if any(_fields(line) for line in words[option + 1 : option + 2]):
         raise OptionError(
-            f"trainer '{trainer}': {words[shell]} would take a folder's name for code: give "
-            f"placeholders after its line, as in {example}"
+            f"trainer '{trainer}': {words[shell]} would execute a folder's name as code: give "
+            f"placeholders after the code, as in {example}"
         )
     operator = next((word for word in words if _OPERATOR.fullmatch(word)), None)
     if operator is not None:
         raise OptionError(
-            f"trainer '{trainer}': no shell reads it, so {operator} means nothing: ask for one, "
-            f"as in {example}"
+            f"trainer '{trainer}': {operator} needs a shell, and none is used: call one, as in "
+            f"{example}"
         )

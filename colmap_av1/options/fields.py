@@ -1,4 +1,4 @@
-"""What a field of options declares beside its type, and the check of its value."""
+"""Declare option fields with help and bounds, and check their values."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from colmap_av1.errors import OptionError
 
 _Value = TypeVar("_Value")
 
-# Key of a field's metadata.
+# Key in a field's metadata.
 _DECLARED = "declared"
-# Whole numbers are 32 bits wide where they are used; squares of others fit, too.
+# Largest magnitude of a number: integers are stored in 32 bits, and squares of floats do not
+# overflow.
 _LARGEST = 2**31 - 1
 _KINDS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text"}
 _MANY = {int: "whole numbers", str: "texts"}
@@ -27,19 +28,19 @@ _MANY = {int: "whole numbers", str: "texts"}
 
 @dataclass(frozen=True)
 class Declared:
-    """What a field says beside its type.
+    """What an option field declares in addition to its type.
 
     Attributes:
-        help: what the value does, a line of any length.
-        least: smallest value, or number in a tuple.
+        help: description of the option, one line of any length.
+        least: smallest value, also of the numbers in a tuple.
         most: largest value.
-        above: values are larger than this.
-        below: values are smaller than this.
-        unit: what numbers count, such as "pixels", for messages.
-        among: the only values.
-        common: one of the options that most users need.
+        above: exclusive lower bound.
+        below: exclusive upper bound.
+        unit: unit of numbers, such as "pixels", for messages.
+        among: the only allowed values.
+        common: whether most users need the option.
         spellings: further names on the command line.
-        unused: paths of the fields of a part that the options have no use for.
+        unused: paths of fields of this part that have no effect here.
     """
 
     help: str = ""
@@ -67,7 +68,7 @@ def option(
     common: bool = False,
     spellings: tuple[str, ...] = (),
 ) -> _Value:
-    """A field of an options dataclass; see `Declared`."""
+    """Declare a field of an options dataclass, see `Declared`."""
     declared = Declared(
         help, least, most, above, below, unit, among, common=common, spellings=spellings
     )
@@ -75,25 +76,25 @@ def option(
 
 
 def part(default: _Value, *, unused: Collection[str] = ()) -> _Value:
-    """A field that holds further options.
+    """Declare a field that holds further options.
 
     Args:
-        default: these.
-        unused: those among them that have no effect here, "name" or "part.name".
+        default: the default options.
+        unused: names of options that have no effect here, "name" or "part.name".
     """
     declared = Declared(unused=frozenset(unused))
     return dataclasses.field(default=default, metadata={_DECLARED: declared})
 
 
 class Options:
-    """Base of the options dataclasses: values that cannot work are refused when one is made.
+    """Base class of the options dataclasses. Values are checked on construction.
 
     Attributes:
-        title: what the options are about, as help titles them.
+        title: title of the group in help texts.
         colmap_prefix: COLMAP's name of the group, as in --ImageReader.camera_model.
 
     Raises:
-        OptionError: a value is of another type, or out of its bounds.
+        OptionError: a value has the wrong type or is out of bounds.
     """
 
     title: ClassVar[str] = ""
@@ -121,20 +122,20 @@ def field_types(kind: type) -> Mapping[str, Any]:
     return _known_types(kind)
 
 
-@functools.cache  # a command line asks some hundred times
+@functools.cache  # called hundreds of times per command line
 def _known_types(kind: type) -> Mapping[str, Any]:
     return types.MappingProxyType(typing.get_type_hints(kind))
 
 
 def members_of(hint: Any) -> tuple[Any, ...]:
-    """The types that a type stands for: those of a union, or itself."""
+    """The members of a union type; for other types, the type itself."""
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         return typing.get_args(hint)
     return (hint,)
 
 
 def is_path(members: Collection[Any]) -> bool:
-    """Whether paths are among some types."""
+    """Whether any of the types is a path."""
     return any(typing.get_origin(member) is os.PathLike for member in members)
 
 
@@ -154,7 +155,7 @@ def _fits_one(value: Any, hint: Any, declared: Declared) -> bool:
 
 
 def _is_of(value: Any, hint: Any) -> bool:
-    """Whether a value is of a plain type; a bool is no number."""
+    """Whether a value has a plain type; a bool does not count as a number."""
     if hint in (int, float):
         wide: Any = Integral if hint is int else Real
         return isinstance(value, wide) and not isinstance(value, bool)
@@ -174,7 +175,7 @@ def _is_within(value: float, declared: Declared) -> bool:
 
 
 def _wanted(value: Any, hint: Any, declared: Declared) -> str:
-    """What to give in place of a value."""
+    """Describe the values that are accepted in place of `value`."""
     members = members_of(hint)
     first = members[0]
     none = ", or None" if type(None) in members else ""
@@ -197,7 +198,7 @@ def _wanted(value: Any, hint: Any, declared: Declared) -> str:
 
 
 def _bounds(declared: Declared) -> str:
-    """The bounds of a number in words; empty where there are none."""
+    """Describe the bounds of a number; empty if there are none."""
     unit, least, most = declared.unit, declared.least, declared.most
     if declared.among:
         *others, last = map(str, declared.among)

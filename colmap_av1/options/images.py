@@ -1,4 +1,4 @@
-"""Options of the images: which frames of the video they are, and how they are named."""
+"""Options of the images: which frames become images, and how they are named."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, option
 
-# Formats that images are written in.
+# Formats in which images are written.
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg")
 _NUMBER_FIELD = re.compile(r"%0?\d*d")
 _LONGEST_NUMBER = 20  # digits
@@ -20,45 +20,45 @@ _LONGEST_NAME = 255  # bytes, on all usual file systems
 
 @dataclass(frozen=True)
 class ImageOptions(Options):
-    """Which frames of the video are images: all, unless one of the options chooses."""
+    """Which frames of the video become images: all, unless an option chooses among them."""
 
     title: ClassVar[str] = "images"
 
     image_name: str = option(
         "frame_%06d",
-        "file name of new images; the number is the frame's display index, from 0; .png or .jpg "
-        "at its end is their format, which is PNG without one, JPEG in reconstruct",
+        "file name of new images; the number is the frame's display index, from 0; the extension "
+        ".png or .jpg chooses the format (default PNG, JPEG in reconstruct)",
     )
     num_images: int | None = option(
-        None, "number of images, spread over the video", least=2, common=True
+        None, "number of images, spread evenly over the video", least=2, common=True
     )
     every: int | None = option(None, "every n-th frame becomes an image", least=1, common=True)
     fps: float | None = option(
         None,
-        "images per second, by the time stamps of the frames",
+        "images per second, measured by the time stamps of the frames",
         above=0,
         unit="images per second",
         common=True,
     )
     frame_list: str | os.PathLike[str] | None = option(
         None,
-        "text file with a line for each image: the frame's index and, if wanted, the image's name",
+        "text file with one line per image: the frame's index and optionally the image's name",
         common=True,
     )
     select: Literal["time", "parallax"] = option(
         "time",
-        "time: num_images at equal intervals of time; parallax: at equal steps of parallax along "
-        "the tracks",
+        "time: space num_images evenly in time; parallax: space them evenly in parallax, measured "
+        "on the tracks",
     )
     skip_blurred: bool = option(
         True,
-        "replace a blurred image by a sharp frame nearby that overlaps as well; only where "
-        "num_images or fps choose and images are written",
+        "replace a blurred image by a nearby sharp frame with as much overlap; applies only if "
+        "num_images or fps chooses the frames and images are written",
     )
     first_number: int | None = option(
         None,
-        "number of the video's first frame in the names of existing images; None: only names that "
-        "determine the frame are accepted",
+        "number of the video's first frame in the names of existing images; None: accept only "
+        "names that determine the frame",
     )
 
     @property
@@ -68,7 +68,7 @@ class ImageOptions(Options):
 
     @property
     def ways(self) -> list[str]:
-        """The options that say which frames are images, of those that are given."""
+        """Names of the given options that choose the frames."""
         names = ("num_images", "every", "fps", "frame_list")
         return [name for name in names if getattr(self, name) is not None]
 
@@ -77,52 +77,53 @@ class ImageOptions(Options):
         given = self.ways
         if len(given) > 1:
             raise OptionError(
-                f"{given[0]} and {given[1]} both say which frames are images: give one"
+                f"{given[0]} and {given[1]} both choose which frames become images: give one"
             )
         if self.select == "parallax" and self.num_images is None:
-            raise OptionError("select 'parallax' spreads a number of images: give num_images, too")
+            raise OptionError("select 'parallax' needs the number of images: give num_images, too")
         check_image_pattern(self.file_name)
 
 
 @dataclass(frozen=True)
 class MaskOptions(Options):
-    """Which pixels count; black ones of masks are left out."""
+    """Masks of the pixels to ignore."""
 
     title: ClassVar[str] = "masks"
     colmap_prefix: ClassVar[str] = "ImageReader"
 
     mask_path: str | os.PathLike[str] | None = option(
         None,
-        "masks, whose black pixels are ignored: a PNG for all frames, or a folder with one for "
-        "every frame, or with NAME.png for every image, as COLMAP has them",
+        "masks, whose black pixels are ignored: one PNG for all frames, or a folder with one for "
+        "each frame, or with NAME.png for each image as in COLMAP",
         common=True,
     )
 
 
 def check_image_pattern(pattern: str) -> str:
-    """Refuse a pattern that cannot name images; 'frame_%06d.png' can.
+    """Check a pattern for image names, such as 'frame_%06d.png'.
 
     Returns:
         The pattern's number field.
 
     Raises:
-        OptionError: it has no number field, or several, names a folder, or no format of images.
+        OptionError: the pattern does not have exactly one number field, names a folder, lacks the
+            extension of an image format, or gives invalid file names.
     """
     fields = _NUMBER_FIELD.findall(pattern)
     if len(fields) != 1 or pattern.count("%") != 1:
         raise OptionError(
-            f"image_name '{pattern}' needs exactly one number field, such as frame_%06d.png"
+            f"image_name '{pattern}' does not have exactly one number field: give one such as "
+            "frame_%06d.png"
         )
-    # Judged before it is used: a field of many digits makes a name that fills memory.
+    # Checked before the pattern is used, because formatting a huge field width fills the memory.
     too_long = int(fields[0].strip("%d") or 0) > _LONGEST_NUMBER if len(fields[0]) < 9 else True
     if too_long or len(os.fsencode(pattern)) + _LONGEST_NUMBER > _LONGEST_NAME or "\0" in pattern:
         raise OptionError(
-            f"image_name {pattern[:40]!r} gives names that files cannot have: give one such as "
-            "frame_%06d.png"
+            f"image_name {pattern[:40]!r} gives invalid file names: give one such as frame_%06d.png"
         )
     if pattern.encode(errors="replace").decode() != pattern:
         raise OptionError(
-            f"image_name {pattern!r} is not UTF-8, as names in a database are: give another"
+            f"image_name {pattern!r} is not UTF-8, which databases need: give another name"
         )
     if Path(pattern).name != pattern or pattern.startswith("."):
         raise OptionError(
@@ -133,10 +134,12 @@ def check_image_pattern(pattern: str) -> str:
 
 
 def check_extension(name: str) -> None:
-    """Refuse a name without the extension of an image format.
+    """Check that a name has the extension of an image format.
 
     Raises:
-        OptionError: so it does.
+        OptionError: it has not.
     """
     if PurePosixPath(name).suffix.lower() not in IMAGE_EXTENSIONS:
-        raise OptionError(f"image name '{name}': give one that ends in .png, .jpg or .jpeg")
+        raise OptionError(
+            f"image name '{name}' has no image extension: give one that ends in .png, .jpg or .jpeg"
+        )

@@ -1,4 +1,4 @@
-"""Options of poses and points of a model, and of files for other programs."""
+"""Options of poses and points, and of export to other programs."""
 
 from __future__ import annotations
 
@@ -26,31 +26,30 @@ class TriangulateOptions(Options):
     )
     min_angle: float = option(
         1.5,
-        "smallest triangulation angle of a point of a survey, between its two widest rays, in "
-        "degrees",
+        "smallest triangulation angle of survey points, between the two widest rays, in degrees",
         least=0,
         below=90,
         unit="degrees",
     )
     max_depth_error: float | None = option(
         0.07,
-        "largest expected error of the depth of a point of a survey, as a fraction of it, from the "
-        "triangulation angle and the reprojection error; None: any",
+        "largest expected depth error of survey points, as a fraction of the depth, from the "
+        "triangulation angle and the reprojection error; None: no limit",
         above=0,
         unit="a fraction",
     )
     min_observations: int = option(3, "fewest observations of a point", least=2, common=True)
     points: Literal["splats", "survey"] = option(
         "splats",
-        "splats: what training of Gaussian splats starts well from, with far points, evenly spread "
-        "in the images, holes filled; survey: only points of sure depth, by min_angle and "
-        "max_depth_error, and all of them",
+        "splats: a point cloud for training Gaussian splats: keeps distant points, covers the "
+        "images evenly, fills holes; survey: all points with a reliable depth, by min_angle and "
+        "max_depth_error",
         common=True,
     )
     max_points: int | None = option(
         None,
-        "largest number of points, of splats; the finest are left out first; None: as many as "
-        "images of this size tell apart",
+        "largest number of points with splats; the finest detail is dropped first; None: as many "
+        "as images of this size resolve",
         least=100,
         common=True,
     )
@@ -58,14 +57,15 @@ class TriangulateOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.max_points is not None and self.points == "survey":
-            raise OptionError("max_points bounds splats: leave it out, or give --points splats")
+            raise OptionError(
+                "max_points applies to splats only: leave it out, or give --points splats"
+            )
         if self.points == "survey":
             return
         for name in ("min_angle", "max_depth_error"):
             if getattr(self, name) != getattr(TriangulateOptions, name):
                 raise OptionError(
-                    f"{name} says which points a survey has, splats have those of any depth: "
-                    "leave it out, or give --points survey"
+                    f"{name} applies to survey points only: leave it out, or give --points survey"
                 )
 
 
@@ -75,16 +75,16 @@ class MapOptions(Options):
 
     title: ClassVar[str] = "mapper"
 
-    mapper: Mapper = option("incremental", "which of COLMAP's mappers", common=True)
+    mapper: Mapper = option("incremental", "COLMAP's mapper to use", common=True)
     forward_motion: bool = option(
         False,
-        "the camera moves along its axis: let the incremental mapper start with such a pair",
+        "let the incremental mapper start with a pair that moves along the optical axis",
         common=True,
     )
     refine_intrinsics: bool | None = option(
         None,
-        "refine focal length and distortion; None: unless the camera moves along its axis, which "
-        "leaves them undetermined",
+        "refine focal length and distortion; None: unless the camera moves along its axis, where "
+        "they are not observable",
         common=True,
     )
     seed: int = option(
@@ -96,7 +96,7 @@ class MapOptions(Options):
     )
     num_threads: int | None = option(
         None,
-        "threads of the mapper; with several, the last digits of its results vary from run to run; "
+        "number of threads of the mapper; with several, results vary slightly from run to run; "
         "None: one per CPU that the process may use",
         least=1,
         common=True,
@@ -106,7 +106,7 @@ class MapOptions(Options):
         super().__post_init__()
         if self.forward_motion and self.mapper != "incremental":
             raise OptionError(
-                "forward_motion says how the incremental mapper starts: leave it out, or give "
+                "forward_motion applies to the incremental mapper only: leave it out, or give "
                 "--mapper incremental"
             )
 
@@ -119,8 +119,8 @@ class MapperOptions(Options):
 
     mapper: Literal["auto", "incremental", "global"] = option(
         "auto",
-        "COLMAP's incremental or global mapper; auto: the global one where camera_params are given "
-        "or the focal length can be estimated from the tracks, else the incremental one",
+        "COLMAP's incremental or global mapper; auto: global if camera_params are given or the "
+        "focal length can be estimated from the tracks, else incremental",
         common=True,
     )
     refine_intrinsics: bool | None = option(
@@ -128,34 +128,34 @@ class MapperOptions(Options):
     )
     key_images: bool = option(
         True,
-        "map key images, as far apart as tracks connect them well, and place the others between "
-        "them by the points they see; 0: map all images",
+        "map only key images, as far apart as tracks connect them well, and register the others by "
+        "resection; 0: map all images",
     )
     pose_tracks_per_image: int = option(
-        600, "tracks of each image that poses are estimated from", least=50
+        600, "number of tracks per image from which poses are estimated", least=50
     )
     pose_spacing: float = option(
         16.0,
-        "width in pixels of the cells of an image; one of these tracks is selected for each",
+        "width in pixels of the cells of an image, each of which selects one track for the poses",
         least=0,
         unit="pixels",
     )
     mapper_threads: int = option(
         1,
-        "threads of the mapper and the bundle adjustment; with several, the last digits of their "
-        "results vary from run to run",
+        "number of threads of the mapper and the bundle adjustment; with several, results vary "
+        "slightly from run to run",
         least=1,
     )
     adjust: bool = option(
-        True, "refine the mapper's poses in a bundle adjustment on more and shorter tracks"
+        True, "refine the mapper's poses by bundle adjustment with more and shorter tracks"
     )
 
 
 @dataclass(frozen=True)
 class ExportOptions(Options):
-    """What is exported from a database for other programs."""
+    """What is exported from a database."""
 
     title: ClassVar[str] = "files"
 
-    format: Literal["hloc"] = option("hloc", "the program whose file layout is written")
-    verified: bool = option(True, "only inliers of each pair's two-view geometry")
+    format: Literal["hloc"] = option("hloc", "program whose file format is written")
+    verified: bool = option(True, "export only inliers of each pair's two-view geometry")

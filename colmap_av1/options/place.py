@@ -1,4 +1,4 @@
-"""Options of where a model lies in the world: its scale, what is up, its coordinates."""
+"""Options of a model's world coordinates: scale, up direction and position."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from colmap_av1.options.fields import Options, option
 
 @dataclass(frozen=True)
 class Mark:
-    """A place that an image shows, or the image's camera.
+    """A point that is marked in an image, or the centre of the image's camera.
 
     Attributes:
         image: name of the image.
-        xy: pixels, the first one's centre at (0.5, 0.5); None: the camera's centre.
+        xy: in pixels, the first pixel's centre at (0.5, 0.5); None: the camera's centre.
     """
 
     image: str
@@ -25,7 +25,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class End:
-    """An end of a known distance: a camera's centre, or what two images or more show of a place."""
+    """An end of a known distance: a camera's centre, or a point marked in two or more images."""
 
     marks: tuple[Mark, ...]
 
@@ -37,7 +37,7 @@ class End:
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """A distance in metres, between two ends."""
+    """A known distance in metres between two ends."""
 
     metres: float
     ends: tuple[End, End]
@@ -48,25 +48,25 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class PlaceOptions(Options):
-    """Where a model lies in the world."""
+    """How a model is placed in world coordinates."""
 
     title: ClassVar[str] = "place and scale"
 
     align: Literal["gps", "none"] = option(
         "gps",
-        "gps: in metres east, north and up of where the video or the photos say they were taken, "
-        "where they say it of a path; none: as the mapper leaves it",
+        "gps: metres east, north and up, if the GPS positions of the video or the photos form a "
+        "path; none: keep the mapper's coordinates",
     )
     upright: bool = option(
         False,
-        "turn the model so that z is up: by the gravity that the video recorded, else by vertical "
-        "lines in its pictures, else by how the camera was held; by positions where align finds "
-        "them",
+        "rotate the model so that z is up: by GPS positions if align finds them, else by the "
+        "gravity recorded in the video, else by vertical lines in the pictures, else by how the "
+        "camera was held",
     )
     scale: str | None = option(
         None,
-        "METRES=A,B: the known distance of two images' cameras, or of two places, each marked in "
-        "two images or more of the model, as in "
+        "METRES=A,B: the known distance between the cameras of two images, or between two points, "
+        "each marked in two or more images of the model, such as "
         "1.25=a.png:310:402+b.png:290:398,a.png:55:410+b.png:61:405",
     )
 
@@ -77,10 +77,10 @@ class PlaceOptions(Options):
 
 
 def parse_distance(text: str) -> KnownDistance:
-    """Read a known distance, METRES=A,B.
+    """Parse a known distance, METRES=A,B.
 
     Raises:
-        OptionError: it is none.
+        OptionError: the text is invalid.
     """
     number, _, rest = text.partition("=")
     try:
@@ -88,14 +88,14 @@ def parse_distance(text: str) -> KnownDistance:
         first, second = (_parse_end(word.strip()) for word in rest.split(","))
     except ValueError:
         raise OptionError(
-            f"scale '{text}': give METRES=A,B, such as 2.5=frame_000010.png,frame_000200.png, or "
-            "for A and B what two images show of them: frame_000010.png:310:402+"
-            "frame_000200.png:290:398"
+            f"scale '{text}' is invalid: give METRES=A,B, such as "
+            "2.5=frame_000010.png,frame_000200.png, or mark A and B in two images each, such as "
+            "frame_000010.png:310:402+frame_000200.png:290:398"
         ) from None
     if not (math.isfinite(metres) and metres > 0):
-        raise OptionError(f"scale '{text}': give a distance above 0 metres")
+        raise OptionError(f"scale '{text}' is not above 0 metres: give a positive distance")
     if first == second:
-        raise OptionError(f"scale '{text}': both ends are one: give two")
+        raise OptionError(f"scale '{text}': both ends are the same: give two different ends")
     return KnownDistance(metres, (first, second))
 
 

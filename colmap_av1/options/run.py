@@ -10,21 +10,21 @@ from colmap_av1.options.fields import Options, option
 
 @dataclass(frozen=True)
 class RunOptions(Options):
-    """What all stages of a run share."""
+    """Options that all stages of a run share."""
 
     title: ClassVar[str] = "run"
-    # Of the seed and the threads of the two-view geometry.
+    # COLMAP's group for the seed and the threads.
     colmap_prefix: ClassVar[str] = "TwoViewGeometry"
 
     num_threads: int | None = option(
         None,
-        "threads; None: one per CPU that the process may use. Does not change the result",
+        "number of threads; None: one per CPU that the process may use. Does not change the result",
         least=1,
         common=True,
     )
     seed: int = option(
         0,
-        "seed of the random numbers: the same seed gives the same result",
+        "seed of the random numbers; the same seed gives the same result",
         least=0,
         spellings=("random_seed",),
     )

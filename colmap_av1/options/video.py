@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from colmap_av1.options.fields import Options, option
 
 NUM_QUALITIES = 64
-_NUM_OPERATING_POINTS = 32  # that a sequence header has room for (5.5.1)
+_NUM_OPERATING_POINTS = 32  # the most that a sequence header can describe (5.5.1)
 
 
 @dataclass(frozen=True)
@@ -25,18 +25,18 @@ class ReadOptions(Options):
     )
     num_threads: int | None = option(
         None,
-        "threads that parse tiles, and groups of frames that start at a key frame, in parallel; "
-        "None: one per CPU that the process may use. Does not change the result",
+        "number of threads that parse tiles, and groups of frames that start at a key frame, in "
+        "parallel; None: one per CPU that the process may use. Does not change the result",
         least=1,
     )
     strict: bool = option(
         False,
         "fail on a damaged stream instead of using the frames before the damage, and on tiles that "
-        "end otherwise than the specification demands",
+        "do not end as the specification requires",
     )
     max_frame_size: int = option(
         16384 * 16384,
-        "largest accepted frame in luma samples; guards memory against hostile headers",
+        "largest accepted frame in luma samples; protects memory from malicious headers",
         above=0,
         unit="samples",
     )
@@ -49,7 +49,7 @@ class EncodeOptions(Options):
     title: ClassVar[str] = "conversion of a video that is not AV1"
 
     encoder: Literal["auto", "nvenc", "qsv", "amf", "vaapi", "libaom", "svt"] = option(
-        "auto", "the encoder; auto: the first that works, hardware before software", common=True
+        "auto", "encoder; auto: the first that works, hardware before software", common=True
     )
     quality: int | None = option(
         None,
@@ -60,20 +60,19 @@ class EncodeOptions(Options):
     speed: int | None = option(
         None,
         "preset on the encoder's own scale: -cpu-used of libaom (5 and above: its realtime mode), "
-        "-preset of the others; None: what effort says",
+        "-preset of the others; None: set by effort",
     )
     effort: Literal["auto", "full", "quick"] = option(
         "auto",
-        "full: search motion as exactly as poses that come from it alone need; quick: in half of "
-        "the time, for poses that are corrected on the pictures; auto: quick in reconstruct, else "
-        "full",
+        "full: an exact motion search, for poses from motion alone; quick: half the time, for "
+        "poses that are refined on the pictures; auto: quick in reconstruct, else full",
     )
     downscale: float | None = option(
         None,
-        "width and height of pictures are divided by this before they are coded; keypoints are "
-        "scaled back, those of the longest tracks corrected on the full pictures, and images keep "
-        "the video's size; None: by a whole number that leaves large pictures half a megapixel or "
-        "more; by 1 in encode, whose output is a video of its own",
+        "divide width and height of the pictures by this before encoding; keypoints are scaled "
+        "back, those of the longest tracks are refined on the full pictures, and images keep the "
+        "video's size; None: a whole number that leaves large pictures half a megapixel or more, "
+        "but 1 in encode",
         least=1,
         most=16,
     )

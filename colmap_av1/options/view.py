@@ -1,4 +1,4 @@
-"""Options of pictures of motion and tracks."""
+"""Options of drawing motion and tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options as words of a command line."""
+"""Convert options to words of a command line."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from colmap_av1.options.fields import Options, declared_of, field_types, is_path
 
 
 def words_of(options: Options) -> list[str]:
-    """The words with which a command gets these options; defaults are left out.
+    """Convert options to command-line words, without those that have their default value.
 
-    Paths become absolute. Fields that a command has no option for are left out.
+    Paths become absolute. Fields without a command-line option are left out.
     """
     return _words(options, type(options)(), frozenset())
 

@@ -1,4 +1,4 @@
-"""Drawings of motion and tracks over frames, of matches and of models, and pages of models."""
+"""Draw motion and tracks over frames, matches and models; write pages of models."""
 
 from colmap_av1.view.matches import view_database
 from colmap_av1.view.model import serve_model, view_model

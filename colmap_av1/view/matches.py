@@ -1,4 +1,4 @@
-"""The matches of two images of a database."""
+"""Draw the matches of two images of a database."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def view_database(
     """Draw the matches between two images of a COLMAP database.
 
     Args:
-        database: any COLMAP database; it is not altered.
+        database: any COLMAP database; it is not changed.
         image_path: folder of its images.
         pair: names of two images; None: the pair with the most inliers.
 
     Returns:
-        uint8 BGR picture with the images beside each other, wide ones above each other, their
-        inlier matches drawn as lines; the matches, where the pair was not verified.
+        uint8 BGR picture with the images side by side, wide ones above each other, and their inlier
+        matches drawn as lines. If the pair was not verified, all its matches are drawn.
 
     Raises:
-        DatabaseError: the file is no COLMAP database, or has no matches of the pair.
+        DatabaseError: the file is not a COLMAP database, or has no matches of the pair.
         ImageError: an image is missing or unreadable.
     """
     path = Path(database)
@@ -54,8 +54,8 @@ def view_database(
         picture = read_image(image_file(Path(image_path), name))
         if len(xy) and np.any(xy.max(axis=0) > [picture.shape[1], picture.shape[0]]):
             raise ImageError(
-                f"{Path(image_path) / name}: is smaller than its keypoints say: give the "
-                "images that were matched"
+                f"{Path(image_path) / name}: the image is smaller than the positions of its "
+                "keypoints: give the images that were matched"
             )
         pictures.append(picture)
     return _draw_matches(pictures[0], pictures[1], keypoints[0], keypoints[1], matches)
@@ -72,12 +72,14 @@ def _read_pair(
                 "SELECT pair_id FROM two_view_geometries ORDER BY rows DESC, pair_id LIMIT 1"
             ).fetchone()
             if row is None:
-                raise DatabaseError(f"{path}: holds no verified pair: run 'colmap-av1 match' first")
+                raise DatabaseError(f"{path}: has no verified pair: run 'colmap-av1 match' first")
             ids = image_ids_from_pair_id(row[0])
         else:
             missing = next((name for name in pair if name not in images), None)
             if missing is not None:
-                raise DatabaseError(f"{path}: lists no image {missing!r}: give two it lists")
+                raise DatabaseError(
+                    f"{path}: has no image {missing!r}: give two images of the database"
+                )
             ids = (images[pair[0]], images[pair[1]])
         pair_id = pair_id_from_image_ids(*ids)
         matches = np.empty((0, 2), dtype=np.uint32)
@@ -91,7 +93,7 @@ def _read_pair(
         name_of = {image_id: name for name, image_id in images.items()}
         if not {*ids} <= name_of.keys():
             raise DatabaseError(
-                f"{path}: has matches of images that it does not list: give a pair that it lists"
+                f"{path}: has matches of images that are not listed: give a pair of listed images"
             )
         names = (name_of[ids[0]], name_of[ids[1]])
         if len(matches) == 0:
@@ -108,8 +110,8 @@ def _read_pair(
         matches = matches[:, ::-1]
     if np.any(matches.max(axis=0) >= [len(k) for k in keypoints]):
         raise DatabaseError(
-            f"{path}: {names[0]!r} and {names[1]!r} match keypoints that are not there: "
-            "'colmap-av1 check' says what else is wrong"
+            f"{path}: {names[0]!r} and {names[1]!r} match keypoints that do not exist: run "
+            "'colmap-av1 check' for a full list of problems"
         )
     return names, keypoints, matches
 
@@ -121,7 +123,7 @@ def _draw_matches(
     keypoints2: NDArray[np.float32],
     matches: NDArray[np.uint32],
 ) -> Image:
-    """Draw matches between two pictures: at most _MAX_LINES, spread over the first."""
+    """Draw matches between two pictures: at most _MAX_LINES, spread over the first picture."""
     height, width = np.maximum(first.shape[:2], second.shape[:2])
     panels = [
         np.pad(image, ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)))
@@ -130,7 +132,7 @@ def _draw_matches(
     picture = side_by_side(panels)
     shift = np.array([picture.shape[1] - width, picture.shape[0] - height], dtype=np.float32)
     a, b = keypoints1[matches[:, 0]], keypoints2[matches[:, 1]]
-    # In the order of a coarse raster, every n-th match is spread over the image.
+    # Sorting by coarse rows makes every n-th match evenly spread over the image.
     order = np.lexsort((a[:, 0], a[:, 1] // 16))
     chosen = order[:: max(1, math.ceil(len(order) / _MAX_LINES))]
     hue = np.linspace(0, 179, len(chosen)) if len(chosen) else np.empty(0)

@@ -1,4 +1,4 @@
-"""Points and camera path of a model, as a picture or in the browser."""
+"""Show the points and camera path of a model, as a picture or in the browser."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from colmap_av1.view.scene import Scene, normalised, read_scene, vertical_view
 from colmap_av1.view.video import SHIFT, fixed_point
 
 _BACKGROUND = 24
-# Brightness that points of assumed depth keep.
+# Brightness factor of points with assumed depth.
 _FAINT = 0.35
 _PATH_COLOUR = (30, 60, 230)  # BGR
 _LAST_PORT = 65535
@@ -25,7 +25,7 @@ _LAST_PORT = 65535
 def view_model(model: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1200)) -> Image:
     """Draw the points and the camera path of a COLMAP model from three sides and obliquely.
 
-    The pictures frame the cameras and the points of observable depth; the others are dark.
+    The views frame the cameras and the points with observable depth; other points are dark.
 
     Args:
         model: folder of the model (cameras, images, points3D; .bin or .txt).
@@ -35,7 +35,7 @@ def view_model(model: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 
         uint8 [height, width, 3] BGR.
 
     Raises:
-        ModelError: the folder holds no model, or one without poses.
+        ModelError: the folder has no model, or a model without poses.
     """
     scene = read_scene(model)
     width, height = size[0] // 2, size[1] // 2
@@ -58,20 +58,20 @@ def serve_model(model: str | os.PathLike[str], *, port: int = 8080) -> Any:
 
     Args:
         model: folder of the model.
-        port: TCP port on this computer only.
+        port: TCP port, open to this computer only.
 
     Returns:
-        The running server; `stop()` ends it.
+        The running server; its method `stop()` ends it.
 
     Raises:
-        ModelError: the folder holds no model, or one without poses.
-        OptionError: the viewer's package is not installed, or the port is none or taken.
+        ModelError: the folder has no model, or a model without poses.
+        OptionError: the viewer's package is not installed, or the port is invalid or taken.
     """
     if not 0 < port <= _LAST_PORT:
         raise OptionError(f"port is {port}: give 1 to {_LAST_PORT}")
     scene = read_scene(model)
     try:
-        import viser  # noqa: PLC0415 - an extra that only this function needs
+        import viser  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
         raise OptionError(
             "the interactive viewer is not installed: pip install 'colmap-av1[viewer]', or give "
@@ -112,7 +112,7 @@ def _draw_scene(
     up: NDArray[np.float64],
     size: tuple[int, int],
 ) -> Image:
-    """An orthographic view, near points over far ones, and the camera path."""
+    """Draw an orthographic view with near points over far ones, and the camera path."""
     width, height = size
     towards = np.cross(right, up)
     plane = np.stack([right, -up])
@@ -122,7 +122,8 @@ def _draw_scene(
     scale = 0.9 * float(np.min(np.array(size) / np.maximum(high - low, 1e-9)))
     origin = np.array(size) / 2 - scale * (low + high) / 2
     picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
-    # Far ones first; those of assumed depth hide no others.
+    # Far points are drawn first. Points with assumed depth are drawn before all others, so that
+    # they hide none.
     order = np.lexsort((scene.points @ towards, scene.observable))
     x, y = np.floor(flat[order] * scale + origin).astype(np.int64).T
     brightness = np.where(scene.observable[order], 1.0, _FAINT)[:, None]

@@ -1,4 +1,4 @@
-"""One HTML page of a model: the cloud and cameras in 3D, key images, timeline and figures."""
+"""Write an HTML page of a model: points and cameras in 3D, key images, timelines and figures."""
 
 from __future__ import annotations
 
@@ -32,34 +32,37 @@ if TYPE_CHECKING:  # slow to import
 _Floats = NDArray[np.float64]
 Figures = Sequence[tuple[str, str]]
 
-# Points that a page shows, evenly spread over all; 22 bytes each.
+# Largest number of points on a page, evenly spaced in the order of the points; 22 bytes each.
 _MOST_POINTS = 200_000
-# Cameras that are drawn with their view, evenly spread; and pictures of the strip.
+# Largest numbers of drawn cameras and of pictures in the strip, evenly spaced.
 _MOST_CAMERAS = 300
 _MOST_PICTURES = 24
+# Height of these pictures in pixels, and their JPEG quality.
 _PICTURE_HEIGHT = 150
 _PICTURE_QUALITY = 80
-# Radius of the sphere at which what lies farther away is drawn, in half diagonals of the scene.
+# Points farther away are drawn on a sphere of this radius, in half diagonals of the scene.
 _FARTHEST = 3.0
-# Longer side of a drawn camera's picture, in half diagonals of the scene.
+# Longer side of a drawn camera's image plane, in half diagonals of the scene.
 _CAMERA_SIZE = 0.045
-# Where a page looks from, as seen from the middle: right, forward, up.
+# Direction from the middle of the scene to the viewer: right, forward, up.
 _EYE = (-0.3, -1.2, 0.6)
-# Half of the angle that plotly's cameras see vertically, as a tangent, and width by height.
+# Tangent of half the vertical field of view of plotly's camera, and the aspect ratio of its view.
 _HALF_VIEW, _ASPECT = 0.414, 1.9
-# Share of the points that are seen from there; a few stray ones would move it far away.
+# Share of the points in the initial view; a few stray points would move the viewer far away.
 _SEEN = 0.97
+# Factor of the viewer's distance.
 _MARGIN = 1.06
-# How far before its camera a view looks, in half diagonals.
+# Distance from a camera to the point that its view looks at, in half diagonals of the scene.
 _AHEAD = 0.5
-# The corners of a drawn camera's picture and its centre, the fifth, as lines; a NaN ends a line.
+# Vertices of a drawn camera as lines: 0 to 3 are the corners of its image plane, 4 is its centre,
+# and 5 is a NaN that ends a line.
 _LINES = (0, 1, 2, 3, 0, 4, 2, 5, 1, 4, 3, 5)
 _NUM_TIMES = 6
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """A picture of the strip, and where the scene is looked at from there."""
+    """A picture of the strip, with plotly's view of the scene from its camera."""
 
     name: str
     uri: str
@@ -70,7 +73,7 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Mark:
-    """An image, or a gap between two, on a timeline; places are per cent of its length."""
+    """An image, or a gap between two, on a timeline; positions are in per cent of its length."""
 
     kind: str
     begin: float
@@ -80,7 +83,7 @@ class _Mark:
 
 @dataclass(frozen=True)
 class _Timeline:
-    """The timeline of a video, with the times below it."""
+    """The timeline of a video, with the labels of its time axis."""
 
     title: str
     marks: list[_Mark]
@@ -93,16 +96,16 @@ def check_page(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Refuse a page that cannot or must not be written, before anything is drawn.
+    """Check that a page can and may be written, before anything is drawn.
 
     Args:
         output: the file.
-        inputs: what is read; None: not given.
-        overwrite: replace a file that exists.
+        inputs: files that are read; None: not given.
+        overwrite: replace an existing file.
 
     Raises:
-        OptionError: the package of the 3D view is missing, another extension, an input, or a file
-            that must not be replaced.
+        OptionError: plotly is not installed, or `output` does not end in .html, is an input, or
+            exists and `overwrite` is not set.
     """
     _plotly()
     path = Path(output)
@@ -120,21 +123,21 @@ def write_model_page(
     image_path: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a page of a COLMAP model that needs no other file and no network.
+    """Write a self-contained page of a COLMAP model, which needs no network.
 
     Args:
         model: folder of the model.
         output: the file, .html.
         figures: names and values that the page lists.
-        report: the report of the run of `reconstruct` that made the model; None: another program
-            did, and the page has no timeline.
-        image_path: folder of the model's images; None: `images` beside the folder `sparse` that
-            holds the model, and no pictures where there is none.
-        overwrite: replace a page that exists.
+        report: report of the `reconstruct` run that created the model; if None, the page has no
+            timeline.
+        image_path: folder of the model's images; if None, the folder `images` next to the folder
+            `sparse` with the model. If there is none, the page has no pictures.
+        overwrite: replace an existing page.
 
     Raises:
         OptionError: see `check_page`; or the file cannot be written.
-        ModelError: the folder holds no model, or one without poses.
+        ModelError: the folder has no model, or a model without poses.
         ImageError: an image is missing or unreadable.
     """
     check_page(output, overwrite=overwrite)
@@ -176,7 +179,7 @@ def write_model_page(
 
 def _plotly() -> Any:
     try:
-        import plotly.graph_objects  # noqa: PLC0415 - an extra that only pages need
+        import plotly.graph_objects  # noqa: PLC0415 - an optional dependency
         import plotly.io  # noqa: PLC0415
     except ImportError as error:
         raise OptionError(
@@ -202,8 +205,8 @@ class _View:
     Attributes:
         scene: the scene.
         axes: float64 [3, 3] unit vectors to the right, forward and up.
-        middle: float64 [3] along these.
-        radius: half the diagonal of what is framed.
+        middle: float64 [3] the middle of the scene along these axes.
+        radius: half the diagonal of the framed box.
     """
 
     scene: Scene
@@ -216,18 +219,18 @@ class _View:
         right, up, back = scene.axes
         axes = np.stack([right, -back, up])
         low, high = scene.box(axes)
-        # A lone camera without points has no extent.
+        # A single camera without points has no extent.
         radius = float(np.linalg.norm(high - low)) / 2 or 1.0
         return _View(scene, axes, (low + high) / 2, radius)
 
     def place(self, xyz: _Floats) -> NDArray[np.float32]:
-        """Float32 [n, 3] places of points, in half diagonals, none beyond the farthest."""
+        """Page coordinates of points in half diagonals, limited to `_FARTHEST`, float32 [n, 3]."""
         at = (xyz @ self.axes.T - self.middle) / self.radius
         far = np.linalg.norm(at, axis=1, keepdims=True)
         return np.asarray(at * np.minimum(1.0, _FARTHEST / np.maximum(far, 1e-9)), np.float32)
 
     def eye(self) -> list[float]:
-        """Where all cameras and nearly all points of observable depth are seen from."""
+        """The position that has all cameras and nearly all observable points in view."""
         back = normalised(np.array(_EYE))
         right = normalised(np.cross([0.0, 0.0, 1.0], back))
         axes = np.stack([right, np.cross(back, right), back])
@@ -245,7 +248,7 @@ class _View:
         return [float(x) for x in back * distance * _MARGIN]
 
     def camera(self, image: ModelImage) -> dict[str, Any]:
-        """Where plotly looks at the scene from the camera of an image."""
+        """Plotly's view from the camera of an image."""
         (centre,) = camera_centres(image.cam_from_world[None])
         ahead = centre + _AHEAD * self.radius * image.cam_from_world[2, :3]
         eye, towards = self.place(np.stack([centre, ahead])).tolist()
@@ -257,7 +260,7 @@ def _xyz(values: Sequence[float]) -> dict[str, float]:
 
 
 def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
-    """The 3D view with the code that draws it, as HTML that needs no escaping."""
+    """The 3D view as HTML, including plotly's code; it needs no escaping."""
     plotly = _plotly()
     scene = view.scene
     observable = scene.observable[shown]
@@ -284,7 +287,7 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
         *_cameras(view, "key images", groups["key images"], "#f59e0b"),
     ]
     axis = {"visible": False, "range": [-_FARTHEST, _FARTHEST]}
-    # One unit of plotly's cameras is one half diagonal.
+    # This ratio makes one unit of plotly's camera coordinates one half diagonal.
     ratio = 2 * _FARTHEST
     layout = {
         "scene": {
@@ -300,7 +303,7 @@ def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
         "legend": {"x": 0.01, "y": 0.99, "itemsizing": "constant", "bgcolor": "rgba(0,0,0,0.4)"},
     }
     figure = plotly.graph_objects.Figure(traces, layout)
-    figure.layout.template = None  # two kilobytes for other kinds of plots
+    figure.layout.template = None  # saves two kilobytes of defaults for other plots
     return str(
         plotly.io.to_html(
             figure,
@@ -333,7 +336,7 @@ def _points(
         "marker": {"color": colours, **marker},
         "hoverinfo": "skip",
     }
-    # The legend would show the colour of the first point.
+    # A separate trace for the legend, which would otherwise show the colour of the first point.
     in_legend = {
         **_columns(np.full((1, 3), np.nan, np.float32)),
         "type": "scatter3d",
@@ -427,7 +430,7 @@ def _gap_in_words(gap: Gap) -> str:
 
 
 def _commands(model: Path, report: ReconstructReport | None) -> list[tuple[str, str]]:
-    """What to do next, in words and as a command."""
+    """Suggestions for the next step: a description and a command each."""
     if report is None:
         command = ["colmap-av1", "densify", "--model", str(model), "--video", "VIDEO"]
         return [("Add dense points from the video", shlex.join([*command, "--output", "OUTPUT"]))]

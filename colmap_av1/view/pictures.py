@@ -1,4 +1,4 @@
-"""Pictures and videos that are drawn, written whole or not at all."""
+"""Write drawn pictures and videos. A file appears only when it is complete."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 
 Image = NDArray[np.uint8]
-# Set, because x264's output depends on their number.
+# Fixed, because x264's output depends on the number of threads.
 _ENCODER_THREADS = 4
-# With `mbtree` it depends on what lies in memory that x264 never wrote.
+# With `mbtree`, x264's output depends on uninitialized memory.
 _ENCODER_OPTIONS = {"crf": "18", "x264-params": "mbtree=0"}
 
 
@@ -31,15 +31,16 @@ def check_picture(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Refuse an output that `write_picture` cannot or must not write, before anything is drawn.
+    """Check that `write_picture` can and may write an output, before anything is drawn.
 
     Args:
         output: the file.
-        inputs: what is drawn.
-        overwrite: replace a file that exists.
+        inputs: files that are read.
+        overwrite: replace an existing file.
 
     Raises:
-        OptionError: another extension, an input, or a file that must not be replaced.
+        OptionError: `output` has another extension, is an input, or exists and `overwrite` is not
+            set.
     """
     path = Path(output)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
@@ -50,10 +51,10 @@ def check_picture(
 def write_picture(
     picture: Image, output: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a picture as PNG or JPEG, by the extension; whole or not at all.
+    """Write a picture as PNG or JPEG, depending on the extension.
 
     Raises:
-        OptionError: as `check_picture` says, or the file cannot be written.
+        OptionError: see `check_picture`; or the file cannot be written.
     """
     check_picture(output, overwrite=overwrite)
     _write_picture(picture, Path(output))
@@ -67,7 +68,7 @@ def _write_picture(picture: Image, path: Path) -> None:
 
 
 def side_by_side(panels: Sequence[Image]) -> Image:
-    """Pictures of one size beside each other, wide ones above each other."""
+    """Join pictures of the same size side by side, wide ones above each other."""
     wide = panels[0].shape[1] > panels[0].shape[0]
     return np.asarray(np.concatenate(panels, axis=0 if wide else 1), dtype=np.uint8)
 
@@ -77,7 +78,7 @@ def bgr(
     saturation: NDArray[np.floating[Any]],
     value: NDArray[np.floating[Any]],
 ) -> NDArray[np.uint8]:
-    """BGR colours [n, 3] of OpenCV's hue (0 to 180), saturation and value (0 to 255)."""
+    """Convert OpenCV's hue (0 to 180), saturation and value (0 to 255) to BGR colours [n, 3]."""
     hsv = np.stack([hue, saturation, value], axis=-1).astype(np.uint8)
     if len(hsv) == 0:  # OpenCV refuses empty arrays
         return hsv
@@ -93,7 +94,7 @@ def existing_pictures(path: Path) -> list[Path]:
 
 @contextmanager
 def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], None]]:
-    """Write pictures to an .mp4 file, or numbered to a folder; see `existing_pictures`."""
+    """Write pictures to an .mp4 file, or as numbered files to a folder."""
     if path.suffix.lower() != ".mp4":
         count = 0
 
@@ -106,7 +107,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OptionError(
-                f"{path}: cannot be made: {error.strerror}: fix that, or give another path"
+                f"{path}: cannot be created: {error.strerror}: fix that, or give another path"
             ) from error
         yield write_file
         return
@@ -119,7 +120,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
 
         def write_frame(picture: Image) -> None:
             nonlocal size
-            # 4:2:0 has no odd sizes; a video has one size.
+            # 4:2:0 needs even sizes, and all frames of a video have the same size.
             if size is None:
                 size = (picture.shape[1] + 1 & ~1, picture.shape[0] + 1 & ~1)
                 stream.width, stream.height = size
@@ -140,7 +141,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
 
 @contextmanager
 def _output(path: Path) -> Iterator[Path]:
-    """A `whole_file`, whose errors become ours."""
+    """A `whole_file` whose errors become an OptionError."""
     try:
         remove_leftovers(path.parent, path.name)
         with whole_file(path) as partial:

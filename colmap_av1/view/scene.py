@@ -1,4 +1,4 @@
-"""A model as pictures and pages show it."""
+"""Prepare a model for drawing."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from colmap_av1.geometry.observable import framed_box, has_observable_depth
 _Floats = NDArray[np.float64]
 
 _NO_COLOUR = 190
-# Cosine of the angle to the vertical from which on most cameras look straight down or up.
+# Above this cosine of the angle to the vertical, the cameras look straight down or up.
 _VERTICAL = 0.95
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A model as it is drawn.
+    """A model, prepared for drawing.
 
     Attributes:
         model: the pycolmap.Reconstruction.
-        points: float64 [n, 3], in the order of their ids.
+        points: float64 [n, 3] positions, in the order of the point ids.
         colours: uint8 [n, 3] RGB.
-        observable: bool [n] points of observable depth; that of the others is assumed.
+        observable: bool [n] points with observable depth; the depth of the others is assumed.
         images: the registered images, in the order of their names.
-        centres: float64 [m, 3] of their cameras.
-        axes: float64 [3, 3] unit vectors to the right, up and back as most cameras see them.
+        centres: float64 [m, 3] camera centres.
+        axes: float64 [3, 3] unit vectors to the right, up and back for the average camera.
     """
 
     model: pycolmap.Reconstruction
@@ -49,12 +49,12 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """Length of the diagonal of most of the scene."""
+        """Length of the diagonal of the framed box."""
         low, high = self.box(self.axes)
         return float(np.linalg.norm(high - low))
 
     def box(self, axes: _Floats) -> tuple[_Floats, _Floats]:
-        """What is framed, along `axes` [d, 3]; see `framed_box`."""
+        """The framed box along `axes` [d, 3], see `framed_box`."""
         return framed_box(self.points @ axes.T, self.observable, self.centres @ axes.T)
 
     def camera_of(self, image: ModelImage) -> pycolmap.Camera:
@@ -62,10 +62,10 @@ class Scene:
         return self.model.cameras[image.camera_id]
 
     def corners(self, image: ModelImage, size: float) -> _Floats:
-        """Float64 [4, 3] the corners in the world of an image whose longer side has a length."""
+        """Corners in the world, float64 [4, 3], of an image plane whose longer side is `size`."""
         camera = self.camera_of(image)
         width, height = camera.width, camera.height
-        # Without distortion, which folds what lies beyond the picture of a wide lens.
+        # Distortion is left out: beyond the image of a wide lens it is not invertible.
         at = np.array([[-width, -height], [width, -height], [width, height], [-width, height]]) / 2
         rays = np.column_stack([at, np.full(4, camera.mean_focal_length())])
         rotation, translation = image.cam_from_world[:, :3], image.cam_from_world[:, 3]
@@ -73,20 +73,20 @@ class Scene:
 
 
 def read_scene(model: str | os.PathLike[str], *, up: _Floats | None = None) -> Scene:
-    """Read a COLMAP model and find how its cameras were held.
+    """Read a COLMAP model and find the axes from which to draw it.
 
     Args:
         model: folder of the model.
-        up: float64 [3] unit vector that points up; None: as most cameras were held.
+        up: float64 [3] unit vector that points up; None: the up direction of the average camera.
 
     Raises:
-        ModelError: the folder holds no model, or one without poses.
+        ModelError: the folder has no model, or a model without poses.
     """
     reconstruction = read_model(model)
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
     poses = np.array([image.cam_from_world for image in images])
-    # Cameras look along their third axis with the second pointing down.
+    # A camera looks along its third axis; the second axis points down.
     back, top = normalised(-poses[:, 2, :3].mean(axis=0)), -poses[:, 1, :3].mean(axis=0)
     if up is None:
         up = normalised(top - back * (top @ back))
@@ -108,7 +108,7 @@ def read_scene(model: str | os.PathLike[str], *, up: _Floats | None = None) -> S
 
 
 def vertical_view(scene: Scene) -> tuple[float, float]:
-    """Vertical field of view in radians, and width by height, of the first image."""
+    """Vertical field of view in radians, and aspect ratio, of the first image."""
     camera = scene.camera_of(scene.images[0])
     return (
         2 * math.atan2(camera.height / 2, camera.mean_focal_length()),
@@ -117,5 +117,5 @@ def vertical_view(scene: Scene) -> tuple[float, float]:
 
 
 def normalised(vector: _Floats) -> _Floats:
-    """The vector with length 1."""
+    """Scale a vector to length 1."""
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))

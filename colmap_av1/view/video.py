@@ -1,4 +1,4 @@
-"""Motion and tracks, drawn over the frames of a video."""
+"""Draw motion and tracks over the frames of a video."""
 
 from __future__ import annotations
 
@@ -29,20 +29,22 @@ from colmap_av1.view.pictures import (
     side_by_side,
 )
 
-# Tracks are one to a unit of 4x4 pixels at most.
+# Side in pixels of the units in which motion is drawn.
 _UNIT = 4
 _GREY = 128
-# Quantile of the motion that is drawn in full colour: the few fastest would pale the rest.
+# Quantile of the speeds that is drawn in full colour. With the maximum, a few fast tracks would
+# make the rest pale.
 _FULL_COLOUR_QUANTILE = 0.95
 _DEFAULT_FRAME_RATE = 25.0
-# Fractional bits of the coordinates that OpenCV draws at.
+# Number of fractional bits of drawing coordinates in OpenCV.
 SHIFT = 4
+# Width of the colour wheel in pixels.
 _WHEEL_SIZE = 48
-# Motion below this many pixels a frame is never drawn in full colour.
+# Motion below this speed, in pixels per frame, is never drawn in full colour.
 _LEAST_FULL_SPEED = 0.25
-# Frames within which one track is drawn for each cell.
+# One track is drawn for each cell and this many frames.
 _FRAMES_PER_CHOICE = 8
-# Frames after which a track is drawn in the colour of an old one.
+# Number of observations after which a track has the colour of an old one.
 _OLD_AGE = 32
 
 
@@ -58,27 +60,28 @@ def view_video(
 ) -> int:
     """Draw motion and tracks over the frames of a video.
 
-    Motion: each 4x4 unit that a track runs through is coloured by the direction in which it
-    moves, deeper where it moves faster; the wheel in the corner is the key. Units whose motion
-    is not trusted, and so carries no track, are grey. Tracks: a dot where each is, and a tail to
-    where it was in the frames before, blue for a young track, red for an old one.
+    Motion: each 4x4 unit with a track is coloured by the direction of its motion, more saturated
+    if it is faster; the wheel in the corner is the key. Units without a track are grey, because
+    their motion is not trusted. Tracks: each is a dot with a tail along its previous positions,
+    blue for a young track, red for an old one.
 
     Args:
         video: an AV1 video.
-        output: an .mp4 file, or a folder that gets a PNG for each frame.
+        output: an .mp4 file, or a folder for one PNG per frame.
         options: what is drawn.
         tracks: how the motion is chained.
         read: how the bitstream is read.
-        progress: called with a stage's name, what is done, and of how much where known.
-        overwrite: replace files that exist.
+        progress: called with the stage's name, the number of items done, and their total if known.
+        overwrite: replace existing files.
 
     Returns:
         The number of frames drawn.
 
     Raises:
-        OptionError: the output cannot be written, or must not.
+        OptionError: the output cannot be written, or exists and `overwrite` is not set.
         VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
-        BitstreamError: the stream is damaged before its second frame, or with strict.
+        BitstreamError: the stream is damaged, and `strict` is set or fewer than two frames precede
+            the damage.
     """
     options = options if options is not None else ViewOptions()
     report = progress if progress is not None else no_progress
@@ -97,7 +100,7 @@ def view_video(
         chained = build_tracks(
             read_motion(video, read), tracks, lambda done: report("tracks", done, total)
         )
-        # A decoder takes frames of any size, so the bitstream, whose frames are limited, is first.
+        # The motion was read first: its reader limits the frame size, and the decoder does not.
         opened = read_video(video, operating_point)
         chained = chained.as_displayed(opened.display, opened.presented)
         drawing = _prepare(chained, options)
@@ -116,18 +119,18 @@ def view_video(
 
 @dataclass(frozen=True)
 class _Drawing:
-    """Tracks as they are drawn.
+    """Tracks, prepared for drawing.
 
     Attributes:
-        tracks: all of them.
+        tracks: all tracks.
         options: what is drawn.
         by_frame: int64 [num_observations] observations sorted by frame.
         bounds: int64 [num_frames + 1] bounds of the frames in `by_frame`.
-        age: int64 [num_observations] observations of the track before this one.
-        velocity: float32 [num_observations, 2] pixels per frame, from the observation before;
-            at a track's start to the next.
-        full_speed: pixels per frame that are drawn in full colour.
-        has_tail: bool [num_observations] of a track that is drawn as such.
+        age: int64 [num_observations] number of earlier observations of the same track.
+        velocity: float32 [num_observations, 2] pixels per frame since the previous observation; at
+            the start of a track, until the next one.
+        full_speed: speed in pixels per frame that is drawn in full colour.
+        has_tail: bool [num_observations] whether the track is drawn as a dot with a tail.
     """
 
     tracks: Tracks
@@ -167,9 +170,10 @@ def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
 
 
 def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
-    """Choose long tracks that start in different cells of `spacing` pixels: bool [num_tracks].
+    """Choose the tracks to draw as dots with tails, bool [num_tracks].
 
-    Of the tracks that start in a cell within as many frames as tails are long, the longest.
+    Chosen is the longest of the tracks that start in a cell of `spacing` pixels within
+    `_FRAMES_PER_CHOICE` frames.
     """
     length = tracks.lengths
     start = tracks.offsets[:-1]
@@ -185,7 +189,7 @@ def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
 
 
 def _draw_motion(picture: Image, drawing: _Drawing, frame: int) -> Image:
-    """Colour every unit that a track runs through by the direction of its motion."""
+    """Colour every unit with a track by the direction of its motion."""
     height, width = picture.shape[:2]
     rows, cols = -(-height // _UNIT), -(-width // _UNIT)
     seen = drawing.seen_in(frame)
@@ -204,7 +208,7 @@ def _draw_motion(picture: Image, drawing: _Drawing, frame: int) -> Image:
 
 
 def _draw_tracks(picture: Image, drawing: _Drawing, frame: int) -> Image:
-    """Draw a dot for each chosen track, and a tail to its places in the frames before."""
+    """Draw a dot for each chosen track, and a tail along its previous positions."""
     drawn = picture.copy()
     seen = drawing.seen_in(frame)
     seen = seen[drawing.has_tail[seen]]
@@ -220,17 +224,20 @@ def _draw_tracks(picture: Image, drawing: _Drawing, frame: int) -> Image:
     return np.asarray(drawn)
 
 
-# What each value of ViewOptions.draw stands for; both for both.
+# The value of ViewOptions.draw for each panel; "both" draws both.
 _NAMES = {_draw_motion: "motion", _draw_tracks: "tracks"}
 
 
 def fixed_point(xy: NDArray[np.float32]) -> NDArray[np.int32]:
-    """COLMAP's pixel coordinates as OpenCV draws them: pixel centres at whole numbers."""
+    """Convert COLMAP's pixel coordinates to OpenCV's, in fixed point, for drawing.
+
+    In OpenCV, pixel centres have integer coordinates.
+    """
     return np.asarray(np.round((xy - 0.5) * (1 << SHIFT)), dtype=np.int32)
 
 
 def _direction_colours(velocity: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Colours [n, 3] of velocities [n, 2]: hue by direction, saturated at length 1."""
+    """Colours [n, 3] of velocities [n, 2]: the hue is the direction, saturated from length 1 on."""
     angle = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0])) % 360
     saturation = 255 * np.minimum(np.hypot(velocity[:, 0], velocity[:, 1]), 1)
     return bgr(angle / 2, saturation, np.full(len(angle), 255.0))

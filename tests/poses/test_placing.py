@@ -234,7 +234,7 @@ def test_known_distance_of_cameras_and_of_marks() -> None:
         (f"1={mark(a, 0)}+0.png:10:10,1.png", "give METRES=A,B"),
         ("1=0.png", "give METRES=A,B"),
         ("-1=0.png,1.png", "above 0 metres"),
-        ("1=0.png,0.png", "both ends are one"),
+        ("1=0.png,0.png", "both ends"),
         ("far=0.png,1.png", "give METRES=A,B"),
     ):
         with pytest.raises(OptionError, match=why):

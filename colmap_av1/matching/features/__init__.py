@@ -1,1 +1,1 @@
-"""Features of pictures: SIFT, those of overlays among them, and images that look alike by them."""
+"""SIFT features, the removal of overlays from them, and image retrieval."""

@@ -1,4 +1,4 @@
-"""Features of what lies over the pictures, which is not part of the scene: logos, displays."""
+"""Remove features of overlays: logos and displays that are fixed in the picture."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from numpy.typing import NDArray
 from colmap_av1.matching.features.sift import Features, alike
 from colmap_av1.util.spread import evenly_spread
 
-# Images that each is held against, spread over all.
+# Number of images, evenly spread, that each image is compared with.
 _NUM_COMPARED = 8
-# Pixels that a feature may move by between pictures and still be in its place.
+# A feature is fixed if it moves by no more than this many pixels between pictures.
 _STILL = 1.0
-# Share of other images that show an overlay's feature in its place, at least, and that which usual
-# features may have: where the camera rests all of them stay.
+# A feature belongs to an overlay if it is fixed in at least this share of the other images.
 _LEAST_SHARE = 0.3
+# If the median share of all features is above this, the camera stands still and none is removed.
 _USUAL_SHARE = 0.25
-# Side in pixels of the cells that overlays fill: features at their edges change with what is below.
+# Side in pixels of the cells that overlays cover. Features at the edges of an overlay change with
+# the scene behind it, so whole cells are removed.
 _CELL = 16
 
 
 def without_overlays(
     features: Mapping[int, Features], cameras: Sequence[pycolmap.Camera]
 ) -> dict[int, Features]:
-    """Leave out the features that stay in their place in pictures that else change.
+    """Remove the features that stay at the same position while the rest of the picture changes.
 
-    They would match whatever the pictures show, and as well as nothing else does.
+    Such features match perfectly in all images, whatever the camera does.
 
     Args:
-        features: those of images, by the numbers of these.
-        cameras: of all images; only those of one size are held against each other.
+        features: the features of some images, by the index of the image.
+        cameras: the camera of each image; only images of the same size are compared.
 
     Returns:
-        The features of the same images; the same objects where none is left out.
+        The features of the same images; the same objects if nothing is removed.
     """
     groups: dict[tuple[int, int], list[int]] = {}
     for image in sorted(features):
@@ -59,18 +60,18 @@ def without_overlays(
 
 
 def _cells(xy: NDArray[np.float32], side: float, columns: int) -> NDArray[np.int64]:
-    """Int64 [n] the squares that positions lie in, so many beside each other."""
+    """Number of the square cell of each position, int64 [n]."""
     column, row = np.floor(xy / side).astype(np.int64).T
     return np.asarray(row * columns + column)
 
 
 def _shares_in_place(features: Sequence[Features], width: int) -> list[NDArray[np.float64]]:
-    """Of each feature of some images, the share of other images that show it in its place."""
+    """The share of the other images in which each feature is fixed, float64 [n] of each image."""
     num_images = len(features)
     compared = evenly_spread(num_images, _NUM_COMPARED)
     image = np.repeat(compared, [len(features[k].xy) for k in compared])
     descriptors = np.concatenate([features[k].descriptors for k in compared])
-    columns = int(width / _STILL) + 3  # none is beside the first of the next row
+    columns = int(width / _STILL) + 3  # keeps the last cell of a row apart from the next row
     cell = np.concatenate([_cells(features[k].xy, _STILL, columns) for k in compared])
     order = np.argsort(cell, kind="stable")
     cell, image, descriptors = cell[order], image[order], descriptors[order]

@@ -1,8 +1,8 @@
-"""Images that look alike, found on a vocabulary trained on the video itself.
+"""Retrieve similar images, with a vocabulary trained on the video itself.
 
 Vectors of locally aggregated descriptors (Jegou et al., "Aggregating local descriptors into a
-compact image representation", CVPR 2010). pycolmap's `VisualIndex` gives no result of a query to
-Python.
+compact image representation", CVPR 2010). pycolmap's `VisualIndex` does not return the result of a
+query to Python.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.matching.features.sift import Features
 
 _NUM_WORDS = 64
-# Descriptors that the vocabulary is trained on.
+# Number of descriptors on which the vocabulary is trained.
 _NUM_TRAINING = 20_000
 _NUM_ITERATIONS = 10
 
@@ -23,13 +23,13 @@ _NUM_ITERATIONS = 10
 def similar_images(
     features: Sequence[Features], allowed: NDArray[np.bool_], num_nearest: int, *, seed: int = 0
 ) -> NDArray[np.int32]:
-    """Pair each image with those most like it.
+    """Pair each image with the images most similar to it.
 
     Args:
         features: features of each image.
         allowed: bool [n, n] which images may be paired; symmetric.
-        num_nearest: images that each is paired with at most.
-        seed: of the vocabulary.
+        num_nearest: largest number of images with which each is paired.
+        seed: seed of the vocabulary.
 
     Returns:
         int32 [m, 2] indices of images, first < second, ascending.
@@ -47,7 +47,7 @@ def similar_images(
 
 
 def _aggregate(features: Sequence[Features], seed: int) -> NDArray[np.float32]:
-    """One vector of unit length for each image: [n, words * 128]; of zeros without a feature."""
+    """One unit vector for each image, [n, words * 128]; zeros if an image has no features."""
     descriptors = np.concatenate([f.descriptors for f in features])
     from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - slow to import
 

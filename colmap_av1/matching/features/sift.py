@@ -1,4 +1,4 @@
-"""SIFT features of pictures, and their matches."""
+"""Extract and match SIFT features."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.video.coded_size import smaller_grey
 
-# SIFT starts from a picture of twice the size. Light features are searched in a picture of half the
-# pixels, in which this takes half the time; they are placed as exactly.
+# Scale of the picture before extraction. SIFT first doubles the size; light features use half the
+# pixels, which takes half the time and locates features as exactly.
 _SCALE = {"light": 0.7, "full": 1.0}
-# Contrast that a feature needs. The lower one finds about twice as many, also in blurred pictures.
+# Contrast threshold. The lower one finds about twice as many features, also in blurred pictures.
 _CONTRAST = {"light": 0.04, "full": 0.02}
-# COLMAP's own limits for matches of SIFT: angle of the nearest descriptor, in radians, and its
-# ratio to that of the second nearest.
+# COLMAP's limits for SIFT matches: angle to the nearest descriptor in radians, and its ratio to the
+# angle of the second nearest.
 _MAX_ANGLE = 0.7
 _MAX_RATIO = 0.8
 _NUM_DIMENSIONS = 128
@@ -38,21 +38,21 @@ class Features:
     descriptors: NDArray[np.float32]
 
     def only(self, kept: NDArray[np.bool_]) -> Features:
-        """Those of them that are kept: bool [n]."""
+        """Select the features where `kept`, bool [n], is True."""
         return Features(self.xy[kept], self.descriptors[kept])
 
 
 def extract_features(
     picture: NDArray[np.uint8], max_num_features: int, effort: Literal["light", "full"] = "light"
 ) -> Features:
-    """SIFT features of a picture, by OpenCV.
+    """Extract SIFT features of a picture with OpenCV.
 
     Large pictures are reduced first, see `smaller_grey`.
 
     Args:
         picture: uint8 [height, width, 3], BGR.
-        max_num_features: number of features at most; those of the highest contrast are kept.
-        effort: light: fewer features in a third of the time; full: all.
+        max_num_features: largest number of features; those of the highest contrast are kept.
+        effort: "light" finds fewer features in a third of the time, "full" finds all.
     """
     grey = smaller_grey(picture)
     size = tuple(max(1, round(length * _SCALE[effort])) for length in grey.shape[::-1])
@@ -64,30 +64,30 @@ def extract_features(
         enable_precise_upscale=True,
     )
     keypoints, found = sift.detectAndCompute(grey, None)
-    # OpenCV counts from the centre of the first pixel.
+    # OpenCV's origin is the centre of the first pixel.
     xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2) + np.float32(0.5)
     xy *= np.array(picture.shape[1::-1], dtype=np.float32) / grey.shape[::-1]
     if found is None:
         found = np.empty((0, _NUM_DIMENSIONS), np.float32)
-    # The root of each share: RootSIFT, which COLMAP uses by default.
+    # RootSIFT (L1 norm, then square root), COLMAP's default.
     sums = np.maximum(found.sum(axis=1, keepdims=True), 1e-6)
     return Features(xy, np.sqrt(found / sums).astype(np.float32))
 
 
 def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask | None) -> Features:
-    """The features of a picture on pixels of it that count; None: all do."""
+    """Keep the features on unmasked pixels of a picture; all if `mask` is None."""
     if mask is None:
         return features
     return features.only(mask.keeps(features.xy, picture.shape[1::-1]))
 
 
 def alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Bool [n] whether descriptors [n, 128] show the same, by COLMAP's limit."""
+    """Whether descriptors [n, 128] match within COLMAP's limit, bool [n]."""
     return np.asarray(np.einsum("ij,ij->i", a, b) >= np.cos(_MAX_ANGLE))
 
 
 def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
-    """Match features that are nearest to each other, by COLMAP's limits.
+    """Match mutual nearest neighbours within COLMAP's limits.
 
     Returns:
         uint32 [n, 2] indices of features (in a, in b), ascending in the first.

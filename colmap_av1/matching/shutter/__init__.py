@@ -1,1 +1,1 @@
-"""The read-out time of a rolling shutter, from tracks."""
+"""Estimate the read-out time of a rolling shutter from tracks, and correct tracks for it."""

@@ -1,4 +1,4 @@
-"""Tracks of a video corrected for its rolling shutter, of a given or an estimated read-out time."""
+"""Correct the tracks of a video for its rolling shutter."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def without_shutter(
     camera: CameraOptions,
     context: RunContext,
 ) -> tuple[Tracks, float | None]:
-    """The tracks where they are in the middle of each picture's read-out, and the time of that.
+    """Move tracks to their positions in the middle of each picture's read-out.
 
     Args:
-        tracks: tracks of all frames, of which neighbours say how they move.
-        display: how the pictures are shown that they are of.
-        rate: frames per second; None, where it is unknown, leaves them as they are.
+        tracks: tracks of all frames; neighbouring observations give their velocities.
+        display: how players show the pictures.
+        rate: frames per second; if None (unknown), the tracks are returned unchanged.
         camera: the read-out time, the model and given intrinsics.
         context: its clock gets the stage "shutter".
 
     Returns:
-        The tracks, and the read-out time in milliseconds; None where nothing is corrected.
+        The tracks, and the read-out time in milliseconds; None if nothing is corrected.
     """
     wanted = camera.rolling_shutter
     if wanted == "none" or rate is None or tracks.num_frames == 0:
@@ -50,20 +50,20 @@ def without_shutter(
 
 
 def shutter_settings(camera: CameraOptions) -> tuple[str, ...]:
-    """What the correction of tracks depends on, of the options."""
+    """The options that the correction of tracks depends on."""
     lens = (str(camera.camera_model), str(camera.camera_params))
     return (camera.rolling_shutter, *(lens if camera.rolling_shutter == "estimate" else ()))
 
 
 def rows_down(display: Display, size: tuple[int, int]) -> tuple[int, int]:
-    """How the direction in which rows are read is shown, see `row_places`.
+    """The direction in the displayed picture in which the sensor reads its rows, see `row_places`.
 
-    The rows are those of the sensor, which is wider than high: a picture that is shown upright and
-    was stored so has been turned before.
+    The sensor is assumed to be wider than high: a picture that is stored upright was rotated before
+    it was stored.
 
     Args:
         display: how players show the pictures.
-        size: (width, height) of these.
+        size: (width, height) of the displayed pictures.
     """
     (_, across), (_, down) = display.turn
     if display == Display() and size[0] < size[1]:
@@ -72,7 +72,7 @@ def rows_down(display: Display, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _focal_length(camera: CameraOptions) -> float | None:
-    """The given focal length; None where none is."""
+    """The given focal length in pixels; None if none is given."""
     if camera.camera_params is None:
         return None
     model = camera_of_model(camera.camera_model or DEFAULT_MODEL)

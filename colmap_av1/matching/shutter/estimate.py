@@ -1,4 +1,4 @@
-"""The read-out time of a rolling shutter, estimated from tracks by least epipolar errors."""
+"""Estimate the read-out time of a rolling shutter by minimizing epipolar errors of tracks."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# Read-out times that are tried, in frames: rows may be read from the bottom, too.
+# Read-out times to try, in frame periods; negative if rows are read from the bottom.
 _TRIED = np.linspace(-1.0, 1.0, 17)
-# Pairs of frames that are looked at, frames between those of a pair, and matches of each.
+# Number of frame pairs, distances in frames within a pair, and matches used per pair.
 _NUM_PAIRS = 48
 _GAPS = (4, 8, 16)
 _NUM_MATCHES = 300
 _MIN_MATCHES, _MIN_PAIRS = 80, 12
-# Spread of the motion of a pair, in pixels, that shows parallax or a turn.
+# Spread of the motion of a pair, in pixels, that is enough parallax or rotation.
 _LEAST_SPREAD = 4.0
-# What is estimated holds where it explains the pairs better than none by so many standard errors,
-# where every second pair and the others agree on it to so much of a frame, and where it is more.
+# An estimate is accepted if it fits better than a read-out time of 0 by this many standard errors,
+# if even and odd pairs agree on it to within this share of a frame period, and if it is longer than
+# this share of a frame period.
 _LEAST_SIGNIFICANCE = 4.0
 _LARGEST_DIFFERENCE = 0.15
 _LEAST_READ_OUT = 0.05
+# Added to a loss before its logarithm, which keeps the logarithm finite.
 _LEAST_LOSS = 1e-3
 
 
@@ -38,9 +40,10 @@ class ReadOut:
     """An estimated read-out time.
 
     Attributes:
-        frames: time from the first row to the last, in frames; negative: read from the bottom.
-        error: half the difference of the estimates by every second pair and by the others.
-        significance: by how many standard errors it explains the pairs better than none.
+        frames: time from the first row to the last in frame periods; negative if rows are read
+            from the bottom.
+        error: half the difference of the estimates from even and from odd pairs.
+        significance: improvement of the loss over a read-out time of 0, in standard errors.
     """
 
     frames: float
@@ -50,7 +53,7 @@ class ReadOut:
 
 @dataclass(frozen=True)
 class _View:
-    """Matches of a pair of frames: pixels from the centre, velocities and places of rows."""
+    """Matches of a pair of frames: pixels from the centre, velocities, places in the read-out."""
 
     xy: tuple[_Floats, _Floats]
     velocity: tuple[_Floats, _Floats]
@@ -67,43 +70,43 @@ class _View:
 def estimate_read_out(
     tracks: Tracks, down: tuple[int, int], focal_length: float | None, seed: int = 0
 ) -> ReadOut | str:
-    """Estimate the time in which a shutter reads the rows of a picture.
+    """Estimate the time in which a rolling shutter reads the rows of a picture.
 
-    For each of a range of times positions are moved to the middle of the read-out by their
-    velocities, and relative poses are fitted to pairs of frames: the geometric mean of their
-    robust epipolar losses is least at the true time, as far as the motion changes along the video.
-    An even pan or walk bends all pictures alike and shows nothing.
+    For a range of times, positions are moved to the middle of the read-out by their velocities, and
+    relative poses are fitted to pairs of frames. The true time minimizes the geometric mean of the
+    robust epipolar losses if the motion changes along the video. An even pan or walk distorts all
+    pictures alike, so it does not determine the time.
 
     Args:
         tracks: tracks through all frames.
-        down: how the direction in which rows are read is shown, see `row_places`.
-        focal_length: in pixels; None: it is estimated from the tracks, too.
+        down: direction in which rows are read, see `row_places`.
+        focal_length: in pixels; if None, it is estimated from the tracks.
         seed: the random seed.
 
     Returns:
-        The read-out time; in words why it cannot be told.
+        The read-out time, or the reason why it is not observable.
     """
     views = _views(tracks, down, seed)
     if len(views) < _MIN_PAIRS:
         return "too few frames share enough tracks, or nothing moves"
-    found: ReadOut | str = "the focal length cannot be told from the tracks"
+    found: ReadOut | str = "the focal length is not observable from the tracks"
     read_out = 0.0
     for _ in range(1 if focal_length is not None else 2):
         focal = focal_length or _focal_length(tracks, views, read_out, seed)
-        found = _least(views, focal, seed) if focal is not None else found
+        found = _least_loss(views, focal, seed) if focal is not None else found
         if isinstance(found, str):
             return found
         read_out = found.frames
     assert isinstance(found, ReadOut)
     if abs(found.frames) < _LEAST_READ_OUT or found.significance < _LEAST_SIGNIFICANCE:
-        return "no read-out time explains the tracks better than none"
+        return "no read-out time fits the tracks better than a global shutter"
     if found.error > _LARGEST_DIFFERENCE / 2:
-        return "parts of the video disagree on it"
+        return "parts of the video give different read-out times"
     return found
 
 
 def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
-    """Pairs of frames all along the video, as far apart as their motion shows something."""
+    """Pairs of frames along the video, far enough apart for enough motion if possible."""
     rng = np.random.default_rng(seed)
     speed = velocities(tracks)
     place = row_places(tracks.xy, (tracks.width, tracks.height), down)
@@ -149,7 +152,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
 def _focal_length(
     tracks: Tracks, views: Sequence[_View], read_out: float, seed: int
 ) -> float | None:
-    """The focal length by the views' matches, corrected for a read-out time."""
+    """Estimate the focal length from the views' matches, corrected for a read-out time."""
     size = tracks.width, tracks.height
     centre = np.array(size) / 2
     keypoints: list[ImageKeypoints] = []
@@ -164,8 +167,8 @@ def _focal_length(
     return estimate_focal_length(keypoints, pairs, matches, size, seed=seed)
 
 
-def _least(views: Sequence[_View], focal_length: float, seed: int) -> ReadOut | str:
-    """The time of the least loss; in words why there is none."""
+def _least_loss(views: Sequence[_View], focal_length: float, seed: int) -> ReadOut | str:
+    """The read-out time with the smallest loss, or the reason why there is none."""
     loss = np.array(
         [
             [
@@ -177,7 +180,7 @@ def _least(views: Sequence[_View], focal_length: float, seed: int) -> ReadOut | 
     )
     found, *halves = (lowest(_TRIED, part.mean(axis=0)) for part in (loss, loss[::2], loss[1::2]))
     if found is None or None in halves:
-        return "the tracks show no least read-out time"
+        return "the loss has no minimum within the read-out times tried"
     at_best = np.array([np.interp(found, _TRIED, row) for row in loss])
     at_none = loss[:, len(_TRIED) // 2]
     gain = at_none - at_best

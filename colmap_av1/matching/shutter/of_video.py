@@ -1,4 +1,4 @@
-"""The read-out time of a video's shutter, by its tracks."""
+"""Estimate the read-out time of a video's rolling shutter from its tracks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.facts import read_video
 
-# Share of the time by which it may be off in all parts of a video: velocities are means, so it
-# comes out a tenth too short on rendered clips of 15 and 30 ms.
-_OFF_ALIKE = 0.12
+# Systematic error as a share of the read-out time. Velocities are averages, so estimates are a
+# tenth too short on rendered clips with 15 and 30 ms.
+_SYSTEMATIC_ERROR = 0.12
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class VideoReadOut:
     """The time in which the shutter of a video reads the rows of a picture.
 
     Attributes:
-        milliseconds: from the first row to the last, below 0 where rows are read from the bottom.
-        error: what it may be off by in milliseconds: half the difference of what every second
-            pair of frames says and the others do, and a share of it.
+        milliseconds: from the first row to the last; negative if rows are read from the bottom.
+        error: uncertainty in milliseconds: half the difference of the estimates from even and from
+            odd pairs of frames, combined with a systematic error.
     """
 
     milliseconds: float
@@ -41,8 +41,8 @@ def estimate_video_read_out(
 ) -> VideoReadOut | str:
     """Estimate the time in which the shutter of an AV1 video reads the rows of a picture.
 
-    Its motion is chained into tracks; the focal length comes from these, too. This is what
-    `--rolling_shutter estimate` corrects keypoints for.
+    The focal length is estimated as well. `--rolling_shutter estimate` corrects keypoints for this
+    time.
 
     Args:
         video: the AV1 video.
@@ -50,17 +50,18 @@ def estimate_video_read_out(
         progress: called with the stage "motion" and the number of frames so far.
 
     Returns:
-        The time; in words why it cannot be told.
+        The time, or the reason why it is not observable.
 
     Raises:
         VideoError: the video cannot be read, or shows no frame.
-        NotAv1Error: it is of another codec.
-        BitstreamError: the stream is damaged, and strict or before its second frame.
-        ImageError: the frames change their size.
+        NotAv1Error: the video has another codec.
+        BitstreamError: the stream is damaged, and `strict` is set or fewer than two frames precede
+            the damage.
+        ImageError: the frame size changes.
     """
     opened = read_video(video)
     if opened.frame_rate is None:
-        return "the container says no frame rate"
+        return "the container has no frame rate"
     if not is_square(opened.display.pixel_aspect):
         return "pixels are not square"
     context = RunContext(progress=progress if progress is not None else no_progress)
@@ -75,5 +76,5 @@ def estimate_video_read_out(
     if isinstance(found, str):
         return found
     period = 1000 / opened.frame_rate
-    error = math.hypot(found.error, _OFF_ALIKE * found.frames)
+    error = math.hypot(found.error, _SYSTEMATIC_ERROR * found.frames)
     return VideoReadOut(found.frames * period, error * period)
