@@ -341,7 +341,7 @@ def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) ->
     settings = MapOptions(refine_intrinsics=camera.camera_params is None, forward_motion=forward)
     mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
     missing = mapped.num_images - mapped.num_registered[0]
-    parts = [f"{missing} images have no pose in folder 0"] if missing else []
+    parts = [f"{missing} images are not registered in folder 0"] if missing else []
     return about_the_model([*matched.warnings, *mapped.warnings, *parts])
 
 
@@ -349,7 +349,8 @@ def about_the_model(warnings: Sequence[str]) -> list[str]:
     """The warnings about bent or disconnected models and images that are not registered."""
     signs = (
         "few matches",
-        "no pose",
+        "not registered",
+        "no model has all",
         "join '",
         "fit the poses",
         "far apart in time",
