@@ -58,7 +58,7 @@ def match_rows(report: MatchReport) -> Rows:
     ]
     if report.estimate is not None:
         rows += _estimate_rows(report.estimate, report.num_images)
-    if report.focal_length is not None:
+    elif report.focal_length is not None:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
@@ -71,6 +71,7 @@ def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
         ("joint estimate", f"{estimate.num_registered} of {num_images} images registered"),
         *_dynamic_row(estimate.moving),
         *_long_range_rows(estimate.far_views, estimate.far_views_largest),
+        _focal_length_row(estimate.focal_lengths),
     ]
 
 

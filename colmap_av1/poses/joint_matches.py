@@ -9,6 +9,8 @@ observations suffice. This keeps the mapper fast.
 
 from __future__ import annotations
 
+import copy
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -80,12 +82,14 @@ class JointEstimate:
             apart; None if no such images overlap.
         far_views_largest: its 90th percentile.
         moving: share of dynamic pixels, which have no matches.
+        focal_lengths: the shortest and the longest focal length of the registered images in pixels.
     """
 
     num_registered: int
     far_views: float | None
     far_views_largest: float | None
     moving: float | None
+    focal_lengths: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,7 @@ def match_jointly(
     matches = posed.matches.result
     pose_of = {image.name: image.cam_from_world for image in known.images}
     left = [name for name in image_set.images.names if name not in pose_of]
+    focal = [known.cameras[image.camera_id].mean_focal_length() for image in known.images]
     return JointMatches(
         cameras=cameras,
         focal_length=_focal_length(run, cameras[0], guessed=matches.guessed),
@@ -150,6 +155,7 @@ def match_jointly(
             far_views=far.far_views if far is not None else None,
             far_views_largest=far.far_views_largest if far is not None else None,
             moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
+            focal_lengths=(min(focal), max(focal)),
         ),
         poses=[pose_of.get(name) for name in image_set.images.names],
     )
@@ -377,31 +383,41 @@ def _tracks_of_unregistered(
 
 
 def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
-    """The camera of each image: adjusted if its focal length is known, else the initial guess.
+    """The camera of each image.
 
-    Cameras of an existing database stay unchanged.
+    Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
+    its images has its own adjusted camera. Other cameras are adjusted if their focal length is
+    known, else they are the initial guess.
     """
     if run.cameras is not None:
         return run.cameras.of_images
-    database = run.output / "database.db"
-    listed = read_images(database)
+    listed = read_images(run.output / "database.db")
     names = [image.name for image in listed]
-    matched = dict(zip(names, listed_cameras(database, listed, names), strict=True))
+    matched = dict(
+        zip(names, listed_cameras(run.output / "database.db", listed, names), strict=True)
+    )
+    registered = {image.name: known.cameras[image.camera_id] for image in known.images}
+    for camera in registered.values():
+        camera.has_prior_focal_length = True  # models do not store it
     named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
-    first = {sequence: matched[name] for sequence, name in named if name in matched}
-    adjusted = dict[int, pycolmap.Camera]()
-    own = dict[str, pycolmap.Camera]()
-    for image in known.images:
-        own[image.name] = known.cameras[image.camera_id]
-        own[image.name].has_prior_focal_length = True  # models do not store it
-        if image.name in matched:
-            adjusted[id(matched[image.name])] = own[image.name]
+    of_sequence = {sequence: matched[name] for sequence, name in named if name in matched}
+    initial = [of_sequence[sequence] for sequence, _ in named]
     # Images share a camera if it is the same object, see `ImageMatches`.
-    cameras = [first[sequence] for sequence, _ in named]
-    return [
-        own.get(name, adjusted.get(id(camera), camera)) if camera.has_prior_focal_length else camera
-        for (_, name), camera in zip(named, cameras, strict=True)
-    ]
+    sharing = defaultdict[int, list[int]](list)
+    for i, (_, name) in enumerate(named):
+        if name in registered:
+            sharing[id(initial[i])].append(i)
+    cameras = []
+    for i, (camera, (_, name)) in enumerate(zip(initial, named, strict=True)):
+        places = np.array(sharing[id(camera)])
+        adjusted = [registered[named[k][1]] for k in places]
+        if len(set(map(id, adjusted))) > 1:
+            nearest = adjusted[int(np.argmin(np.abs(places - i)))]
+            cameras.append(nearest if name in registered else copy.copy(nearest))
+        else:
+            is_known = adjusted and camera.has_prior_focal_length
+            cameras.append(adjusted[0] if is_known else camera)
+    return cameras
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:

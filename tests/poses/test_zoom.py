@@ -16,6 +16,8 @@ from colmap_av1.cli.reports import reconstruct_rows
 from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.map import map_database
+from colmap_av1.match import match
 from colmap_av1.options import CameraOptions, MapperOptions, MatchOptions, ReconstructOptions
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.video.decoding import decode_frames
@@ -54,6 +56,18 @@ def test_a_zoom_is_found(encode: Callable[..., Path], truth: Truth, tmp_path: Pa
     shortest, longest = report.focal_lengths
     assert longest / shortest == pytest.approx(ZOOM, rel=0.02)
     assert dict(reconstruct_rows(report))["focal lengths"] == f"{shortest:.2f} to {longest:.2f} px"
+
+
+def test_a_zoom_is_found_by_match(
+    encode: Callable[..., Path], truth: Truth, tmp_path: Path
+) -> None:
+    database, images = tmp_path / "zoom.db", tmp_path / "images"
+    match(database, zooming(encode, tmp_path / "zoom.mp4"), image_path=images)
+    model = read_model(map_database(database, images, tmp_path / "models").model)
+    errors = pose_errors(model_poses(model, 60), truth.cam_from_world)
+    assert errors.num_poses > 50
+    assert errors.ate < 0.003 * errors.extent
+    assert len(model.cameras) == model.num_reg_images()
 
 
 def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> None:
