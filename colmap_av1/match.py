@@ -36,7 +36,7 @@ from colmap_av1.matching.match_images import (
     SelectedTracks,
     match_images,
 )
-from colmap_av1.matching.shutter.correct import without_shutter
+from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
@@ -547,7 +547,7 @@ def _without_shutter(
 ) -> PreparedImages:
     """The images with their tracks corrected for the rolling shutter, if requested."""
     tracked = prepared.tracked
-    tracks, read_out = without_shutter(
+    tracks, read_out = correct_rolling_shutter(
         tracked.tracks,
         prepared.display,
         prepared.source.pictures.frame_rate,

@@ -12,9 +12,14 @@ from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.corners.in_images import corners_in_images
-from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
-from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
-from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
+from colmap_av1.poses.dynamic.stage import (
+    DynamicResult,
+    dynamic_stage,
+    read_dynamic_masks,
+    without_dynamic_tracks,
+)
+from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import split_stage
 from colmap_av1.poses.pose_stages import (
@@ -165,7 +170,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
         if posed.far_views is not None:
-            posed = replace(posed, far_views=_far_views(run, posed, image_set))
+            posed = replace(posed, far_views=_long_range_check(run, posed, image_set))
     return posed
 
 
@@ -217,23 +222,23 @@ def _pose_stages(
     mapped = pose_stage(run, matched, image_set, keyed)
     # Without a read-out time the tracks were not corrected.
     in_place = not any(own.read_out for own in videos)
-    believed = believed_tracks(run, [own.tracks for own in videos], image_set)
+    trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
-        run, matched, mapped, believed=believed, image_set=image_set, keyed=keyed, in_place=in_place
+        run, matched, mapped, trusted=trusted, image_set=image_set, keyed=keyed, in_place=in_place
     )
     links = matched.result.links
     if links.gaps or links.fast:
         posed = remapped_poses(run, posed, image_set)
-    return replace(posed, far_views=_far_views(run, posed, image_set))
+    return replace(posed, far_views=_long_range_check(run, posed, image_set))
 
 
-def _far_views(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
+def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
     """The long-range check of the poses."""
     linked = posed.matches.result.links.looked_again
-    return far_view_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
+    return long_range_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
 
 
-def believed_tracks(
+def trusted_tracks(
     run: Run, tracks: Sequence[Tracks], image_set: ImageSet
 ) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut at gaps that links replace, and the links."""
@@ -261,7 +266,7 @@ def _adjusted(
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
     moving, in_place = posed.moving, posed.in_place
-    follows = in_place and (bool(moving) or has_moving_masks(image_set))
+    follows = in_place and (bool(moving) or has_changing_masks(image_set))
     return adjustment_stage(
         run,
         posed.tracks,
@@ -280,7 +285,7 @@ def refined_poses(
     matched: Kept[MatchesResult],
     mapped: Kept[MappedResult],
     *,
-    believed: tuple[Tracks, Tracks],
+    trusted: tuple[Tracks, Tracks],
     image_set: ImageSet,
     keyed: ImageSet,
     in_place: bool,
@@ -291,21 +296,21 @@ def refined_poses(
         run: the run.
         matched: the database that was mapped.
         mapped: the poses of the mapper.
-        believed: the tracks and links, see `believed_tracks`.
+        trusted: the tracks and links, see `trusted_tracks`.
         image_set: the images.
         keyed: the key images.
         in_place: see `Posed`.
     """
-    tracks, links = believed
+    tracks, links = trusted
     resection = dynamic = None
     poses: Kept[PosesResult] = mapped
     if len(keyed.sequence) < len(image_set.sequence):
         poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        dynamic = moving_stage(run, tracks, image_set, poses)
-        moving = read_moving(run.stages)
-    tracks, links = (without_moving(own, image_set, moving, run) for own in (tracks, links))
+        dynamic = dynamic_stage(run, tracks, image_set, poses)
+        moving = read_dynamic_masks(run.stages)
+    tracks, links = (without_dynamic_tracks(own, image_set, moving, run) for own in (tracks, links))
     posed = Posed(
         matches=matched,
         mapped=mapped,
