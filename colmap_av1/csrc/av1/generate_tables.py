@@ -233,8 +233,8 @@ def _parse_braces(text: str, start: int, constants: dict[str, int]) -> _Nested:
                 return done
             stack[-1].append(done)
         elif token != ",":
-            # Split_Tx_Size lacks one comma at a line's end: there the line break separates. The
-            # check of the dimensions tells if this ever splits what is one entry.
+            # Split_Tx_Size lacks a comma at the end of a line, so line breaks separate entries as
+            # well. The check of the dimensions would detect if this split an entry.
             stack[-1].extend(_evaluate(entry, constants) for entry in token.split("\n"))
     raise ValueError("an array definition has no closing brace; the text is cut short")
 
