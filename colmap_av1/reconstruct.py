@@ -220,7 +220,7 @@ def reconstruct(
                 open_source(
                     own,
                     with_stream_kept(_as_converted(options), stages, label).source,
-                    beside=output,
+                    next_to=output,
                     context=context,
                 )
             )

@@ -53,8 +53,8 @@ class Posed:
         tracks: the tracks of all videos, cut at gaps that links replace.
         links: links as tracks.
         moving: masks that exclude dynamic objects, by image name.
-        in_place: whether tracks have the positions of the pictures; false if they were corrected
-            for a rolling shutter.
+        has_picture_positions: whether tracks have positions in the pictures; false if they were
+            corrected for a rolling shutter.
         far_views: the long-range check; None if it was not made.
     """
 
@@ -66,7 +66,7 @@ class Posed:
     tracks: Tracks
     links: Tracks
     moving: dict[str, Mask]
-    in_place: bool
+    has_picture_positions: bool
     far_views: Kept[LongRangeResult] | None = None
 
     @property
@@ -221,10 +221,16 @@ def _pose_stages(
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
     # Without a read-out time the tracks were not corrected.
-    in_place = not any(own.read_out for own in videos)
+    has_picture_positions = not any(own.read_out for own in videos)
     trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
-        run, matched, mapped, trusted=trusted, image_set=image_set, keyed=keyed, in_place=in_place
+        run,
+        matched,
+        mapped,
+        trusted=trusted,
+        image_set=image_set,
+        keyed=keyed,
+        has_picture_positions=has_picture_positions,
     )
     links = matched.result.links
     if links.gaps or links.fast:
@@ -253,7 +259,7 @@ def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if the
     adjustment did not use corners.
     """
-    if posed.adjustment is None or not posed.in_place:
+    if posed.adjustment is None or not posed.has_picture_positions:
         return posed
     again = remap_stage(run, image_set, posed.adjustment)
     if not again.result.is_better:
@@ -265,8 +271,8 @@ def _adjusted(
     run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
-    moving, in_place = posed.moving, posed.in_place
-    follows = in_place and (bool(moving) or has_changing_masks(image_set))
+    moving, has_picture_positions = posed.moving, posed.has_picture_positions
+    follows = has_picture_positions and (bool(moving) or has_changing_masks(image_set))
     return adjustment_stage(
         run,
         posed.tracks,
@@ -275,7 +281,7 @@ def _adjusted(
         poses,
         moved=posed.dynamic.digest if posed.dynamic is not None and moving else None,
         follow=partial(follow_behind, run, moving) if follows else None,
-        corners=partial(corners_in_images, run, moving) if in_place else None,
+        corners=partial(corners_in_images, run, moving) if has_picture_positions else None,
         number=number,
     )
 
@@ -288,7 +294,7 @@ def refined_poses(
     trusted: tuple[Tracks, Tracks],
     image_set: ImageSet,
     keyed: ImageSet,
-    in_place: bool,
+    has_picture_positions: bool,
 ) -> Posed:
     """Estimate the poses of the images between the key images, and adjust all poses.
 
@@ -299,7 +305,7 @@ def refined_poses(
         trusted: the tracks and links, see `trusted_tracks`.
         image_set: the images.
         keyed: the key images.
-        in_place: see `Posed`.
+        has_picture_positions: see `Posed`.
     """
     tracks, links = trusted
     resection = dynamic = None
@@ -320,7 +326,7 @@ def refined_poses(
         tracks=tracks,
         links=links,
         moving=moving,
-        in_place=in_place,
+        has_picture_positions=has_picture_positions,
     )
     if not run.options.mapping.adjust:
         return posed

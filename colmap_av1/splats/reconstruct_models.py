@@ -110,7 +110,7 @@ def further_models(
                 trusted=trusted,
                 image_set=some,
                 keyed=key,
-                in_place=first.in_place,
+                has_picture_positions=first.has_picture_positions,
             )
             posed = split_at_seams(own, posed, some)
         except ModelError:  # no track agrees with the mapper's poses of these images

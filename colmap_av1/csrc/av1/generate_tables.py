@@ -2,7 +2,7 @@
 
 Usage: ``python generate_tables.py SPEC_DIR``, where SPEC_DIR holds the specification's markdown
 chapters (03.symbols.md to 10.additional.tables.md). The files constants.h, spec_tables.h,
-default_cdfs.h and default_cdfs.cc are written beside this script; they are committed, so building
+default_cdfs.h and default_cdfs.cc are written next to this script; they are committed, so building
 the package needs neither the specification nor this script.
 
 Every array definition of the chapters is either emitted or named in ``_PIXEL_TABLES`` or
@@ -407,7 +407,7 @@ def generate(spec_dir: Path) -> dict[str, str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the generated files beside this script; returns the exit status."""
+    """Write the generated files next to this script; returns the exit status."""
     if len(arguments) != 1:
         print("usage: python generate_tables.py SPEC_DIR", file=sys.stderr)
         return 2
