@@ -231,7 +231,7 @@ def _track(
         )
 
     with (
-        open_source(images.video, matching.source, beside=output, context=context) as source,
+        open_source(images.video, matching.source, next_to=output, context=context) as source,
         unchanged(source.stream.state),
     ):
         chaining = chaining_for_points(

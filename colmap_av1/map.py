@@ -26,7 +26,7 @@ from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.gaps import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
-from colmap_av1.poses.long_range import FarViews
+from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.placing.placement import (
     Place,
@@ -65,7 +65,7 @@ class MapReport:
     num_registered: tuple[int, ...]
     place: Place
     figures: ModelFigures
-    far_views: FarViews | None
+    far_views: LongRangeErrors | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 

@@ -36,7 +36,7 @@ from colmap_av1.matching.match_images import (
     SelectedTracks,
     match_images,
 )
-from colmap_av1.matching.shutter.correct import without_shutter
+from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
@@ -187,7 +187,7 @@ def match(
     Args:
         database: the database file; created if it is missing.
         video: a video or several. A video that is not AV1 is converted first, to a temporary file
-            beside the database or to a file that is kept (`options.keep_stream`).
+            next to the database or to a file that is kept (`options.keep_stream`).
         photos: folder of photos that become images, too, named by the folder and their path in it;
             None: no photos.
         image_path: folder to write the images to, for the mapper's colours and for training.
@@ -228,7 +228,7 @@ def match(
             listed_of_videos(database, listed, inputs),
             folder,
             options,
-            beside=database,
+            next_to=database,
             scratch=scratch,
             context=context,
         )
@@ -376,7 +376,7 @@ def _prepare(
     folder: Path | None,
     options: MatchOptions,
     *,
-    beside: Path,
+    next_to: Path,
     scratch: Path | None,
     context: RunContext,
 ) -> _Images:
@@ -387,7 +387,7 @@ def _prepare(
         listed: for each video, (width, height) by name of the images that the database lists.
         folder: folder to write the images to; None: no images are written.
         options: all options.
-        beside: the database.
+        next_to: the database.
         scratch: folder that keeps decoded pictures for a joint estimate; None: no joint estimate
             follows, and only the tracks selected for matching are kept.
         context: state of the run.
@@ -402,11 +402,11 @@ def _prepare(
             options,
             listed=existing,
             masks=masks,
-            beside=beside,
+            next_to=next_to,
             context=context,
         )
         fast.append(fast_frames(prepared.tracked.tracks))
-        prepared = _without_shutter(prepared, options, context)
+        prepared = _correct_rolling_shutter(prepared, options, context)
         if scratch is not None:
             kept = KeptPictures(scratch / f"{number}.raw")
             prepared = replace(prepared, source=replace(prepared.source, kept=kept))
@@ -542,12 +542,12 @@ def _match_pairs(
     )
 
 
-def _without_shutter(
+def _correct_rolling_shutter(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
 ) -> PreparedImages:
     """The images with their tracks corrected for the rolling shutter, if requested."""
     tracked = prepared.tracked
-    tracks, read_out = without_shutter(
+    tracks, read_out = correct_rolling_shutter(
         tracked.tracks,
         prepared.display,
         prepared.source.pictures.frame_rate,

@@ -220,7 +220,7 @@ def reconstruct(
                 open_source(
                     own,
                     with_stream_kept(_as_converted(options), stages, label).source,
-                    beside=output,
+                    next_to=output,
                     context=context,
                 )
             )
@@ -276,7 +276,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     posed = estimate_poses(run, videos, image_set)
     del videos  # These tracks are as large as those in `posed`.
     placed, written = written_model(run, posed, image_set)
-    further, unplaced = further_models(run, posed, image_set)
+    further, not_registered = further_models(run, posed, image_set)
     assert posed.far_views is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
     implausible = focal_length_warning(read_posed_model(run.stages / poses.poses).cameras.values())
@@ -324,16 +324,16 @@ def _run_stages(run: Run) -> ReconstructReport:
             *matches.link_warnings,
             *placed.result.place_warnings,
             *([implausible] if implausible is not None else []),
-            *_warnings(posed, model, len(image_set.sequence), further, unplaced),
+            *_warnings(posed, model, len(image_set.sequence), further, not_registered),
         ),
-        timelines=_timelines(run, image_set, matches.key_images, unplaced),
+        timelines=_timelines(run, image_set, matches.key_images, not_registered),
     )
 
 
 def _timelines(
-    run: Run, image_set: ImageSet, key_images: Sequence[int], unplaced: Sequence[str]
+    run: Run, image_set: ImageSet, key_images: Sequence[int], not_registered: Sequence[str]
 ) -> tuple[VideoTimeline, ...]:
-    keys, left = {image_set.images.names[i] for i in key_images}, set(unplaced)
+    keys, left = {image_set.images.names[i] for i in key_images}, set(not_registered)
     timelines = []
     for number, video in enumerate(run.inputs.videos):
         own = image_set.of_video(number)
@@ -356,7 +356,7 @@ def _warnings(
     model: ModelResult,
     num_images: int,
     further: Sequence[FurtherModel],
-    unplaced: Sequence[str],
+    not_registered: Sequence[str],
 ) -> list[str]:
     """Warnings about the poses and the model."""
     matches, poses = posed.matches.result, posed.last.result
@@ -367,10 +367,10 @@ def _warnings(
             f"{num_images}, {', '.join(map(str, further))}; each folder has its own "
             "'images' and 'sparse/0'"
         )
-    if unplaced:
+    if not_registered:
         warnings.append(
-            f"{len(unplaced)} of {num_images} images are not registered and left out: "
-            f"{some_names(unplaced)}"
+            f"{len(not_registered)} of {num_images} images are not registered: "
+            f"{some_names(not_registered)}"
         )
     left_out = [name for name, count in poses.registered.items() if count == 0]
     if left_out and not further:

@@ -1,4 +1,4 @@
-"""Paths and clips that several tests use."""
+"""Paths, clips and fixtures that several tests use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED = PROJECT.parent / "shared"
-# For `sys.path` of processes that use parts of the tests.
+# `sys.path` entries of processes that import modules of the tests.
 TEST_PATHS = os.pathsep.join(str(p) for p in (PROJECT / "tests", *(PROJECT / "tests").glob("*/")))
 
 AV1 = [
@@ -25,15 +25,16 @@ AV1 = [
     *("-row-mt", "1", "-crf", "20", "-b:v", "0", "-g", "9999"),
 ]
 
-# Shells let what they start in the background ignore interrupts, and Python then does, too.
-HEED_INTERRUPTS = """
+# Shells make background processes ignore interrupts, and Python inherits this. This program handles
+# interrupts anyway.
+HANDLE_INTERRUPTS = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from colmap_av1.cli import main
 sys.exit(main())
 """
 
-# A busy machine may take long for an example.
+# On a busy machine, an example can exceed the default deadline.
 settings.register_profile("tests", deadline=None)
 settings.load_profile("tests")
 
@@ -42,7 +43,7 @@ Encode = Callable[..., Path]
 
 
 def pytest_configure() -> None:
-    # For the workers, which fill the cores: BLAS's further threads would wait for one in a loop.
+    # The test workers already use all cores, and further BLAS threads would wait in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
@@ -53,7 +54,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of test data beside the checkout."""
+    """The folder of test data next to the checkout."""
     if not SHARED.is_dir():
         pytest.skip("needs the test data in ../shared")
     return SHARED
@@ -61,7 +62,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def ffmpeg() -> Ffmpeg:
-    """Runs ffmpeg with the given words, the last of which is the output, and returns it."""
+    """Run ffmpeg with arguments, the last of which is the output, and return the output."""
 
     def run(*words: str | Path, stdin: bytes | None = None) -> Path:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *map(str, words)]
@@ -73,7 +74,7 @@ def ffmpeg() -> Ffmpeg:
 
 @pytest.fixture(scope="session")
 def encode(ffmpeg: Ffmpeg) -> Encode:
-    """Encodes uint8 [n, height, width, 3] BGR frames, as AV1 unless told otherwise."""
+    """Encode uint8 [n, height, width, 3] BGR frames, as AV1 by default."""
 
     def run(frames: NDArray[np.uint8], output: Path, *how: str) -> Path:
         height, width = frames.shape[1:3]
@@ -85,7 +86,7 @@ def encode(ffmpeg: Ffmpeg) -> Encode:
 
 
 def make_frames(count: int, width: int = 192, height: int = 128) -> NDArray[np.uint8]:
-    """Frames of a textured ground with textured posts before it, seen by a moving camera."""
+    """Frames of a textured background with textured posts in front of it and a moving camera."""
     rng = np.random.default_rng(7)
     texture = rng.integers(0, 256, (height // 4 + 1, width // 2, 3), dtype=np.uint8)
     far = texture.repeat(4, axis=0).repeat(4, axis=1)[:height]
@@ -100,7 +101,7 @@ def make_frames(count: int, width: int = 192, height: int = 128) -> NDArray[np.u
 
 
 def encode_two_sizes(encode: Encode, output: Path, count: int) -> Path:
-    """A stream of frames of 192x128, as many as told, and then of 128x128."""
+    """A stream of `count` frames of 192x128 and then `count` frames of 128x128."""
     parts = [output.with_name(f"{width}.obu") for width in (192, 128)]
     for width, part in zip((192, 128), parts, strict=True):
         encode(make_frames(count, width, 128), part)
@@ -116,7 +117,7 @@ def clip(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def clips(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of 8 clips: 6 of AV1 in 3 lengths, 1 damaged in the first frame, 1 of text."""
+    """A folder of 8 clips: 6 AV1 clips of 3 lengths, 1 damaged in its first frame, 1 text file."""
     folder = tmp_path_factory.mktemp("batch") / "clips"
     for part in ("a", "b"):
         (folder / part).mkdir(parents=True)

@@ -153,7 +153,7 @@ class CommandMachine(RuleBasedStateMachine):
         in_the_way = self.in_the_way(command)
         before = contents(self.folder, *command.outputs)
         outcome = self.call(command.words)
-        assert outcome.status in (0, 2), outcome.said
+        assert outcome.status in (0, 2), outcome.output
         if outcome.status == 0:
             if good:
                 assert self.made_by(command) == self.world.made(*command.outputs)
@@ -161,7 +161,7 @@ class CommandMachine(RuleBasedStateMachine):
         else:
             after = contents(self.folder, *command.outputs)
             assert before.items() <= after.items() or command.resumes
-            assert not good or in_the_way, outcome.said
+            assert not good or in_the_way, outcome.output
 
     @rule(
         name=st.sampled_from(sorted(COMMANDS)),
@@ -176,9 +176,9 @@ class CommandMachine(RuleBasedStateMachine):
         quiet = {signal.SIGTERM: (143,), signal.SIGINT: (130,), signal.SIGKILL: (-9,)}[number]
         assert outcome.status in (0, 2, *quiet), outcome
         if number == signal.SIGTERM and outcome.status == 143:
-            assert outcome.said == ""
+            assert outcome.output == ""
         if number == signal.SIGINT and outcome.status == 130:
-            assert outcome.said in ("", "colmap-av1: interrupted\n")
+            assert outcome.output in ("", "colmap-av1: interrupted\n")
 
     @precondition(lambda self: self.derived())
     @rule(data=st.data(), how=st.sampled_from(["cut", "flip", "empty", "more", "gone", "folder"]))
@@ -240,7 +240,7 @@ class CommandMachine(RuleBasedStateMachine):
                     self.remove("out/report.json")
                 if command.resumes or self.made_by(command) != reference:
                     outcome = self.call(command.words)
-                    assert outcome.status == 0, outcome.said
+                    assert outcome.status == 0, outcome.output
                 assert self.made_by(command) == reference
                 assert not self.leftovers(command), os.listdir(self.folder)
         finally:
@@ -252,10 +252,10 @@ class CommandMachine(RuleBasedStateMachine):
         return outcome
 
     def check_words(self, outcome: Outcome) -> None:
-        lines = outcome.said.splitlines()
-        assert all(line.startswith("colmap-av1: ") for line in lines), outcome.said
+        lines = outcome.output.splitlines()
+        assert all(line.startswith("colmap-av1: ") for line in lines), outcome.output
         errors = [line for line in lines if line.startswith("colmap-av1: error: ")]
-        assert len(errors) == (outcome.status == 2), outcome.said
+        assert len(errors) == (outcome.status == 2), outcome.output
 
     def made_by(self, command: Command) -> dict[str, str]:
         made = contents(self.folder, *command.outputs)
@@ -321,7 +321,7 @@ def world(ffmpeg: Ffmpeg, tmp_path: Path) -> Iterator[World]:
         seconds = {}
         for name, command in COMMANDS.items():
             outcome = server.run(folder, f"{command.words} --quiet")
-            assert outcome.status == 0, outcome.said
+            assert outcome.status == 0, outcome.output
             seconds[name] = outcome.seconds
         yield World(server, folder, seconds)
 

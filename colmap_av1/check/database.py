@@ -105,7 +105,7 @@ class CheckReport:
 def check(database: str | os.PathLike[str]) -> CheckReport:
     """Check what the mappers will do with a COLMAP database of any version.
 
-    The database is not changed or migrated, and no file is created beside it. The thresholds are
+    The database is not changed or migrated, and no file is created next to it. The thresholds are
     the defaults of COLMAP's mappers.
 
     Args:

@@ -9,7 +9,7 @@ import pycolmap
 
 from colmap_av1.check.crossings import Crossings, model_crossings
 from colmap_av1.check.model_figures import ModelFigures, model_figures
-from colmap_av1.poses.long_range import FarViews, model_far_views
+from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
 
@@ -28,7 +28,7 @@ class ModelCheck:
     figures: ModelFigures
     seams: Seams
     crossings: Crossings | None
-    far_views: FarViews | None
+    far_views: LongRangeErrors | None
 
     @property
     def seam_warnings(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ def check_model(
         DatabaseError: the database cannot be read, or is damaged.
     """
     # The long-range check comes first, because it raises if images are missing.
-    far_views = None if image_path is None else model_far_views(model, image_path, progress)
+    far_views = None if image_path is None else model_long_range_errors(model, image_path, progress)
     return ModelCheck(
         figures=model_figures(model),
         seams=model_seams(model),

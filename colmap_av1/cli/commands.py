@@ -462,7 +462,7 @@ COMMANDS = {
             _GAUSSIANS,
             _flag(
                 "report",
-                "also write the page OUTPUT.html, beside the folder, to view the model (needs the "
+                "also write the page OUTPUT.html, next to the folder, to view the model (needs the "
                 "viewer extra)",
             ),
             _flag("overwrite", "replace an existing file of --gaussians or --report"),

@@ -20,8 +20,8 @@ from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
-from colmap_av1.video.metadata.lens import doubtful_lens
-from colmap_av1.video.metadata.positions import doubtful_place
+from colmap_av1.video.metadata.lens import implausible_focal_length
+from colmap_av1.video.metadata.positions import implausible_position
 from colmap_av1.video.metadata.spherical import check_is_plane, hint
 from colmap_av1.video.unchanged import FileState
 
@@ -164,7 +164,10 @@ def read_inputs(
     _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
-    doubtful = [(v.doubtful_times, doubtful_place(v.tags), doubtful_lens(v.tags)) for v in videos]
+    doubtful = [
+        (v.doubtful_times, implausible_position(v.tags), implausible_focal_length(v.tags))
+        for v in videos
+    ]
     doubts = _with_names(videos, [[note for note in own if note is not None] for own in doubtful])
     notes = (*hints, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)

@@ -115,7 +115,7 @@ def prepare_images(
     *,
     listed: Mapping[str, tuple[int, int]],
     masks: VideoMasks | None = None,
-    beside: Path,
+    next_to: Path,
     context: RunContext,
 ) -> PreparedImages:
     """Chain the motion of a video into tracks and find or choose the frames that are images.
@@ -126,7 +126,7 @@ def prepare_images(
         options: all are used except those of density, pairs and verification.
         listed: (width, height) of images in an existing database, by name.
         masks: masks of the pictures; None: all pixels are used.
-        beside: the output file, see `open_source`.
+        next_to: the output file, see `open_source`.
         context: measures the stages up to "choice".
 
     Raises:
@@ -161,7 +161,7 @@ def prepare_images(
         )
 
     with (
-        open_source(video, options.source, beside=beside, context=context) as source,
+        open_source(video, options.source, next_to=next_to, context=context) as source,
         unchanged(source.stream.state),
     ):
         found = track_images(

@@ -23,7 +23,7 @@ from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.options import CameraOptions
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.facts import Video
-from colmap_av1.video.metadata.lens import said_focal_length
+from colmap_av1.video.metadata.lens import container_focal_length
 
 # Focal lengths from tracks and from the container agree if they differ by less than this factor.
 _MAX_FACTOR = 1.2
@@ -46,7 +46,7 @@ class Shape:
 
 def shape_of(video: Video, size: tuple[int, int], pixel_aspect: float) -> Shape:
     """Read the shape of a video's images."""
-    return Shape(size, pixel_aspect, said_focal_length(video.tags, size, pixel_aspect))
+    return Shape(size, pixel_aspect, container_focal_length(video.tags, size, pixel_aspect))
 
 
 @dataclass(frozen=True)

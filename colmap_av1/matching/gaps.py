@@ -164,7 +164,7 @@ def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
     return np.asarray(sliding_window_view(fast, 2 * _LASTING_FRAMES + 1).any(axis=1))
 
 
-def may_link(
+def should_examine_pictures(
     inter_share: NDArray[np.float32],
     frames: NDArray[np.int32],
     tracks: Tracks,

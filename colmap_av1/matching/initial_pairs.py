@@ -68,14 +68,14 @@ def demote_bad_initial_pairs(
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):
                 # The remaining inliers decide as well as all of them.
-                few = _thinned(geometry)
+                few = _demoted(geometry)
                 if _is_contradicted(few, inliers_of(matched, cameras, pair, few)):
                     geometries[k] = few
         known = KnownPoses(poses)
         for k in known.misleading_pairs(replace(matched, geometries=geometries), cameras):
-            geometries[k] = _thinned(geometries[k])
+            geometries[k] = _demoted(geometries[k])
         for k in runaway_starts(replace(matched, geometries=geometries), cameras, known):
-            geometries[k] = _thinned(geometries[k])
+            geometries[k] = _demoted(geometries[k])
     return replace(matched, geometries=geometries)
 
 
@@ -109,7 +109,7 @@ def _error(E: _Floats, x: Sequence[_Floats]) -> float:
     return float(np.quantile(sampson_error(E, x[0], x[1]), _ERROR_QUANTILE))
 
 
-def _thinned(geometry: TwoViewGeometry) -> TwoViewGeometry:
+def _demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
     """Keep some of the inliers, evenly spread, too few for an initial pair."""
     count = len(geometry.inlier_matches)
     chosen = evenly_spread(count, _MIN_INLIERS - 1, rounded=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.depth import DepthEvidence, depth_of_images
-from colmap_av1.matching.gaps import may_link
+from colmap_av1.matching.gaps import should_examine_pictures
 from colmap_av1.matching.image_matches import (
     MatchedImages,
     PairedImages,
@@ -160,7 +160,7 @@ def pair_videos(
     paired = []
     for number, video in enumerate(videos):
         chosen = image_set.of_video(number)
-        linked_anyway = may_link(
+        examines_pictures = should_examine_pictures(
             video.inter_share, chosen.frames, video.tracks, options.links, options.min_length
         )
         paired.append(
@@ -171,7 +171,7 @@ def pair_videos(
                 options.pairs,
                 min_length=options.min_length,
                 context=context,
-                needed=image_set.num_sequences == 1 and not linked_anyway,
+                needed=image_set.num_sequences == 1 and not examines_pictures,
             )
         )
     return join_videos(paired, image_set)

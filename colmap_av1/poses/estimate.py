@@ -12,9 +12,14 @@ from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.corners.in_images import corners_in_images
-from colmap_av1.poses.dynamic.following import follow_behind, has_moving_masks
-from colmap_av1.poses.dynamic.stage import DynamicResult, moving_stage, read_moving, without_moving
-from colmap_av1.poses.long_range_stage import LongRangeResult, far_view_stage
+from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
+from colmap_av1.poses.dynamic.stage import (
+    DynamicResult,
+    dynamic_stage,
+    read_dynamic_masks,
+    without_dynamic_tracks,
+)
+from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import split_stage
 from colmap_av1.poses.pose_stages import (
@@ -48,8 +53,8 @@ class Posed:
         tracks: the tracks of all videos, cut at gaps that links replace.
         links: links as tracks.
         moving: masks that exclude dynamic objects, by image name.
-        in_place: whether tracks have the positions of the pictures; false if they were corrected
-            for a rolling shutter.
+        has_picture_positions: whether tracks have positions in the pictures; false if they were
+            corrected for a rolling shutter.
         far_views: the long-range check; None if it was not made.
     """
 
@@ -61,7 +66,7 @@ class Posed:
     tracks: Tracks
     links: Tracks
     moving: dict[str, Mask]
-    in_place: bool
+    has_picture_positions: bool
     far_views: Kept[LongRangeResult] | None = None
 
     @property
@@ -165,7 +170,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
         if posed.far_views is not None:
-            posed = replace(posed, far_views=_far_views(run, posed, image_set))
+            posed = replace(posed, far_views=_long_range_check(run, posed, image_set))
     return posed
 
 
@@ -216,24 +221,30 @@ def _pose_stages(
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
     # Without a read-out time the tracks were not corrected.
-    in_place = not any(own.read_out for own in videos)
-    believed = believed_tracks(run, [own.tracks for own in videos], image_set)
+    has_picture_positions = not any(own.read_out for own in videos)
+    trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
-        run, matched, mapped, believed=believed, image_set=image_set, keyed=keyed, in_place=in_place
+        run,
+        matched,
+        mapped,
+        trusted=trusted,
+        image_set=image_set,
+        keyed=keyed,
+        has_picture_positions=has_picture_positions,
     )
     links = matched.result.links
     if links.gaps or links.fast:
         posed = remapped_poses(run, posed, image_set)
-    return replace(posed, far_views=_far_views(run, posed, image_set))
+    return replace(posed, far_views=_long_range_check(run, posed, image_set))
 
 
-def _far_views(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
+def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
     """The long-range check of the poses."""
     linked = posed.matches.result.links.looked_again
-    return far_view_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
+    return long_range_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
 
 
-def believed_tracks(
+def trusted_tracks(
     run: Run, tracks: Sequence[Tracks], image_set: ImageSet
 ) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut at gaps that links replace, and the links."""
@@ -248,7 +259,7 @@ def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if the
     adjustment did not use corners.
     """
-    if posed.adjustment is None or not posed.in_place:
+    if posed.adjustment is None or not posed.has_picture_positions:
         return posed
     again = remap_stage(run, image_set, posed.adjustment)
     if not again.result.is_better:
@@ -260,8 +271,8 @@ def _adjusted(
     run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
-    moving, in_place = posed.moving, posed.in_place
-    follows = in_place and (bool(moving) or has_moving_masks(image_set))
+    moving, has_picture_positions = posed.moving, posed.has_picture_positions
+    follows = has_picture_positions and (bool(moving) or has_changing_masks(image_set))
     return adjustment_stage(
         run,
         posed.tracks,
@@ -270,7 +281,7 @@ def _adjusted(
         poses,
         moved=posed.dynamic.digest if posed.dynamic is not None and moving else None,
         follow=partial(follow_behind, run, moving) if follows else None,
-        corners=partial(corners_in_images, run, moving) if in_place else None,
+        corners=partial(corners_in_images, run, moving) if has_picture_positions else None,
         number=number,
     )
 
@@ -280,10 +291,10 @@ def refined_poses(
     matched: Kept[MatchesResult],
     mapped: Kept[MappedResult],
     *,
-    believed: tuple[Tracks, Tracks],
+    trusted: tuple[Tracks, Tracks],
     image_set: ImageSet,
     keyed: ImageSet,
-    in_place: bool,
+    has_picture_positions: bool,
 ) -> Posed:
     """Estimate the poses of the images between the key images, and adjust all poses.
 
@@ -291,21 +302,21 @@ def refined_poses(
         run: the run.
         matched: the database that was mapped.
         mapped: the poses of the mapper.
-        believed: the tracks and links, see `believed_tracks`.
+        trusted: the tracks and links, see `trusted_tracks`.
         image_set: the images.
         keyed: the key images.
-        in_place: see `Posed`.
+        has_picture_positions: see `Posed`.
     """
-    tracks, links = believed
+    tracks, links = trusted
     resection = dynamic = None
     poses: Kept[PosesResult] = mapped
     if len(keyed.sequence) < len(image_set.sequence):
         poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
     moving: dict[str, Mask] = {}
     if run.options.moving != "keep":
-        dynamic = moving_stage(run, tracks, image_set, poses)
-        moving = read_moving(run.stages)
-    tracks, links = (without_moving(own, image_set, moving, run) for own in (tracks, links))
+        dynamic = dynamic_stage(run, tracks, image_set, poses)
+        moving = read_dynamic_masks(run.stages)
+    tracks, links = (without_dynamic_tracks(own, image_set, moving, run) for own in (tracks, links))
     posed = Posed(
         matches=matched,
         mapped=mapped,
@@ -315,7 +326,7 @@ def refined_poses(
         tracks=tracks,
         links=links,
         moving=moving,
-        in_place=in_place,
+        has_picture_positions=has_picture_positions,
     )
     if not run.options.mapping.adjust:
         return posed

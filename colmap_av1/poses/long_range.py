@@ -48,7 +48,7 @@ _MIN_TRIED = 3
 
 
 @dataclass(frozen=True)
-class FarViews:
+class LongRangeErrors:
     """Result of the long-range check.
 
     Attributes:
@@ -106,7 +106,7 @@ class FarViews:
         )
 
 
-class FarViewCheck:
+class LongRangeCheck:
     """Collects features of a few images, matches them, and compares the matches with the poses.
 
     Args:
@@ -144,7 +144,7 @@ class FarViewCheck:
             features = extract_features(picture, _NUM_FEATURES)
             self._features[index] = masked_features(features, picture, mask)
 
-    def result(self) -> FarViews:
+    def result(self) -> LongRangeErrors:
         """Match the pairs and compute their errors, after all `wanted` images have been added."""
         features = without_overlays(self._features, self._cameras)
         # Outliers are removed by each pair's own two-view geometry, not by the poses under test.
@@ -163,7 +163,7 @@ class FarViewCheck:
                 names.append((self._images[i].name, self._images[j].name))
                 errors.append(float(np.median(error)))
         sizes = [len(own.xy) for own in features.values()]
-        return FarViews(
+        return LongRangeErrors(
             tuple(names),
             np.array(errors),
             num_tried=len(self._pairs),
@@ -184,9 +184,9 @@ class FarViewCheck:
         return np.asarray(distance[np.isfinite(distance)])
 
 
-def model_far_views(
+def model_long_range_errors(
     reconstruction: Any, image_path: Path, progress: Progress = no_progress
-) -> FarViews:
+) -> LongRangeErrors:
     """Run the long-range check on a few pairs of a model's images.
 
     Args:
@@ -207,7 +207,7 @@ def model_far_views(
         points = [reconstruction.points3D[point_id].xyz for point_id in ids]
         return np.array(points, dtype=np.float64).reshape(-1, 3)
 
-    check = FarViewCheck(images, reconstruction.cameras, points_of)
+    check = LongRangeCheck(images, reconstruction.cameras, points_of)
     for done, index in enumerate(check.wanted, start=1):
         image = images[index]
         picture = read_image(image_file(image_path, image.name))

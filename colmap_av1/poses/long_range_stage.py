@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.long_range import FarViewCheck, FarViews
+from colmap_av1.poses.long_range import LongRangeCheck, LongRangeErrors
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
     PosedImages,
@@ -31,7 +31,7 @@ _NUM_TRACKS = 10_000
 
 @dataclass(frozen=True)
 class LongRangeResult:
-    """What `far_view_stage` found.
+    """What `long_range_stage` found.
 
     Attributes:
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
@@ -47,7 +47,7 @@ class LongRangeResult:
     apart: bool
 
 
-def far_view_stage(
+def long_range_stage(
     run: Run,
     tracks: Tracks,
     image_set: ImageSet,
@@ -90,10 +90,10 @@ def far_view_stage(
 
 def _compared(
     run: Run, tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], placed: PosedImages
-) -> FarViews:
+) -> LongRangeErrors:
     with run.clock.measure("far views"):
         points_of = _points_by_image(run, tracks, placed)
-        check = FarViewCheck(placed.images, placed.cameras, points_of.__getitem__)
+        check = LongRangeCheck(placed.images, placed.cameras, points_of.__getitem__)
         masks = placed.masks_with(moving)
         places = np.searchsorted(image_set.images.frames, placed.frames[check.wanted]).tolist()
         index_of = dict(zip(places, check.wanted, strict=True))

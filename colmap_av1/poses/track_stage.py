@@ -20,7 +20,7 @@ from colmap_av1.images.names import image_names
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links import images_to_link
-from colmap_av1.matching.shutter.correct import shutter_settings, without_shutter
+from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
 from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks, least_length
@@ -111,7 +111,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     def make(partial: Path) -> TracksResult:
         found, is_long = _track_and_choose(run, video, tracking, partial)
         chosen, tracked = found.chosen, found.video
-        tracks, read_out = without_shutter(
+        tracks, read_out = correct_rolling_shutter(
             tracked.tracks,
             shown.display,
             shown.frame_rate,

@@ -11,9 +11,9 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.estimate import (
     Posed,
-    believed_tracks,
     refined_poses,
     split_at_seams,
+    trusted_tracks,
 )
 from colmap_av1.poses.parts import FEWEST_IMAGES
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
@@ -101,16 +101,16 @@ def further_models(
         free = left.difference(*(other.model.by_name for other in waiting))
         some, key = _named(image_set, known | free), _named(keyed, known)
         tracks = [read_tracks_only(run, video) for video in range(len(run.sources))]
-        believed = believed_tracks(run, tracks, image_set)
+        trusted = trusted_tracks(run, tracks, image_set)
         try:
             posed = refined_poses(
                 own,
                 first.matches,
                 own_poses,
-                believed=believed,
+                trusted=trusted,
                 image_set=some,
                 keyed=key,
-                in_place=first.in_place,
+                has_picture_positions=first.has_picture_positions,
             )
             posed = split_at_seams(own, posed, some)
         except ModelError:  # no track agrees with the mapper's poses of these images

@@ -101,7 +101,7 @@ class TrackedVideo:
 
 @contextmanager
 def open_source(
-    video: Video, options: SourceOptions, *, beside: Path, context: RunContext
+    video: Video, options: SourceOptions, *, next_to: Path, context: RunContext
 ) -> Iterator[VideoSource]:
     """Open the AV1 stream of a video, from which motion is read; convert the video if necessary.
 
@@ -110,7 +110,7 @@ def open_source(
     Args:
         video: a video of any codec.
         options: whether and how the video is converted.
-        beside: the output file or folder, in whose parent folder a temporary stream is written.
+        next_to: the output file or folder, in whose parent folder a temporary stream is written.
         context: measures the stage "encoding" if the video is converted.
 
     Raises:
@@ -119,7 +119,7 @@ def open_source(
         OptionError: `keep_stream` names a file that is not a stream of this video.
     """
     # A killed run may have left its stream here, even if this video needs no conversion.
-    remove_leftovers(beside.resolve().parent, beside.resolve().name)
+    remove_leftovers(next_to.resolve().parent, next_to.resolve().name)
     if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
         yield VideoSource(video, video)
         return
@@ -136,7 +136,7 @@ def open_source(
             )
         yield _made_source(video, made, how, is_kept=True)
         return
-    with _scratch(beside) as folder:
+    with _scratch(next_to) as folder:
         with context.clock.measure("encoding"):
             made = encode(
                 video,
@@ -189,13 +189,13 @@ def with_stream_kept(options: MatchOptions, folder: Path, name: str = "") -> Mat
 
 
 @contextmanager
-def _scratch(beside: Path) -> Iterator[Path]:
+def _scratch(next_to: Path) -> Iterator[Path]:
     """A temporary folder for a stream that is not kept."""
     with ExitStack() as made:
         try:
-            folder = made.enter_context(scratch_folder(beside))
+            folder = made.enter_context(scratch_folder(next_to))
         except OSError as error:
-            where = beside.absolute().parent
+            where = next_to.absolute().parent
             raise EncodeError(f"{cannot_write(where, error)}; or give --keep_stream") from error
         yield folder
 

@@ -154,20 +154,20 @@ def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_folder(beside: Path) -> Iterator[Path]:
+def scratch_folder(next_to: Path) -> Iterator[Path]:
     """A hidden folder next to a file or folder; it exists while the body runs.
 
     The leftovers of killed runs are removed first.
 
     Args:
-        beside: the file or folder, which need not exist.
+        next_to: the file or folder, which need not exist.
 
     Raises:
         OSError: the folder cannot be created.
     """
-    beside = beside.resolve()
-    remove_leftovers(beside.parent, beside.name)
-    with _hidden_folder(beside) as scratch:
+    next_to = next_to.resolve()
+    remove_leftovers(next_to.parent, next_to.name)
+    with _hidden_folder(next_to) as scratch:
         yield scratch
 
 

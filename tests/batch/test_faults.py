@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from batch_output import files_of, rows_of, workers_of
-from conftest import HEED_INTERRUPTS
+from conftest import HANDLE_INTERRUPTS
 
 import colmap_av1
 from colmap_av1 import BatchOptions, MatchOptions, ReadOptions, VerifyOptions, run_batch
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for proce
 
 
 def drive(clips: Path, out: Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-c", HEED_INTERRUPTS, "batch", "--inputs", clips, "--output", out]
+    command = [sys.executable, "-c", HANDLE_INTERRUPTS, "batch", "--inputs", clips, "--output", out]
     words = [*command, "--task", "match", "--verify", "pairs", "--retries", "99", "--quiet"]
     path = os.pathsep.join([str(PACKAGES), *filter(None, sys.path)])
     return subprocess.Popen(

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import HEED_INTERRUPTS, PROJECT, Encode, Ffmpeg, make_frames
+from conftest import HANDLE_INTERRUPTS, PROJECT, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.database.reading import read_cameras, read_images
@@ -239,7 +239,7 @@ def test_interrupt_exits_with_130(tmp_path: Path) -> None:
     words = ["match", "--database", "a.db", "--video", str(scene), "--image_path", "frames"]
     words += ["--offsets", "1", "--growth", "1"]
     process = subprocess.Popen(
-        [sys.executable, "-c", HEED_INTERRUPTS, *words],
+        [sys.executable, "-c", HANDLE_INTERRUPTS, *words],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -24,7 +24,7 @@ from colmap_av1.video.facts import read_video
 
 OPTIONS = MatchOptions()
 # No video here is converted to a stream that is not kept.
-BESIDE = Path("absent/a.db")
+NEXT_TO = Path("absent/a.db")
 LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
 
 
@@ -39,7 +39,7 @@ def prepared(
         folder,
         options,
         listed=listed or {},
-        beside=BESIDE,
+        next_to=NEXT_TO,
         context=RunContext(),
     )
 
@@ -51,7 +51,7 @@ def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
         None,
         replace(OPTIONS, images=ImageOptions(num_images=5)),
         listed={},
-        beside=BESIDE,
+        next_to=NEXT_TO,
         context=RunContext(clock, lambda stage, done, total: told.add(stage)),
     )
     assert "looking" not in told

@@ -10,7 +10,7 @@ from conftest import Ffmpeg
 from colmap_av1 import CameraOptions, MatchOptions, match
 from colmap_av1.database.reading import read_cameras
 from colmap_av1.matching.cameras import Shape, _initial_focal_length
-from colmap_av1.video.metadata.lens import doubtful_lens, said_focal_length
+from colmap_av1.video.metadata.lens import container_focal_length, implausible_focal_length
 
 TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -20,17 +20,17 @@ TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
     [("26", 1323.8), ("26.5", 1349.2), ("0", None), ("9999", None), ("wide", None), ("", None)],
 )
 def test_equivalent_of_film(said: str, focal_length: float | None) -> None:
-    found = said_focal_length(((TAG, said),), (1920, 1080))
+    found = container_focal_length(((TAG, said),), (1920, 1080))
     assert found == (None if focal_length is None else pytest.approx(focal_length, abs=0.1))
-    assert said_focal_length((("comment", said),), (1920, 1080)) is None
+    assert container_focal_length((("comment", said),), (1920, 1080)) is None
 
 
 @pytest.mark.parametrize("said", ["0", "10000", "-26", "wide\x1b[2J"])
 def test_a_focal_length_of_no_lens_is_told(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, said: str
 ) -> None:
-    assert doubtful_lens(((TAG, "26"),)) is None
-    assert doubtful_lens((("comment", said),)) is None
+    assert implausible_focal_length(((TAG, "26"),)) is None
+    assert implausible_focal_length((("comment", said),)) is None
     tags = ["-metadata", f"{TAG}={said}", "-metadata", "location=+95.0000+018.0686/"]
     how = ["-i", clip, "-c", "copy", "-movflags", "use_metadata_tags", *tags]
     report = match(tmp_path / "a.db", ffmpeg(*how, tmp_path / "phone.mp4"))

@@ -12,7 +12,7 @@ import pytest
 from colmap_av1 import ImageError
 from colmap_av1.cli import main
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.poses.long_range import model_far_views
+from colmap_av1.poses.long_range import model_long_range_errors
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1
@@ -37,7 +37,7 @@ def bent(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def test_model_that_holds_together(made: ReconstructReport) -> None:
     model = read_model(made.output / "sparse" / "0")
-    found = model_far_views(model, made.output / "images")
+    found = model_long_range_errors(model, made.output / "images")
     assert found.median == pytest.approx(made.far_views, rel=0.05)
     assert found.median is not None
     assert found.median < 1
@@ -48,7 +48,7 @@ def test_bent_model_is_told(
     made: ReconstructReport, bent: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = made.output / "images"
-    found = model_far_views(read_model(bent), images)
+    found = model_long_range_errors(read_model(bent), images)
     assert found.median is not None
     assert found.median > 10
     assert found.warning() is not None
@@ -65,7 +65,7 @@ def test_pictures_that_show_nothing_are_told(made: ReconstructReport, tmp_path: 
     for path in (made.output / "images").iterdir():
         blurred = cv2.blur(cv2.imread(str(path)), (61, 61))
         cv2.imwrite(str(tmp_path / path.name), blurred)
-    found = model_far_views(read_model(made.output / "sparse" / "0"), tmp_path)
+    found = model_long_range_errors(read_model(made.output / "sparse" / "0"), tmp_path)
     assert found.median is None
     warning = found.warning()
     assert warning is not None
@@ -76,7 +76,7 @@ def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: P
     for path in (made.output / "images").iterdir():
         cv2.imwrite(str(tmp_path / path.name), np.zeros((20, 30, 3), np.uint8))
     with pytest.raises(ImageError, match="30x20"):
-        model_far_views(read_model(made.output / "sparse" / "0"), tmp_path)
+        model_long_range_errors(read_model(made.output / "sparse" / "0"), tmp_path)
 
 
 @pytest.mark.parametrize(

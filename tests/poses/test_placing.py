@@ -230,7 +230,7 @@ def test_known_distance_of_cameras_and_of_marks() -> None:
     assert found.similarity.scale * world.scale == pytest.approx(1, rel=1e-3)
     for wrong, why in (
         ("1=0.png,99.png", "no image '99.png'"),
-        (f"1={mark(a, 0)}+{mark(b, 10)},1.png", "marks no one place"),
+        (f"1={mark(a, 0)}+{mark(b, 10)},1.png", "not mark the same point"),
         (f"1={mark(a, 0)}+0.png:10:10,1.png", "give METRES=A,B"),
         ("1=0.png", "give METRES=A,B"),
         ("-1=0.png,1.png", "above 0 metres"),

@@ -1,4 +1,4 @@
-"""What batches leave, but for the times that they took, and the processes that they run."""
+"""Results of batches without their run times, and the processes of running batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-# Left out where runs are compared.
+# Fields that differ between equal runs.
 TIMES = ("seconds", "cpu_seconds")
 
 
@@ -19,7 +19,7 @@ def rows_of(output: Path, name: str = "batch.csv") -> list[dict[str, str]]:
 
 
 def files_of(output: Path) -> dict[str, bytes]:
-    """The files of the videos; reports without the times."""
+    """Contents of the files of all videos, by path; reports without the times."""
     found = {}
     for path in sorted(output.rglob("*")):
         relative = path.relative_to(output)
@@ -38,13 +38,13 @@ def _timeless(value: Any) -> Any:
 
 
 def workers_of(*drivers: int) -> list[int]:
-    """The processes that run our commands for some processes."""
+    """Process ids of `colmap_av1` commands whose parents are the given processes."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
             command = (folder / "cmdline").read_bytes()
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         if parent in drivers and b"\0-m\0colmap_av1\0" in command:
             found.append(int(folder.name))

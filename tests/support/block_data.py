@@ -1,4 +1,4 @@
-"""Block data made up for tests: a block for each unit, so that any unit can differ."""
+"""Synthetic block data, with one block per unit so that any unit can be changed."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 
 
 def blank_blocks(rows: int, cols: int) -> NDArray[np.void]:
-    """Blocks of all zeros without a local warp, [rows, cols]."""
+    """Zero blocks without a local warp, [rows, cols]."""
     blocks = np.zeros((rows, cols), BLOCK)
     blocks["local_warp"] = blocks["warp_index"] = -1
     return blocks
 
 
 def frame_of_blocks(blocks: NDArray[np.void], **values: Any) -> FrameMotion:
-    """A frame whose units have these blocks, [mi_rows, mi_cols], and no local warp."""
+    """A frame with one block per unit, [mi_rows, mi_cols], and no local warps."""
     index = np.arange(blocks.size, dtype=np.int32).reshape(blocks.shape)
     return FrameMotion(
         blocks=blocks.reshape(-1),
@@ -30,12 +30,12 @@ def frame_of_blocks(blocks: NDArray[np.void], **values: Any) -> FrameMotion:
 
 
 def units(frame: FrameMotion) -> NDArray[np.void]:
-    """The blocks of such a frame by their units, [mi_rows, mi_cols], to be written."""
+    """Writable view of the blocks of such a frame, [mi_rows, mi_cols]."""
     return frame.blocks.reshape(frame.block_index.shape)
 
 
 def with_units(frame: FrameMotion, **fields: Any) -> FrameMotion:
-    """Such a frame with other values of the units' fields."""
+    """A copy of such a frame with other values of some fields of the units."""
     changed = replace(frame, blocks=frame.blocks.copy())
     for name, values in fields.items():
         units(changed)[name] = values

@@ -1,4 +1,4 @@
-"""Pages as headless Chromium shows them, without a network."""
+"""Renders pages in headless Chromium, without a network."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _SIZE = (1400, 2000)
 
 @dataclass(frozen=True)
 class Shown:
-    """What Chromium shows of a page.
+    """A page rendered by Chromium.
 
     Attributes:
         picture: uint8 [height, width, 3] BGR screenshot.
-        errors: lines of the console that report an error.
+        errors: lines of the console, except a harmless one.
     """
 
     picture: NDArray[np.uint8]
@@ -30,7 +30,7 @@ class Shown:
 
 
 def show(page: Path, folder: Path) -> Shown:
-    """Open a page; a missing Chromium skips the test.
+    """Render a page; skips the test if Chromium is missing.
 
     Args:
         page: the HTML file.
@@ -42,7 +42,7 @@ def show(page: Path, folder: Path) -> Shown:
     words = [
         *(_PROGRAM, "--headless", "--no-sandbox", f"--user-data-dir={folder / 'profile'}"),
         *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"),
-        # No name leads anywhere: there is no network.
+        # Resolve no names, so that pages cannot use the network.
         *("--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr"),
         *(f"--window-size={_SIZE[0]},{_SIZE[1]}", "--virtual-time-budget=3000"),
     ]
@@ -54,7 +54,7 @@ def show(page: Path, folder: Path) -> Shown:
         timeout=600,
     )
     console = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
-    harmless = "willReadFrequently"  # advice of Chromium's on the speed of reading a canvas
+    harmless = "willReadFrequently"  # a performance hint about reading a canvas
     return Shown(
         picture=np.asarray(cv2.imread(str(screenshot)), np.uint8),
         errors=[line for line in console if harmless not in line],

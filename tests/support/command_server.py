@@ -1,4 +1,4 @@
-"""A process that runs commands in copies of itself, which are there at once, and may kill them."""
+"""A process that runs commands in forks of itself, which start fast, and can kill them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import json, os, signal, sys, time
 from colmap_av1.cli import main
 from colmap_av1.util.signals import ENDING, end_at_once
 
-def run(task, said):
+def run(task, output):
     os.chdir(task["folder"])
     os.setpgid(0, 0)
-    os.dup2(said, 1)
-    os.dup2(said, 2)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
     try:
         status = main(task["words"])
     except SystemExit as end:
@@ -32,23 +32,23 @@ def run(task, said):
     sys.stderr.flush()
     os._exit(status)
 
-for number in ENDING:  # before the copies are made, which are programs that have just started
+for number in ENDING:  # so that forks behave like programs that have just started
     signal.signal(number, end_at_once)
 for line in sys.stdin:
     task = json.loads(line)
-    said = os.memfd_create("said")
+    output = os.memfd_create("output")
     start = time.monotonic()
     child = os.fork()
     if child == 0:
-        run(task, said)
+        run(task, output)
     if task["number"]:
         time.sleep(task["after"])
         os.kill(child, task["number"])
     _, status = os.waitpid(child, 0)
     seconds = time.monotonic() - start
-    size = os.lseek(said, 0, os.SEEK_END)
-    text = os.pread(said, size, 0).decode(errors="replace")
-    os.close(said)
+    size = os.lseek(output, 0, os.SEEK_END)
+    text = os.pread(output, size, 0).decode(errors="replace")
+    os.close(output)
     answer = [os.waitstatus_to_exitcode(status), text, seconds]
     print(json.dumps(answer), flush=True)
 """
@@ -59,18 +59,18 @@ class Outcome:
     """How a command ended.
 
     Attributes:
-        status: its exit status; below 0: the signal that killed it.
-        said: what it printed.
+        status: its exit status; the negative signal number if a signal killed it.
+        output: standard output and error.
         seconds: how long it ran.
     """
 
     status: int
-    said: str
+    output: str
     seconds: float
 
 
 class CommandServer:
-    """Runs commands; a context manager that ends with its process."""
+    """Runs commands; a context manager that ends the process on exit."""
 
     def __init__(self) -> None:
         self._process: Any = subprocess.Popen(
@@ -78,7 +78,7 @@ class CommandServer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            cwd=os.sep,  # else the checkout would hide the installed package
+            cwd=os.sep,  # in the checkout, its package would hide the installed one
         )
 
     def __enter__(self) -> CommandServer:
@@ -92,7 +92,7 @@ class CommandServer:
     def run(
         self, folder: Path, words: str, number: signal.Signals | None = None, after: float = 0.0
     ) -> Outcome:
-        """Run a command in a folder; with a number, send it that signal after some seconds."""
+        """Run a command in a folder; if `number` is given, send this signal `after` seconds."""
         task = {
             **{"folder": str(folder), "words": words.split()},
             **{"number": int(number or 0), "after": after},

@@ -1,4 +1,4 @@
-"""Comparison of the parser's values with the conformance kit's expected arrays."""
+"""Comparison of the parser's values with the expected arrays of the conformance kit."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _UNIT_FIELDS = (
 )
 _INTRA_FRAMES = (0, 2)
 
-# Header fields that mean something only where another field says so; where it does not, the
-# kit holds what its decoder kept from an earlier frame.
+# Header fields that are defined only under a condition. Otherwise the kit contains the value that
+# its decoder kept from an earlier frame.
 _CONDITIONAL = {
     "skip_mode_frame": lambda h: h["skip_mode_present"],
     "delta_q_res": lambda h: h["delta_q_present"],
@@ -38,7 +38,7 @@ _CONDITIONAL = {
     "is_motion_mode_switchable": lambda h: h["frame_type"] not in _INTRA_FRAMES,
     "tile_size_bytes": lambda h: h["tile_cols"] * h["tile_rows"] > 1,
 }
-# The kit stores the multiplier, the syntax element is its logarithm.
+# The kit stores the multiplier; the syntax element is its logarithm.
 _MULTIPLIERS = ("delta_q_res", "delta_lf_res")
 
 
@@ -60,10 +60,10 @@ def read_events(stream: Path) -> tuple[list[Any], dict[str, int]]:
 
 
 def differences(stream: Path, expected: Path, *, layout: bool = True) -> Iterator[str]:
-    """Every field that differs, in words; nothing where all are exact.
+    """Describe every field that differs.
 
-    With layout=False, values that say where in the file an OBU lies are left out: another
-    container or a rewritten stream moves them.
+    With layout=False, positions of OBUs in the file are not compared, because another container or
+    a rewritten stream changes them.
     """
     events, sequence = read_events(stream)
     with np.load(expected) as arrays:
@@ -116,8 +116,8 @@ def _block_differences(
         got = blocks[name][block_index]
         value = want[f"u_{name}"][offset : offset + rows * cols].reshape(got.shape)
         if name == "skip_mode" and intra:
-            # 5.11.7 sets skip_mode to 0 in intra frames. The kit's decoder leaves what the
-            # last inter frame had stored for a block at the same place.
+            # 5.11.7 sets skip_mode to 0 in intra frames. The kit's decoder keeps the value of the
+            # last inter frame at the same position.
             value = np.zeros_like(value)
         if not np.array_equal(got, value):
             row, col = np.argwhere((got != value).reshape(rows, cols, -1).any(axis=2))[0]

@@ -1,4 +1,4 @@
-"""What COLMAP's own reader finds in a database."""
+"""Reads databases with pycolmap."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 
 def keypoints_of(database: Path) -> dict[str, NDArray[np.float32]]:
-    """Keypoints [n, 2] in pixels by the names of the images, in order of their ids."""
+    """Keypoints [n, 2] in pixels by image name, in order of image ids."""
     with tempfile.TemporaryDirectory() as folder:
-        # pycolmap brings a database to its own layout.
+        # pycolmap migrates the database that it opens.
         copy = shutil.copyfile(database, Path(folder) / "copy.db")
         with pycolmap.Database.open(copy) as opened:
             images = sorted(opened.read_all_images(), key=lambda image: int(image.image_id))

@@ -1,4 +1,4 @@
-"""The rendered clip: its exact cameras and depth, and a dense model of it."""
+"""The rendered clip with its exact cameras and depth, and a dense model of it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OPTIONS = ReconstructOptions(
 
 @dataclass(frozen=True)
 class Truth:
-    """The rendered clip's exact cameras and depth."""
+    """Exact cameras and depth of the rendered clip."""
 
     camera: pycolmap.Camera
     cam_from_world: np.ndarray

@@ -1,4 +1,4 @@
-"""COLMAP databases in every version's layout, as other programs leave them."""
+"""COLMAP databases in the schemas of all versions, as other programs write them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LAYOUTS = ("3.8", "3.11", "3.13", "4.2")
 NUM_IMAGES = 8
 NAMES = [f"frame_{i:03d}.png" for i in range(NUM_IMAGES)]
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
-# Different points, seen from the same places.
+# Different points, observed by the same cameras.
 THEIR_SCENE, OUR_SCENE = (
     make_scene(num_frames=NUM_IMAGES, num_points=500, seed=seed) for seed in (1, 2)
 )
@@ -39,7 +39,7 @@ def alter(database: Path, sql: str, *values: object) -> None:
 
 
 def make_layout(path: Path, layout: str) -> None:
-    """An empty database, as the version's database_creator makes it."""
+    """Create an empty database as `database_creator` of this version does."""
     script = Path(__file__).parents[1] / "data" / "schemas" / f"colmap-{layout}.sql"
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA journal_mode = WAL")
@@ -47,9 +47,12 @@ def make_layout(path: Path, layout: str) -> None:
 
 
 def list_images(path: Path, layout: str, names: Iterable[str] = NAMES) -> dict[str, int]:
-    """A database as an import of images leaves it, with frames where the version has them.
+    """Create a database with images, and with frames if the version has them.
 
-    Ids run against the order of the names. Returns them by name.
+    Image ids are in reverse order of the names.
+
+    Returns:
+        Image ids by name.
     """
     make_layout(path, layout)
     names = sorted(names, reverse=True)
@@ -72,14 +75,14 @@ def list_images(path: Path, layout: str, names: Iterable[str] = NAMES) -> dict[s
 
 
 def sift_keypoints(index: int) -> NDArray[np.float32]:
-    """Keypoints of an image with the affine shapes that SIFT gives them."""
+    """Keypoints of an image with affine shapes, as of SIFT: float32 [n, 6]."""
     xy = THEIRS["keypoints"][index].xy
     shapes = np.random.default_rng(index).normal(0, 3, (len(xy), 4))
     return np.concatenate([xy, shapes], axis=1).astype(np.float32)
 
 
 def sift_descriptors(index: int) -> NDArray[np.uint8]:
-    """A descriptor of length 512 for each keypoint, the same wherever its point is seen."""
+    """Descriptors [n, 128] of norm 512, equal for all observations of a point."""
     track = THEIRS["keypoints"][index].track
     of_track = np.random.default_rng(0).gamma(1.0, 1.0, (track.max(initial=0) + 1, 128))
     of_track *= 512 / np.linalg.norm(of_track, axis=1, keepdims=True)
@@ -87,7 +90,7 @@ def sift_descriptors(index: int) -> NDArray[np.uint8]:
 
 
 def fill_with_sift(path: Path, ids: dict[str, int]) -> None:
-    """Add keypoints, descriptors and verified matches as SIFT's extractor and matcher do."""
+    """Add keypoints, descriptors and verified matches as COLMAP's SIFT commands do."""
     has_type = "type" in {row[1] for row in query(path, "PRAGMA table_info(descriptors)")}
     with closing(sqlite3.connect(path)) as connection, connection:
         for index, name in enumerate(NAMES):
@@ -96,7 +99,7 @@ def fill_with_sift(path: Path, ids: dict[str, int]) -> None:
                 "INSERT INTO keypoints (image_id, rows, cols, data) VALUES (?, ?, 6, ?)",
                 (ids[name], len(keypoints), keypoints.tobytes()),
             )
-            # In 4.x a descriptor says its type; 0 is SIFT's.
+            # COLMAP 4 stores the type of descriptors; 0 is SIFT.
             extra = (", type", ", 0") if has_type else ("", "")
             connection.execute(
                 f"INSERT INTO descriptors (image_id, rows, cols, data{extra[0]}) "
@@ -130,7 +133,7 @@ def fill_with_sift(path: Path, ids: dict[str, int]) -> None:
 
 
 def make_existing(path: Path, layout: str, state: str) -> dict[str, int]:
-    """A database that lists the images ("listed") or has SIFT's rows for them ("sift")."""
+    """Create a database with images only ("listed") or also with SIFT matches ("sift")."""
     ids = list_images(path, layout)
     if state == "sift":
         fill_with_sift(path, ids)

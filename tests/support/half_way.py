@@ -27,7 +27,7 @@ _WAITING = """
                 time.sleep(60)
             return super().__getitem__(index)
 
-    # A small cache makes SQLite write pages of the open transaction to the disk.
+    # With a small cache, SQLite writes pages of the open transaction to the disk.
     connect = database_file.sqlite3.connect
     def connect_small(*args, **kwargs):
         connection = connect(*args, **kwargs)
@@ -43,16 +43,16 @@ _WAITING = """
 def start_writing(
     path: Path, mode: str, module: str = "existing_database", rows: str = "OURS"
 ) -> subprocess.Popen[str]:
-    """A process that has written most rows and then waits inside its transaction.
+    """Start a process that writes most rows and then waits inside its transaction.
 
-    `module` of the tests holds the rows, under that name, with NAMES and CAMERA.
+    `module` is a module of the tests with NAMES, CAMERA and the rows, in a variable named `rows`.
     """
     script = textwrap.dedent(_WAITING)
     process = subprocess.Popen(
         [sys.executable, "-c", script, path, TEST_PATHS, module, rows, mode],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=path.parent,  # else the checkout would hide the installed package
+        cwd=path.parent,  # in the checkout, its package would hide the installed one
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "half-way\n"
@@ -60,6 +60,6 @@ def start_writing(
 
 
 def kill(process: subprocess.Popen[str]) -> None:
-    """End it at once."""
+    """Kill the process."""
     with process:
         process.send_signal(signal.SIGKILL)

@@ -38,20 +38,20 @@ with whole_folder(Path(sys.argv[1]), overwrite=True) as partial:
 
 
 def kill_while_writing(how: str, path: Path) -> None:
-    """Let a process die while it writes a file or folder."""
+    """Kill a process while it writes a file or folder."""
     assert _ended(_WHILE_WRITING, how, path) == -signal.SIGKILL
 
 
 def kill_while_replacing(folder: Path, steps: int) -> None:
-    """Let a process die after some steps of replacing a folder's files by new ones, a and c.
+    """Kill a process after some steps of replacing a folder's files with new files a and c.
 
-    If it is allowed more steps than replacing takes, it exits normally.
+    With more steps than replacing takes, it exits normally.
     """
     assert _ended(_WHILE_REPLACING, folder, steps) in (-signal.SIGKILL, 0)
 
 
 def _ended(program: str, *words: object) -> int:
-    """Exit status of a program run outside the checkout, which hides the installed package."""
+    """Exit status of a program, run outside the checkout, which hides the installed package."""
     command = [sys.executable, "-c", program, *map(str, words)]
     with tempfile.TemporaryDirectory() as folder:
         return subprocess.run(command, cwd=folder, check=False).returncode

@@ -1,7 +1,7 @@
-"""Runs `train_gaussians.py`, named first, with its arguments and a rasterizer that needs no GPU.
+"""Runs `train_gaussians.py` with a rasterizer that needs no GPU.
 
-The rasterizer is exact and slow: every Gaussian at every pixel, nearest first, of one colour from
-all sides.
+The first argument is the path of the script, the others are its arguments. The rasterizer is exact
+and slow: it evaluates every Gaussian at every pixel, nearest first, with view-independent colours.
 """
 
 from __future__ import annotations

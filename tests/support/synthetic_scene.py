@@ -1,4 +1,4 @@
-"""A synthetic scene with exact poses: points seen by a camera that moves along an arc."""
+"""A synthetic scene with exact poses: points observed by a camera that moves along an arc."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ CAMERA_PARAMS = f"{FOCAL},{WIDTH / 2},{HEIGHT / 2},0"
 
 @dataclass(frozen=True)
 class Scene:
-    """Tracks with noise, and the truth behind them.
+    """Noisy tracks and the true poses.
 
     Attributes:
-        tracks: observations of the points, each seen during a stretch of frames.
-        rotation: float64 [n, 3, 3] camera from world.
+        tracks: observations of the points, each in consecutive frames.
+        rotation: float64 [n, 3, 3] rotations from world to camera.
         center: float64 [n, 3] camera centres.
     """
 
@@ -42,11 +42,11 @@ def make_scene(
     turning: bool = False,
     seed: int = 0,
 ) -> Scene:
-    """Points 8 to 12 units from a camera that moves along an arc around them.
+    """Make a scene of points 8 to 12 units from a camera that moves along an arc around them.
 
     Args:
         flat: all points lie in one plane.
-        turning: the camera turns in place instead of moving.
+        turning: the camera rotates in place.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform([-4, -3, 0.0 if flat else -2], [4, 3, 0.0 if flat else 2], (num_points, 3))
@@ -84,7 +84,7 @@ def make_scene(
 
 
 def match_scene(scene: Scene, camera: object) -> dict[str, object]:
-    """Run the stages up to verification; returns write_matches's arguments by name."""
+    """Run the stages up to verification, and return arguments of `write_matches` by name."""
     keypoints = image_keypoints(scene.tracks, range(scene.tracks.num_frames))
     pairs = schedule_pairs(keypoints, PairOptions())
     matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
@@ -100,7 +100,7 @@ def match_scene(scene: Scene, camera: object) -> dict[str, object]:
 
 
 def alignment_error(estimated: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """RMS distance of camera centres after the best similarity (Umeyama 1991)."""
+    """RMS distance of camera centres after similarity alignment (Umeyama 1991)."""
     a, b = estimated - estimated.mean(axis=0), truth - truth.mean(axis=0)
     u, d, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])

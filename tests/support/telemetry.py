@@ -1,4 +1,4 @@
-"""Containers with positions, as phones, GoPro's cameras and DJI's drones write them."""
+"""Containers with positions, in the formats of GoPro and DJI cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LETTERS = {"l": "i", "s": "h", "S": "H", "f": "f", "L": "I"}
 
 
 def gpmf(key: bytes, letters: str, rows: object) -> bytes:
-    """An item of numbers: a letter for all of them, or one for each of a row."""
+    """A GPMF item of numbers, with one type letter for all columns or one for each column."""
     table = np.atleast_2d(np.asarray(rows))
     each = letters * table.shape[1] if len(letters) == 1 else letters
     layout = ">" + "".join(_LETTERS[letter] for letter in each)
@@ -39,7 +39,7 @@ def gpmf_nest(key: bytes, *items: bytes) -> bytes:
 
 
 def gps5(places: NDArray[np.float64], fix: int = 3) -> bytes:
-    """A stream of HERO5 to HERO10: a lock for all, one scale for each number."""
+    """A GPS stream of HERO5 to HERO10: one GPS fix for all samples, a scale for each column."""
     rows = np.hstack([places * [1e7, 1e7, 1e3], np.zeros((len(places), 2))])
     return gpmf_nest(
         b"STRM",
@@ -51,7 +51,7 @@ def gps5(places: NDArray[np.float64], fix: int = 3) -> bytes:
 
 
 def gps9(places: NDArray[np.float64], fix: Sequence[int]) -> bytes:
-    """A stream of HERO11 and later: numbers of two types, the last one the lock."""
+    """A GPS stream of HERO11 and later: columns of two types, the last of which is the GPS fix."""
     scales = [[10**7], [10**7], [1000], [1000], [100], [1], [1000], [100], [1]]
     rest = np.zeros((len(places), 5))
     rows = np.hstack([places * [1e7, 1e7, 1e3], rest, np.array(fix)[:, None]])
@@ -69,7 +69,7 @@ def grav(directions: NDArray[np.float64]) -> bytes:
 
 
 def with_gpmf(video: Path, output: Path, payloads: Sequence[tuple[float, bytes]]) -> Path:
-    """The AV1 video with a data track of payloads, each with its duration in seconds."""
+    """Copy an AV1 video and add a data track of payloads, each with its duration in seconds."""
     milliseconds = Fraction(1, 1000)
     with av.open(str(video)) as source, av.open(str(output), "w") as target:
         stream = source.streams.video[0]
@@ -95,7 +95,7 @@ def with_gpmf(video: Path, output: Path, payloads: Sequence[tuple[float, bytes]]
 
 
 def dji_text(places: NDArray[np.float64], rate: float) -> str:
-    """The text of an .srt file with a place for each frame, at so many frames per second."""
+    """The text of an .srt file with a position for each frame, at `rate` frames per second."""
 
     def stamp(seconds: float) -> str:
         whole = int(seconds)

@@ -1,4 +1,4 @@
-"""Which files trainers of 3D Gaussians take from a folder, by the rules in their sources."""
+"""The files that trainers of 3D Gaussians read from a folder, by the rules in their sources."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pycolmap
 
 @dataclass(frozen=True)
 class Taken:
-    """What a trainer takes.
+    """Files that a trainer reads.
 
     Attributes:
         model: the folder of the COLMAP model.
         pictures: the picture of each registered image, by the image's name.
-        masks: every file that may be taken for the mask of an image, by the image's name.
+        masks: files that the trainer may use as the mask of an image, by the image's name.
         points: the file of the initial points.
     """
 
@@ -35,8 +35,9 @@ def names_in(model: Path) -> list[str]:
 def brush(folder: Path) -> Taken:
     """Brush 1.0: the model with the most images anywhere below, hidden folders included.
 
-    Ties go to the smaller path (crates/brush-dataset/src/formats/colmap.rs). Pictures and masks are
-    searched for below the folder, too, by their names (formats/mod.rs).
+    Of equally large models, the one with the smaller path is read
+    (crates/brush-dataset/src/formats/colmap.rs). Pictures and masks are searched by name in the
+    whole folder (formats/mod.rs).
     """
     files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     models = [p.parent for p in files if p.name.lower() in ("cameras.bin", "cameras.txt")]
@@ -80,8 +81,8 @@ def lichtfeld_studio(folder: Path) -> Taken:
 def gsplat(folder: Path) -> Taken:
     """gsplat's examples (examples/datasets/colmap.py): `sparse/0` or `sparse`, by pycolmap.
 
-    The sorted files of `images` and of the folder of reduced images stand for each other, so
-    `images` holds the registered images and nothing else.
+    The trainer pairs the sorted files of `images` with those of the folder of downscaled images, so
+    `images` must contain the registered images and no other files.
     """
     model = folder / "sparse" / "0"
     model = model if model.exists() else folder / "sparse"
@@ -105,8 +106,8 @@ def nerfstudio(folder: Path) -> Taken:
 def reference_implementation(folder: Path) -> Taken:
     """graphdeco's 3D Gaussian Splatting (scene/dataset_readers.py): binary files of `sparse/0`.
 
-    A `points3D.ply` beside them is taken in place of the points; of a name only the last part
-    counts.
+    A `points3D.ply` next to them is used instead of `points3D.bin`. Only the last part of an image
+    name is used.
     """
     model = folder / "sparse" / "0"
     points = model / "points3D.ply"
@@ -124,10 +125,10 @@ TRAINERS: tuple[Trainer, ...] = (
     reference_implementation,
 )
 
-# COLMAP's camera models whose distortion trainers take: Brush's `build_camera_model`
+# Camera models of COLMAP whose distortion the trainers support: Brush's `build_camera_model`
 # (crates/brush-dataset/src/formats/colmap.rs), LichtFeld Studio's 3DGUT
 # (docs/docs/features/gut.md) and gsplat's `_camera_distortion` (examples/datasets/colmap.py), whose
-# example undistorts the pictures of its models when it loads them.
+# example undistorts the pictures when it loads them.
 _RADIAL = {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
 _MORE = {"FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 RENDERED: dict[Trainer, set[str]] = {

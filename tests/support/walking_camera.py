@@ -1,4 +1,4 @@
-"""Tracks that a moving camera sees, without a picture."""
+"""Synthetic tracks of a moving camera, without pictures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ NUM_FRAMES = 24
 def seen_by(
     centre: NDArray[np.float64], turn: NDArray[np.float64], num_points: int = 600
 ) -> Tracks:
-    """Tracks of points in a box; the camera's centres and rotation vectors, [NUM_FRAMES, 3]."""
+    """Make tracks of points in a box.
+
+    Args:
+        centre: float64 [NUM_FRAMES, 3] camera centres.
+        turn: float64 [NUM_FRAMES, 3] rotation vectors from world to camera.
+        num_points: number of points.
+    """
     rng = np.random.default_rng(0)
     points = rng.uniform([-6, -4, 8], [6, 4, 16], (num_points, 3))
     rotation = Rotation.from_rotvec(turn).as_matrix()
@@ -35,7 +41,7 @@ def seen_by(
 
 
 def walk(num_points: int = 600) -> Tracks:
-    """What a hand-held camera sees that walks sideways and looks up and around."""
+    """Tracks of a hand-held camera that moves sideways and looks up and around."""
     t = np.linspace(0, 1, NUM_FRAMES)[:, None]
     centre = np.hstack([3 * t, 0.5 * np.sin(5 * t), 0.8 * np.sin(3 * t)])
     turn = np.hstack([0.2 * np.sin(6 * t), 0.25 * np.sin(4 * t), 0.05 * t])

@@ -23,7 +23,7 @@ from colmap_av1 import (
 )
 from colmap_av1.cli import main
 from colmap_av1.matching.shutter import of_video
-from colmap_av1.matching.shutter.correct import rows_down, without_shutter
+from colmap_av1.matching.shutter.correct import correct_rolling_shutter, rows_down
 from colmap_av1.matching.shutter.estimate import ReadOut, estimate_read_out
 from colmap_av1.tracks.shutter import correct_tracks, velocities
 from colmap_av1.tracks.tracks import Tracks
@@ -127,7 +127,9 @@ def test_what_is_asked_for() -> None:
     tracks = tracks_of(0.45)
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
         options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
-        moved, read_out = without_shutter(tracks, Display(), RATE, options.camera, RunContext())
+        moved, read_out = correct_rolling_shutter(
+            tracks, Display(), RATE, options.camera, RunContext()
+        )
         assert read_out == pytest.approx(found)
         assert (moved is tracks) == (found is None)
     options = MatchOptions(
@@ -137,9 +139,12 @@ def test_what_is_asked_for() -> None:
             camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
         )
     )
-    _, read_out = without_shutter(tracks, Display(), RATE, options.camera, RunContext())
+    _, read_out = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
     assert read_out == pytest.approx(15, abs=1.5)
-    assert without_shutter(tracks, Display(), None, options.camera, RunContext()) == (tracks, None)
+    assert correct_rolling_shutter(tracks, Display(), None, options.camera, RunContext()) == (
+        tracks,
+        None,
+    )
     for wrong in ("soon", "101", "nan"):
         with pytest.raises(OptionError, match="milliseconds"):
             CameraOptions(rolling_shutter=wrong)

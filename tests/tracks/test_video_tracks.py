@@ -33,9 +33,9 @@ STRICT = MatchOptions(read=ReadOptions(strict=True))
 
 def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
     """A video that is not converted: its stream outlasts the source."""
-    beside = video.with_name("a.db")
+    next_to = video.with_name("a.db")
     with open_source(
-        read_video(video), options.source, beside=beside, context=RunContext()
+        read_video(video), options.source, next_to=next_to, context=RunContext()
     ) as source:
         return source
 
@@ -52,8 +52,8 @@ def phone(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_path: Path) -> None:
-    beside, context = tmp_path / "a.db", RunContext()
-    with open_source(read_video(phone), OPTIONS.source, beside=beside, context=context) as source:
+    next_to, context = tmp_path / "a.db", RunContext()
+    with open_source(read_video(phone), OPTIONS.source, next_to=next_to, context=context) as source:
         assert source.pictures.path == phone
         assert source.stream.codec == "av1"
         assert source.stream.path.parent.parent == tmp_path
@@ -64,7 +64,7 @@ def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_
     assert list(phone.parent.iterdir()) == [phone]
     with (
         pytest.raises(RuntimeError),
-        open_source(read_video(phone), OPTIONS.source, beside=beside, context=context),
+        open_source(read_video(phone), OPTIONS.source, next_to=next_to, context=context),
     ):
         raise RuntimeError
     assert not list(tmp_path.iterdir())
@@ -88,7 +88,7 @@ def test_a_folder_that_takes_no_stream(phone: Path, tmp_path: Path) -> None:
         open_source(
             read_video(phone),
             OPTIONS.source,
-            beside=tmp_path / "a.db",
+            next_to=tmp_path / "a.db",
             context=RunContext(),
         ),
     ):

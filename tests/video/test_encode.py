@@ -16,7 +16,7 @@ import cv2
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from conftest import HEED_INTERRUPTS, Encode, Ffmpeg, make_frames
+from conftest import HANDLE_INTERRUPTS, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
 from colmap_av1.errors import (
@@ -390,7 +390,7 @@ def long_conversion(
     """A process that is converting long.mp4 of a folder to `words`, for some time yet."""
     long = shutil.copyfile(clip, folder / "long.mp4")
     words = [*words, "--video", str(long), "--encoder", "libaom", "--speed", "2"]
-    command = [sys.executable, "-c", HEED_INTERRUPTS, *words]
+    command = [sys.executable, "-c", HANDLE_INTERRUPTS, *words]
     with subprocess.Popen(command, cwd=folder) as process:
         deadline = time.monotonic() + 60
         while not [p for p in folder.rglob(".*.partial") if p.is_file()]:

@@ -18,7 +18,7 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.video.container import read_file
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.metadata.gpmf import read_payload
-from colmap_av1.video.metadata.positions import Positions, doubtful_place, read_positions
+from colmap_av1.video.metadata.positions import Positions, implausible_position, read_positions
 
 PLACES = np.array([[59.33 + k * 1e-5, 18.07 - k * 2e-5, 20 + k * 0.1] for k in range(10)])
 
@@ -70,7 +70,7 @@ def test_no_position_that_can_be_one(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path,
     ],
 )
 def test_a_place_that_is_none_is_told(said: str, why: str | None) -> None:
-    told = doubtful_place((("com.apple.quicktime.location.iso6709", said),))
+    told = implausible_position((("com.apple.quicktime.location.iso6709", said),))
     if why is None:
         assert told is None
         return

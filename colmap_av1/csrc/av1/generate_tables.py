@@ -2,7 +2,7 @@
 
 Usage: ``python generate_tables.py SPEC_DIR``, where SPEC_DIR holds the specification's markdown
 chapters (03.symbols.md to 10.additional.tables.md). The files constants.h, spec_tables.h,
-default_cdfs.h and default_cdfs.cc are written beside this script; they are committed, so building
+default_cdfs.h and default_cdfs.cc are written next to this script; they are committed, so building
 the package needs neither the specification nor this script.
 
 Every array definition of the chapters is either emitted or named in ``_PIXEL_TABLES`` or
@@ -233,8 +233,8 @@ def _parse_braces(text: str, start: int, constants: dict[str, int]) -> _Nested:
                 return done
             stack[-1].append(done)
         elif token != ",":
-            # Split_Tx_Size lacks one comma at a line's end: there the line break separates. The
-            # check of the dimensions tells if this ever splits what is one entry.
+            # Split_Tx_Size lacks a comma at the end of a line, so line breaks separate entries as
+            # well. The check of the dimensions would detect if this split an entry.
             stack[-1].extend(_evaluate(entry, constants) for entry in token.split("\n"))
     raise ValueError("an array definition has no closing brace; the text is cut short")
 
@@ -407,7 +407,7 @@ def generate(spec_dir: Path) -> dict[str, str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the generated files beside this script; returns the exit status."""
+    """Write the generated files next to this script; returns the exit status."""
     if len(arguments) != 1:
         print("usage: python generate_tables.py SPEC_DIR", file=sys.stderr)
         return 2

@@ -219,7 +219,7 @@ void MvStackFinder::temporal_scan() {
 // unit that the process reads is in the tile as well.
 void MvStackFinder::temporal_sample(const MotionFieldEntry& entry, bool first) {
   if (entry.ref_offset == 0) return;
-  // Neighbours often have the same motion, which projects to the same vectors.
+  // Neighbours often have the same motion, whose projection is in the stack already.
   if (temporal_index_ >= 0 && entry == temporal_entry_) {
     stack_.entries[temporal_index_].weight += 2;
     return;

@@ -14,7 +14,7 @@ namespace colmap_av1::av1 {
 
 // The bits after the last symbol of a tile. The specification requires a bit 1 and zeros to the
 // end. Some encoders write other bits, which decoders ignore. More than a byte or two cannot be
-// padding, though: the symbols before it were then decoded wrongly.
+// padding, though. In that case the symbols before it were decoded wrongly.
 enum class TrailingBits { kValid, kOther, kData, kPastEnd };
 
 // Reads symbols coded with adaptive cumulative distributions.

@@ -14,7 +14,7 @@ namespace {
 // Side in pixels of the compared windows.
 constexpr int kWindow = 11;
 // Largest number of steps, the length in pixels below which a step is the last one, and the largest
-// length of the last step. A search that still moves has not found the patch.
+// length in pixels of the last step. A search that ends with a longer step has not converged.
 constexpr int kMostSteps = 10;
 constexpr float kLastStep = 0.005F;
 constexpr float kAtRest = 0.03F;
@@ -41,7 +41,7 @@ struct Step {
 template <int kSide>
 class Window {
  public:
-  // Sets the window from its pixels and a border of one pixel; false if it shows no corner.
+  // Sets the window from its pixels and a border of one pixel; false if it contains no corner.
   bool set(const Block<kSide + 2>& around) {
     for (int r = 0; r < kSide; ++r) {
       const auto& above = around[r];
@@ -242,7 +242,7 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
     }
     found.xy[2 * i] = place->x;
     found.xy[2 * i + 1] = place->y;
-    // The first step of the backward search leads to the start if the content is the same.
+    // One step of the backward search returns to the start if both windows have the same content.
     const Step back = shown.step_to(sought.grey());
     found.missed[i] = std::max(std::abs(back.x), std::abs(back.y));
     found.likeness[i] = sought.likeness(shown);

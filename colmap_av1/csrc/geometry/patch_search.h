@@ -29,7 +29,7 @@ struct FoundPatches {
 // Searches for 11x11 pixels around the points of patches near the positions `start` [n][2], (x, y)
 // in pixels; the centre of the first pixel is (0.5, 0.5). Inverse compositional steps are used
 // (Baker and Matthews, "Lucas-Kanade 20 Years On", 2004), and the border of the picture is
-// replicated. A patch is not found if it shows no corner, moves by more than `max_move` pixels
+// replicated. A patch is not found if it has no corner, moves by more than `max_move` pixels
 // along x or y, or does not converge. Throws std::invalid_argument for inconsistent arrays.
 FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
                           std::span<const float> start, float max_move);

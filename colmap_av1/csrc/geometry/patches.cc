@@ -13,7 +13,7 @@ static_assert(lanes_of(kPatch) == kPatch, "each lane counts");
 using Patch = Block<kPatch>;
 using Row = Patch::value_type;
 
-// Sums by halves, because a processor can do independent additions in parallel.
+// Sums the halves separately, because a processor does independent additions in parallel.
 float sum_of(Row row) {
   for (int half = kPatch / 2; half > 0; half /= 2) {
     for (int i = 0; i < half; ++i) {

@@ -47,7 +47,7 @@ struct InSquare {
   std::int64_t point = 0;
 };
 
-// Counts the floaters among the points of one square, and changes the order of the points.
+// Counts the floaters among the points of one square, which are reordered.
 void count_hanging(std::span<InSquare> square, const HangingOptions& options,
                    std::vector<std::int64_t>& counts) {
   if (static_cast<std::int64_t>(square.size()) < options.fewest_around) return;

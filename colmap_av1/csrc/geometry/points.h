@@ -31,16 +31,16 @@ std::vector<double> widest_angles(std::span<const double> centres, std::span<con
                                   std::span<const std::int64_t> view);
 
 struct HangingOptions {
-  double before = 0;   // largest distance of a floater, as a share of that of its surroundings
-  double as_near = 0;  // ratio of distances within which another point is as near
-  std::int64_t support = 0;        // number of points as near, including itself, of a non-floater
-  double around = 0;               // px; width of the squares that count as surroundings
-  std::int64_t fewest_around = 0;  // smallest number of points in a square
+  double before = 0;   // largest distance of a floater, as a share of the median in its square
+  double as_near = 0;  // points within this ratio of distances support each other
+  std::int64_t support = 0;        // with this many of them, including itself, it is no floater
+  double around = 0;               // px; width of the squares
+  std::int64_t fewest_around = 0;  // squares with fewer points are ignored
 };
 
-// For each point, the number of its observations as a floater: in front of most points in the same
-// square of the image, with hardly any other point as near. Rays and points that are not finite are
-// ignored. Also throws for squares without a width.
+// For each point, the number of its observations as a floater: nearer than most points in the same
+// square of the image, with hardly any other point at the same distance. Rays and points that are
+// not finite are ignored. Also throws if squares have no width.
 std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
                                                const HangingOptions& options);
 

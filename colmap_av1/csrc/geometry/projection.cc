@@ -23,7 +23,7 @@ void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& 
 // Processes points in chunks. `write` gets an index in the chunk and a point in camera coordinates,
 // writes its values at that index, and returns whether it is visible. `take` then takes the first
 // values of the chunk. Every point is written, and an invisible one is overwritten by the next:
-// visibility is too random for branch prediction.
+// this has no branches, because visibility is too random for branch prediction.
 template <typename Write, typename Take>
 void for_seen(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
               std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
@@ -70,8 +70,8 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
         std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
-        // Pixels times depth are compared: most points are not visible, and a division would take
-        // as long as all the rest.
+        // Pixels times depth are compared, because most points are invisible and a division takes
+        // as long as everything else.
         const auto [u, v, z] = at;
         const double x = camera.focal_x * u + camera.centre_x * z;
         const double y = camera.focal_y * v + camera.centre_y * z;

@@ -25,13 +25,13 @@ struct RayBounds {
   double high_y = 0;
 };
 
-// Points that a picture may show, in ascending order of their indices.
+// Points in the field of view of a camera, in ascending order of their indices.
 struct PointsInView {
   std::vector<std::int64_t> index;
   std::vector<double> xyz;  // [n][3] in camera coordinates
 };
 
-// Points that a picture shows, in ascending order of their indices.
+// Points that project into a picture, in ascending order of their indices.
 struct PointsInPicture {
   std::vector<std::int64_t> index;
   std::vector<double> xy;     // [n][2] pixels

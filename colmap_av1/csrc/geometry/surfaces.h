@@ -1,4 +1,4 @@
-// Selection among points that are close to each other in a picture and lie on the same surface.
+// Selection among points of the same surface that are close to each other in a picture.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@ namespace colmap_av1::geometry {
 struct SurfaceOptions {
   std::span<const std::int64_t> spacings;  // px; widths of cells, descending
   double steps_per_octave = 0;             // of depth; points a step apart are on other surfaces
-  std::int64_t most_steps = 0;             // number of steps; all beyond the last is one surface
+  std::int64_t most_steps = 0;             // number of steps; beyond the last is one surface
 };
 
 // For each point in a picture, the index of the first spacing at which it is the best point of its

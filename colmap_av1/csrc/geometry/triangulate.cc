@@ -12,16 +12,16 @@
 namespace colmap_av1::geometry {
 namespace {
 
-// Pairs of rays for the initial value, given by their position in the track from 0 to 1.
+// Pairs of rays that give initial points, by their positions in the track from 0 to 1.
 constexpr std::array<std::array<double, 2>, 4> kGuesses{
     {{0.0, 1.0}, {0.0, 0.5}, {0.5, 1.0}, {0.25, 0.75}}};
 constexpr int kIterations = 4;
-// The last step is the one that leaves more than this share of a track's cost.
+// Iteration stops after a step that leaves more than this share of the cost.
 constexpr double kConverged = 0.999;
 // Squared error in px^2 at which the weight of an observation is halved.
 constexpr double kSoftError2 = 1.0;
-// Smallest determinant of the normal equations, as a share of their cubed trace, and smallest
-// squared sine between two rays, that are not considered singular.
+// Equations are singular if their determinant, divided by the cube of their trace, is below this.
+// Two rays are parallel if their squared sine is below this.
 constexpr double kSingular = 1e-12;
 constexpr double kInfinite = std::numeric_limits<double>::infinity();
 
@@ -38,7 +38,7 @@ Projection projection_of(const Observation& seen, const Vector& point) {
   return project(seen.pose, seen.focal, seen.x, seen.y, point.data());
 }
 
-// The cost of an observation is at most that at the limit.
+// Sum of the squared errors, each truncated at the limit.
 double cost_of(std::span<const Observation> track, const Vector& point, double limit) {
   double cost = 0;
   for (const Observation& seen : track) cost += std::min(projection_of(seen, point).error2, limit);
@@ -168,11 +168,12 @@ double angle_of(std::span<const Observation> kept, const Vector& point) {
   });
 }
 
-// Whether a point with this angle and mean error has an accurate depth.
+// Whether the depth of a point with this triangulation angle and mean error is accurate.
 bool is_sure(double angle, double error, const double* focal, const TriangulateOptions& options) {
   if (angle < options.min_angle) return false;
   if (!options.max_depth_error) return true;
-  // Observations of a track may share an error, which its reprojection errors show only in part.
+  // The errors of a track's observations are correlated, and only a part of them appears in the
+  // reprojection error.
   const double pixels = std::hypot(options.sigma_floor, options.error_to_sigma * error);
   return pixels <= *options.max_depth_error * ((focal[0] + focal[1]) / 2) * angle;
 }

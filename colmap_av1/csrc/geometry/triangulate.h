@@ -38,9 +38,9 @@ struct PointArrays {
 
 // Triangulates the tracks from `first` up to but excluding `last`. The initial value of a point is
 // the best of several midpoints of two rays (Hartley and Sturm, "Triangulation", 1997), judged by
-// all observations. Gauss-Newton steps on the weighted reprojection error follow. If a track slid
-// from one surface to another, its outliers may be a second point, so they are triangulated once
-// more. Rays that are not finite are ignored. Throws std::invalid_argument for inconsistent arrays.
+// all observations. It is refined by Gauss-Newton steps on the weighted reprojection error. A track
+// that slid from one surface to another observes two points, so its outliers are triangulated as
+// well. Rays that are not finite are ignored. Throws std::invalid_argument for inconsistent arrays.
 PointArrays triangulate(const PosedTracks& tracks, std::int64_t first, std::int64_t last,
                         const TriangulateOptions& options);
 

@@ -25,7 +25,7 @@ void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& st
   }
 }
 
-// Notes the units that may move a track into the current frame.
+// Records the units whose motion may continue a track into the current frame.
 void Chainer::note_open_units(std::span<const Link> links) {
   open_units_.clear();
   if (std::all_of(links.begin(), links.end(), [](const Link& link) { return link.forward; })) {
@@ -61,9 +61,9 @@ void Chainer::chain_backward(const Link& link) {
   for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
 }
 
-// With the displacements of the current frame: every free cell claims the longest track that it
-// finds, and every track goes to the cell in which it is nearest to the centre. This is a stable
-// matching, so the order of cells does not matter.
+// Uses the displacements of the current frame. Every free cell claims the longest track that it
+// finds, and every track goes to the cell whose centre is nearest. This is a stable matching, so
+// the order of cells does not matter.
 void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion.lists[list];
   claims_.resize(link.other->cells.size());
@@ -94,7 +94,7 @@ void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   claimed_.clear();
 }
 
-// Notes the cells of a frame whose tracks are not yet continued into the current frame.
+// Records the cells of a frame whose tracks are not yet continued into the current frame.
 void Chainer::note_unplaced(const ChainedFrame& other) {
   unplaced_.resize(other.cells.size());
   unplaced_units_.assign(other.motion.mi_size.size(), 0);
@@ -109,7 +109,7 @@ void Chainer::note_unplaced(const ChainedFrame& other) {
   }
 }
 
-// Notes that the track of a cell has been continued.
+// Records that the track of a cell has been continued.
 void Chainer::note_placed(const ChainedFrame& other, int cell) {
   unplaced_[cell] = 0;
   const int size = grid_.cells;
@@ -146,7 +146,7 @@ bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motio
   return false;
 }
 
-// Lets a cell claim a track. A cell that loses its claim to it searches for another track in turn.
+// Lets a cell claim a track. If another cell loses this track, it searches for another one in turn.
 void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) {
   while (true) {
     Found best;
@@ -165,8 +165,8 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) 
   }
 }
 
-// The longest track that the motion of a unit leads to and on which the cell has a better claim
-// than the cell that has claimed it; `best` if that is longer.
+// The longest track to which the motion of a unit leads, among those that no cell with a better
+// claim holds; `best` if that is longer.
 Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
                                    Found best) const {
   const ChainedFrame& other = *link.other;
@@ -201,7 +201,7 @@ Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const U
   return best;
 }
 
-// Notes the displacements of neighbouring units that the cells of a unit use, too. Where
+// Records the displacements of neighbouring units that the cells of a unit use as well. Where the
 // displacements of neighbouring blocks diverge, tracks lie in the gap between their targets.
 void Chainer::note_motion_beside(const Link& link, int list, int unit) {
   if (unit == beside_unit_) return;
@@ -259,7 +259,7 @@ Chainer::Window Chainer::around(const Link& link, Point position, float reach) {
           last((position.x + reach) * link.to_cells_x, other.cell_cols)};
 }
 
-// With the displacements of the other frame: every track moves with its unit, and a free cell gets
+// Uses the displacements of the other frame. Every track moves with its unit, and a free cell gets
 // the longest track that lands in it.
 void Chainer::chain_forward(const Link& link, int list) {
   ChainedFrame& other = *link.other;

@@ -16,7 +16,7 @@
 namespace colmap_av1::tracks {
 
 // If two tracks lead to one cell, the longer one is continued. If two cells claim one track, the
-// cell gets it in which the track is nearest to the centre.
+// cell gets it whose centre is nearest to the track.
 class Chainer {
  public:
   Chainer(const TrackBuilderOptions& options, const CellGrid& grid);

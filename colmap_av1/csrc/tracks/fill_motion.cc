@@ -16,8 +16,8 @@ int block_units(int mi_size, Axis axis) {
   return (axis == Axis::kAcross ? av1::kBlockWidth[mi_size] : av1::kBlockHeight[mi_size]) / 4;
 }
 
-// The difference of a unit's interpolated motion from its block's vector, along one axis, towards
-// the block before or after it.
+// The difference between a unit's interpolated motion and its block's vector, along one axis,
+// towards the block before or after it.
 Point towards_neighbour(const TrustedMotion& motion, const std::vector<UnitMotion>& blocks,
                         float limit, int row, int col, Axis axis) {
   const int unit = row * motion.cols + col;

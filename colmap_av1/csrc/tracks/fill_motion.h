@@ -7,12 +7,11 @@
 
 namespace colmap_av1::tracks {
 
-// A block has one vector, the best for the whole block, but real motion varies smoothly. The vector
-// of every unit is interpolated between the centres of its block and of neighbouring blocks, across
-// and down, if their displacements differ by less than `limit` coded pixels. A warp already
-// describes how the motion varies within its block. At the border of a warped block, the
-// displacement of its nearest unit is used, at the position of that unit. `unfilled` is working
-// memory that the caller reuses.
+// A block has a single vector, but real motion varies smoothly. Therefore the vector of every unit
+// is interpolated between the centres of its block and of neighbouring blocks, across and down, if
+// their displacements differ by less than `limit` coded pixels. A warp already describes how the
+// motion varies within its block. At the border of a warped block, the displacement of its nearest
+// unit is used, at the position of that unit. `unfilled` is working memory that the caller reuses.
 void interpolate_blocks(float limit, std::vector<UnitMotion>& unfilled, TrustedMotion& motion);
 
 // Units of a block without trusted motion, such as an intra block, get the motion interpolated

@@ -16,10 +16,10 @@
 
 namespace colmap_av1::tracks {
 
-// Frames are added in bitstream order and chained in display order, so that a frame that
-// was coded far ahead is reached by the short steps of the frames between, not by its own
-// long and inaccurate vectors. Memory holds the frames in reference slots, the frames that
-// displacements link to a frame that is not chained yet, and the tracks of the store.
+// Frames are added in bitstream order and chained in display order. Tracks therefore reach a frame
+// that was coded far ahead in short steps through the frames between, not by its own long and
+// inaccurate vectors. Memory holds the frames in reference slots, the frames that displacements
+// link to a frame that is not chained yet, and the tracks of the store.
 class TrackBuilder {
  public:
   // Throws std::invalid_argument for cells into which a unit cannot be divided.

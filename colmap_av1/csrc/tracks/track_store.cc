@@ -132,7 +132,7 @@ TrackArrays TrackStore::finish() {
   out.offsets.reserve(kept_.size() + 1);
   out.offsets.push_back(0);
   for (const Kept& kept : kept_) out.offsets.push_back(out.offsets.back() + kept.length);
-  // Arrays are filled one after the other, the largest first, which needs the least memory.
+  // Arrays are filled one at a time, the largest first, to need the least memory.
   const auto take_sorted = [this]<typename T>(std::deque<T>& values, std::ptrdiff_t width) {
     std::vector<T> sorted(values.size());
     auto end = sorted.begin();

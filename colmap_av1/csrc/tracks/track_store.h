@@ -23,7 +23,7 @@ struct TrackArrays {
   std::vector<float> sigma;
 };
 
-// Memory holds the observations of tracks that are alive or long enough, in the observed frames.
+// Holds the observations, in the observed frames, of tracks that are alive or long enough.
 class TrackStore {
  public:
   // `observed`: display indices of the observed frames; without a value, all frames. With a value,

@@ -19,9 +19,9 @@ constexpr float kOverlapped = 0.19F;
 constexpr float kWarped = -0.31F;
 constexpr float kNewVector = -1.37F;
 
-// For a block without neighbours to compare with.
+// Disagreement in px that is assumed for a block without neighbours to compare with.
 constexpr float kUnknownDisagreement = 0.5F;
-constexpr float kMaxSigma = 4.F;
+constexpr float kMaxSigma = 4.F;  // px
 
 // Whether the encoder coded a new vector instead of using a neighbour's.
 bool has_new_vector(int y_mode) { return y_mode == av1::NEWMV || y_mode == av1::NEW_NEWMV; }

@@ -1,4 +1,4 @@
-// How far the bitstream's motion can be trusted.
+// Expected errors of the bitstream's motion.
 #pragma once
 
 namespace colmap_av1::tracks {

@@ -23,8 +23,8 @@ using Verdict = TrustScratch::Verdict;
 // Approximate number of sampled units that decide whether a frame moves evenly.
 constexpr int kEvenSamples = 2048;
 constexpr int kSuperblock = 16;  // in units; the smaller of the two sizes
-// At least this share of the sampled units lies in small blocks if the picture shows any detail.
-// For a camera that stands still, without noise, the share is 0.02.
+// If a smaller share of the sampled units is in small blocks, the picture shows no detail. For a
+// camera that stands still, without noise, the share is 0.02.
 constexpr double kDetail = 0.01;
 
 // How the motion of the units around a block compares with that of the block.
@@ -84,7 +84,7 @@ bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool co
   return coded || !options.max_uncoded_block_area || block_area <= *options.max_uncoded_block_area;
 }
 
-// Whether motion from `from` to `to` keeps its distance from the edge of the picture.
+// Whether both ends of a motion keep a distance from the edge of the picture.
 bool is_within_border(const TrustedMotion& motion, float border, Point from, Point to) {
   const auto is_in_border = [&](Point p) {
     return p.x < border || p.y < border || p.x > motion.coded_width - border ||
@@ -97,15 +97,16 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
   return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
 }
 
-// The even motion in the frame's first list. There is none if all blocks are small enough. There is
-// none either if hardly any are, because a picture of one colour seems to stand still.
+// The even motion in the frame's first list. There is none if all blocks are small enough, if fewer
+// than half of the sampled units have motion, or if hardly any blocks are small: a picture of one
+// colour seems to stand still.
 EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
                        const DisplacementModel& model, const TrustedMotion& motion) {
   const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
   int num_small = 0;
   int num_large = 0;
   std::vector<TimedMotion> spread;
-  // Blocks after the last whole superblock are excluded, because they are small for lack of space.
+  // Blocks in partial superblocks are excluded, because they are small for lack of space.
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
@@ -123,8 +124,8 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   return {spread, motion.coded_width, motion.height};
 }
 
-// Reads the displacements of visible units, by the rules that do not compare a unit with its
-// neighbours.
+// Reads the displacements of visible units that are trusted by the rules that do not compare a unit
+// with its neighbours.
 void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
                         TrustedMotion& motion) {
   const DisplacementModel model(frame);
@@ -172,8 +173,7 @@ double disagreement(const TrustedMotion& motion, const UnitMotion& own, int othe
   return best;
 }
 
-// Compares each unit around the block that starts at (row, col) with the unit of the block that it
-// touches.
+// Compares each unit around the block at (row, col) with the adjacent unit of the block.
 Agreement judge_border(const TrustedMotion& motion, std::optional<double> smoothness, int row,
                        int col, int list) {
   Agreement result;
@@ -188,7 +188,7 @@ Agreement judge_border(const TrustedMotion& motion, std::optional<double> smooth
     if (std::isinf(distance)) return;
     ++result.judged;
     result.distance += distance;
-    // Large motion also varies more from position to position.
+    // Large motion also varies more within the picture.
     const double length = std::sqrt(own.dx * own.dx + own.dy * own.dy);
     if (smoothness && distance <= *smoothness * (1 + length / 8)) ++result.agreeing;
   };

@@ -91,7 +91,7 @@ def choose_footage(
                 images,
                 options,
                 listed={},
-                beside=folder / "result.json",
+                next_to=folder / "result.json",
                 context=context,
             )
             chosen = prepared.tracked.chosen

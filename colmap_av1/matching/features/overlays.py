@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.matching.features.sift import Features, alike
+from colmap_av1.matching.features.sift import Features, are_similar
 from colmap_av1.util.spread import evenly_spread
 
 # Number of images, evenly spread, that each image is compared with.
@@ -83,7 +83,7 @@ def _shares_in_place(features: Sequence[Features], width: int) -> list[NDArray[n
         count = last - first
         a = np.repeat(np.arange(len(wanted)) // len(around), count)
         b = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
-        same = alike(own.descriptors[a], descriptors[b]) & (image[b] != k)
+        same = are_similar(own.descriptors[a], descriptors[b]) & (image[b] != k)
         seen = np.unique(a[same] * num_images + image[b[same]]) // num_images
         others = max(1, len(compared) - (k in compared))
         shares.append(np.bincount(seen, minlength=len(own.xy)) / others)

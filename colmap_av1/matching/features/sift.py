@@ -81,7 +81,7 @@ def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask |
     return features.only(mask.keeps(features.xy, picture.shape[1::-1]))
 
 
-def alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
+def are_similar(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Whether descriptors [n, 128] match within COLMAP's limit, bool [n]."""
     return np.asarray(np.einsum("ij,ij->i", a, b) >= np.cos(_MAX_ANGLE))
 

@@ -12,7 +12,7 @@ from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import Display
 
 
-def without_shutter(
+def correct_rolling_shutter(
     tracks: Tracks,
     display: Display,
     rate: float | None,

@@ -205,7 +205,7 @@ class Contradictions:
         """Tracks whose points would occlude other points, or are seen through a surface.
 
         Args:
-            moving: bool [num_tracks] tracks that are known to be dynamic and are no evidence.
+            moving: bool [num_tracks] tracks known to be dynamic, which are not used as evidence.
         """
         agreeing = self._agreeing & ~moving
         hiding = self._hiding(agreeing)
@@ -215,7 +215,7 @@ class Contradictions:
         """Count the agreeing points that project into each cell of images not observing them.
 
         Args:
-            left_out: bool [num_tracks] tracks that are no evidence.
+            left_out: bool [num_tracks] tracks that are not used as evidence.
 
         Returns:
             float64 [images, rows, columns].

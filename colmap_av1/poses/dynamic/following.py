@@ -34,7 +34,7 @@ _PREDICTED_SIGMA = 1.0
 _LK = RefineOptions(refine="lk")
 
 
-def has_moving_masks(image_set: ImageSet) -> bool:
+def has_changing_masks(image_set: ImageSet) -> bool:
     """Whether the masks of a video differ between its images."""
     videos = (image_set.images_of(video) for video in range(len(image_set.videos)))
     return any(len({image_set.masks[image] for image in images}) > 1 for images in videos)

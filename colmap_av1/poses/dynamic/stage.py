@@ -35,7 +35,7 @@ _MIN_IMAGES = 4
 
 @dataclass(frozen=True)
 class DynamicResult:
-    """What `moving_stage` found, apart from the masks it stores.
+    """What `dynamic_stage` found, apart from the masks it stores.
 
     Attributes:
         moving: share of dynamic pixels in all images.
@@ -44,7 +44,7 @@ class DynamicResult:
     moving: float
 
 
-def moving_stage(
+def dynamic_stage(
     run: Run, tracks: Tracks, image_set: ImageSet, posed: Kept[PosesResult]
 ) -> Kept[DynamicResult]:
     """Find the dynamic regions of each image."""
@@ -73,7 +73,7 @@ def moving_stage(
     )
 
 
-def read_moving(stages: Path) -> dict[str, Mask]:
+def read_dynamic_masks(stages: Path) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels, by image name; only of images that have such pixels."""
     with np.load(stages / _FILE) as file:
         packed = np.split(file["packed"], file["ends"][:-1]) if len(file["names"]) else []
@@ -85,7 +85,7 @@ def read_moving(stages: Path) -> dict[str, Mask]:
         }
 
 
-def without_moving(
+def without_dynamic_tracks(
     tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], run: Run
 ) -> Tracks:
     """The tracks of all sequences outside dynamic pixels, see `mask_tracks`."""

@@ -1,1 +1,1 @@
-"""Where a model lies in the world: scale, up, origin."""
+"""Places a model in world coordinates: scale, up direction and origin."""

@@ -1,4 +1,4 @@
-"""Where a model is placed: by positions, by what is up, by a known distance."""
+"""Placement of a model by GPS positions, by its up direction and by a known distance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 from numpy.typing import NDArray
 
@@ -24,13 +24,14 @@ from colmap_av1.poses.placing.up import (
 )
 
 _Floats = NDArray[np.float64]
-# Gives, for what is roughly up, planes of lines that may be vertical, see `vertical_lines`.
+# Returns the planes of lines that may be vertical, given an approximate up direction, see
+# `vertical_lines`.
 Lines = Callable[[_Floats], Sequence[_Floats]]
 
 PLACE_FILE = "place.json"
-# How far what is up may be off by gravity, and by how cameras are held, in radians.
-_ERROR_OF_GRAVITY, _ERROR_OF_HELD = np.deg2rad(2.0), np.deg2rad(6.0)
-_NOWHERE = Similarity(1.0, np.eye(3), np.zeros(3))
+# Standard errors in radians of the up direction from gravity, and from how the camera was held.
+_GRAVITY_ERROR, _CAMERA_ERROR = np.deg2rad(2.0), np.deg2rad(6.0)
+_IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,13 @@ class Origin:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a model lies in the world, as `place.json` holds it.
+    """Coordinate system of a model, the content of `place.json`.
 
     Attributes:
         units: "metres" or "arbitrary".
-        axes: directions of the axes, in words.
+        axes: description of the axes.
         origin: position of the origin on the Earth; None if it is unknown.
-        how: sources of the placement, in words.
+        how: descriptions of the data that determined the placement.
         scale: scale of the similarity from the mapper's coordinates to the model's.
         rotation: its rotation matrix, [3][3].
         translation: its translation, [3].
@@ -67,32 +68,32 @@ class Place:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a model lies in the world.
+    """Transform of a model to world coordinates.
 
     Attributes:
         similarity: from the mapper's coordinates to those of the model.
-        units: "metres", or "arbitrary".
-        axes: what the axes are, in words.
+        units: "metres" or "arbitrary".
+        axes: description of the axes.
         origin: position of the origin on the Earth; None if it is unknown.
-        how: sources of the placement, in words.
-        warnings: what the user should know.
+        how: descriptions of the data that determined the placement.
+        warnings: warnings about the placement.
     """
 
-    similarity: Similarity = _NOWHERE
+    similarity: Similarity = _IDENTITY
     units: str = "arbitrary"
-    axes: str = "as the mapper chose them"
+    axes: str = "of the mapper"
     origin: Origin | None = None
     how: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property
     def is_moved(self) -> bool:
-        """Whether the model lies elsewhere than the mapper left it."""
-        return self.similarity is not _NOWHERE
+        """Whether the model is transformed."""
+        return self.similarity is not _IDENTITY
 
     @property
     def place(self) -> Place:
-        """Where the model lies, in plain numbers."""
+        """The content of `place.json`."""
         return Place(
             units=self.units,
             axes=self.axes,
@@ -106,14 +107,15 @@ class Placement:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of where images were taken.
+    """Data that can place a model.
 
     Attributes:
-        priors: where images were taken, by name.
+        priors: pose priors of images, by name.
         gravity: float64 [n, 3] direction of gravity for each image, see `up_of_gravity`; None
-            where nothing says it.
-        lines: finds lines in the pictures; None where there are no pictures.
-        place: the one position of all that there is.
+            if unknown.
+        lines: finds lines in the pictures; None without pictures.
+        place: latitude, longitude and altitude of a single position for all images; None if
+            there is none.
     """
 
     priors: Mapping[str, PosePrior]
@@ -129,17 +131,17 @@ def find_placement(
     options: PlaceOptions,
     seed: int,
 ) -> Placement:
-    """Find where a model is to be placed.
+    """Determine the placement of a model.
 
     Args:
-        images: the images that have a pose.
+        images: the registered images.
         cameras: cameras of their pictures, by id.
-        known: what is known of where they were taken.
-        options: what is wanted.
-        seed: of the random samples.
+        known: positions, gravity and lines.
+        options: the options.
+        seed: random seed of the samples.
 
     Raises:
-        OptionError: the known distance is none of this model.
+        OptionError: the known distance cannot be measured in the model, see `model_distance`.
     """
     poses = np.array([image.cam_from_world for image in images])
     found = Placement()
@@ -164,7 +166,7 @@ def _by_positions(
             return Placement()
         latitude, longitude, altitude = known.place
         where = f"{latitude:.5f}, {longitude:.5f}, {altitude:.1f} m"
-        return Placement(how=(f"taken at {where}, one position that gives no scale or direction",))
+        return Placement(how=(f"a single position, {where}, which gives no scale or direction",))
     cartesian = sum(prior.is_cartesian for prior in priors)
     kind = cartesian * 2 > len(priors)
     at = [i for i, prior in zip(at, priors, strict=True) if prior.is_cartesian == kind]
@@ -181,38 +183,38 @@ def _by_positions(
     if isinstance(fit, str):
         return Placement(
             warnings=(
-                f"the positions do not place the model: {fit}; it keeps the mapper's scale: "
-                "--scale gives it another, --upright turns it",
+                f"the positions do not place the model: {fit}; its scale and "
+                "axes are arbitrary: give --scale and --upright",
             )
         )
     how = (
-        f"{fit.num_used} of {len(at)} positions agree to {fit.error:.2f} m, scale to "
-        f"{fit.scale_error:.1%}"
+        f"{fit.num_used} of {len(at)} positions with a residual of {fit.error:.2f} m, scale "
+        f"accurate to {fit.scale_error:.1%}"
     )
     axes = "of the pose priors" if origin is None else "x east, y north, z up"
     return Placement(fit.similarity, "metres", axes, origin, (how,))
 
 
 def _rough_ups(poses: _Floats, gravity: _Floats | None) -> list[Up]:
-    """What may be up: by gravity, or as cameras are held, upright or looking straight down."""
-    felt = up_of_gravity(poses, gravity) if gravity is not None else None
-    if felt is not None:
-        return [Up(felt[0], _ERROR_OF_GRAVITY)]
+    """Candidates for up: by gravity, else for cameras held upright and cameras looking down."""
+    measured = up_of_gravity(poses, gravity) if gravity is not None else None
+    if measured is not None:
+        return [Up(measured[0], _GRAVITY_ERROR)]
     back = -poses[:, 2, :3].mean(axis=0)
     back /= max(float(np.linalg.norm(back)), 1e-12)
-    return [Up(up_of_cameras(poses), _ERROR_OF_HELD), Up(back, _ERROR_OF_HELD)]
+    return [Up(up_of_cameras(poses), _CAMERA_ERROR), Up(back, _CAMERA_ERROR)]
 
 
 def _up(poses: _Floats, known: Surroundings) -> tuple[_Floats, str]:
-    """What is up, and what said so."""
-    felt = up_of_gravity(poses, known.gravity) if known.gravity is not None else None
-    if felt is not None:
-        return felt[0], f"gravity, which images agree on to {felt[1]:.1f} degrees"
+    """The up direction, and a description of the data that determined it."""
+    measured = up_of_gravity(poses, known.gravity) if known.gravity is not None else None
+    if measured is not None:
+        return measured[0], f"gravity, which scatters by {measured[1]:.1f} degrees"
     held = up_of_cameras(poses)
     straight = up_of_lines(known.lines(held), held) if known.lines is not None else None
     if straight is not None:
         return straight, "vertical lines"
-    return held, "how the camera was held, as no lines say it"
+    return held, "how the camera was held, without vertical lines"
 
 
 def _with_distance(
@@ -221,24 +223,24 @@ def _with_distance(
     cameras: Mapping[int, pycolmap.Camera],
     text: str,
 ) -> Placement:
-    """The placement with a scale by which a distance is as it is known to be."""
+    """The placement with the scale of a known distance."""
     known = parse_distance(text)
     distance = model_distance(known, {image.name: image for image in images}, cameras)
     before = found.similarity
     scale = known.metres / distance
     centre = camera_centres(np.array([image.cam_from_world for image in images])).mean(axis=0)
-    # Positions keep the middle of the path where they say it is.
+    # Scaling about the mean camera centre keeps the model at its GPS positions.
     fixed = before.apply(centre[None])[0] if found.units == "metres" else np.zeros(3)
     factor = scale / before.scale
     moved = replace(before, scale=scale, translation=fixed + factor * (before.translation - fixed))
     how = f"scale by {known}"
     if found.units == "metres":
-        how += f", {before.scale / scale - 1:+.1%} by the positions"
+        how += f", the scale of the positions differs by {before.scale / scale - 1:+.1%}"
     return replace(found, similarity=moved, units="metres", how=(*found.how, how))
 
 
 def write_place(folder: Path, placement: Placement) -> None:
-    """Write where a model lies, as JSON.
+    """Write `place.json`.
 
     Raises:
         OSError: the file cannot be written.

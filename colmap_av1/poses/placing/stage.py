@@ -1,4 +1,4 @@
-"""The stage of `reconstruct` that places the model in the world."""
+"""The stage of `reconstruct` that places the model in world coordinates."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from colmap_av1.util.stages import Kept, run_stage
 
 @dataclass(frozen=True)
 class PlaceResult(PosesResult):
-    """What `place_stage` found.
+    """Result of `place_stage`.
 
     Attributes:
-        place: where the model lies in the world.
-        place_warnings: what the user should know of it.
+        place: coordinate system of the model.
+        place_warnings: warnings about the placement.
     """
 
     place: Place
@@ -42,13 +42,13 @@ class PlaceResult(PosesResult):
 def place_stage(
     run: Run, image_set: ImageSet, posed: Kept[PosesResult], positions: ImagePositions
 ) -> Kept[PlaceResult]:
-    """Place the posed images where positions, gravity and a known distance say.
+    """Place the registered images by positions, gravity and a known distance.
 
     Args:
         run: the run.
         image_set: the images.
         posed: the stage with the poses.
-        positions: what is known of where the images of `image_set` were taken.
+        positions: GPS positions and gravity of the images of `image_set`.
     """
     options, seed = run.options.place, run.options.match.run.seed
     undistort = run.options.undistort
@@ -57,7 +57,7 @@ def place_stage(
     def make(partial: Path) -> PlaceResult:
         placed = read_posed_images(run, posed, image_set)
         with run.clock.measure("place"):
-            # Marks are in pictures as the model's folder holds them.
+            # Points are marked in the written pictures.
             cameras = output_cameras(placed.cameras, undistort=undistort)
             known = _surroundings(run, image_set, placed, positions)
             found = find_placement(placed.images, cameras, known, options, seed)
@@ -94,16 +94,16 @@ def _surroundings(
     run: Run, image_set: ImageSet, placed: PosedImages, positions: ImagePositions
 ) -> Surroundings:
     index = {name: i for i, name in enumerate(image_set.images.names)}
-    own = [index[image.name] for image in placed.images]
+    indices = [index[image.name] for image in placed.images]
     places = positions.places
     priors = {
         image_set.images.names[i]: PosePrior(places[i], is_cartesian=False)
-        for i in own
+        for i in indices
         if np.isfinite(places[i]).all()
     }
 
     def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        images = dict(some_spread([*zip(own, placed.images, strict=True)]))
+        images = dict(some_spread([*zip(indices, placed.images, strict=True)]))
         return [
             vertical_lines(
                 picture,
@@ -114,6 +114,6 @@ def _surroundings(
             for i, picture in run.pictures(image_set)(sorted(images))
         ]
 
-    gravity = positions.gravity[own]
+    gravity = positions.gravity[indices]
     has_gravity = bool(np.isfinite(gravity).any())
     return Surroundings(priors, gravity if has_gravity else None, lines, positions.place)

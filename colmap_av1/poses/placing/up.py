@@ -1,4 +1,4 @@
-"""What is up in a model: by gravity, by vertical lines in its pictures, or by how it was filmed."""
+"""The up direction of a model, from gravity, vertical lines or how the camera was held."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import cv2
-import numpy as np
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.util.spread import evenly_spread
@@ -15,29 +16,30 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 _Item = TypeVar("_Item")
 
-# How much further from the mean of the images' own up a direction is taken that turns less
-# with them: cameras are pitched up and down more than they are rolled.
+# Weight of the mean up direction of the images compared with the requirement that their x axes are
+# horizontal. It is small, because cameras are pitched more than they are rolled.
 _PITCH_WEIGHT = 0.005
-# Lines that stand within this angle of what is up by the cameras alone, and their least number.
+# Sine of the largest angle between a vertical line and the approximate up direction, and the
+# smallest number of lines.
 _LARGEST_LEAN = np.sin(np.deg2rad(20))
 _LEAST_LINES = 20
-# Angle of a line to the vertical from which on it counts less.
+# Sine of the angle to the vertical that is the scale of the Cauchy loss.
 _LINE_SCALE = np.sin(np.deg2rad(1))
 _ITERATIONS = 20
-# Shortest line, as a share of the image's shorter side, and pixels of that in which lines are
-# looked for.
+# Length of the shortest line, as a share of the picture's shorter side.
 _SHORTEST_LINE = 0.06
+# Largest shorter side, in pixels, of a picture in which lines are detected.
 _LINE_PICTURE = 720
 _NUM_PICTURES = 12
-# Directions of gravity of which the axes of the recorder are found, in degrees at the most apart.
+# With a larger median scatter in degrees, gravity is not constant and is ignored.
 _LARGEST_SCATTER = 10.0
 
 
 def up_of_cameras(cam_from_world: _Floats) -> _Floats:
-    """Unit vector that is up, as the cameras [n, 3, 4] were held: rolled little.
+    """Up direction (unit vector) of cameras [n, 3, 4] that are rolled little.
 
-    It is across the images' horizontal axes; where these have one direction only, as near to the
-    images' own up as that allows.
+    It is perpendicular to the x axes of the cameras. If these are parallel, it is the perpendicular
+    direction that is closest to the mean -y axis.
     """
     across, down = cam_from_world[:, 0, :3], cam_from_world[:, 1, :3]
     mean = -down.mean(axis=0)
@@ -49,19 +51,19 @@ def up_of_cameras(cam_from_world: _Floats) -> _Floats:
 
 
 def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, float] | None:
-    """What is up by the direction of gravity in axes of a recorder that may be any of the camera's.
+    """Up direction from gravity, measured in camera axes of unknown order and signs.
 
-    Makers count these axes differently, and turn them with the picture: of all 48 orders and
-    signs, those are right by which gravity has one direction while the camera turns, and points
-    down in the images.
+    Manufacturers define these axes differently, and rotate them with the picture. Of all 48 orders
+    and signs, the one is chosen with which gravity is constant in the world and points down in the
+    images.
 
     Args:
         cam_from_world: float64 [n, 3, 4].
         gravity: float64 [n, 3] vectors; NaN where unknown.
 
     Returns:
-        The unit vector, and the scatter of single images in degrees; None where gravity is
-        unknown, or has no one direction by any axes.
+        The unit vector, and the median angle in degrees between it and single images; None if
+        gravity is unknown, or is not constant with any axes.
     """
     known = np.isfinite(gravity).all(axis=1)
     if not known.any():
@@ -76,7 +78,7 @@ def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, f
             mean = world.mean(axis=0)
             length = max(float(np.linalg.norm(mean)), 1e-12)
             scatter = 1 - length
-            # Down in the images is +y; what is off by less than a right angle is no objection.
+            # Down in the images is +y. This decides only between axes of similar scatter.
             score = scatter + 0.02 * (1 - float(np.mean(seen[:, 1])))
             if best is None or score < best[0]:
                 spread = np.rad2deg(np.arccos(np.clip(world @ mean / length, -1, 1)))
@@ -86,18 +88,19 @@ def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, f
 
 
 def vertical_lines(
-    picture: NDArray[np.uint8], camera: object, pose: _Floats, up: _Floats
+    picture: NDArray[np.uint8], camera: pycolmap.Camera, pose: _Floats, up: _Floats
 ) -> _Floats:
-    """Planes through the camera and lines in its picture that may be vertical.
+    """Planes through the camera centre and lines in its picture that may be vertical.
 
     Args:
-        picture: uint8 [height, width, 3].
-        camera: its pycolmap.Camera.
+        picture: uint8 [height, width, 3] BGR picture.
+        camera: its camera.
         pose: float64 [3, 4] cam_from_world.
-        up: unit vector that is roughly up.
+        up: approximate up direction (unit vector).
 
     Returns:
-        float64 [n, 3] unit normals of the planes in the world; what is up is across each.
+        float64 [n, 3] unit normals of the planes in the world. They are perpendicular to the up
+        direction if the lines are vertical.
     """
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     shrink = min(1.0, _LINE_PICTURE / min(grey.shape))
@@ -107,9 +110,9 @@ def vertical_lines(
         return np.empty((0, 3))
     ends = found.reshape(-1, 2, 2).astype(np.float64)
     long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _SHORTEST_LINE * min(small.shape)
-    # OpenCV counts from the centre of the first pixel.
+    # The centre of the first pixel is (0, 0) in OpenCV and (0.5, 0.5) in COLMAP.
     pixels = (ends[long].reshape(-1, 2) + 0.5) / shrink
-    rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])  # type: ignore[attr-defined]
+    rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
     rays = rays.reshape(-1, 2, 3) @ pose[:, :3]
     normals = np.cross(rays[:, 0], rays[:, 1])
     length = np.linalg.norm(normals, axis=1)
@@ -118,19 +121,19 @@ def vertical_lines(
 
 
 def some_spread(items: Sequence[_Item]) -> list[_Item]:
-    """As many of some items, evenly spread, as lines are looked for in pictures of."""
+    """Choose the evenly spread items in whose pictures lines are detected."""
     return [items[i] for i in evenly_spread(len(items), _NUM_PICTURES, rounded=True)]
 
 
 def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
-    """The direction that most lines have: iteratively reweighted least squares, Cauchy's loss.
+    """Direction of most lines, by iteratively reweighted least squares with the Cauchy loss.
 
     Args:
-        normals: what `vertical_lines` gives of each picture.
-        up: unit vector that is roughly up.
+        normals: results of `vertical_lines` for each picture.
+        up: approximate up direction (unit vector).
 
     Returns:
-        The unit vector; None where the lines are few, or few of them agree.
+        The unit vector; None if there are few lines, or few inliers.
     """
     planes = np.concatenate([np.empty((0, 3)), *normals])
     if len(planes) < _LEAST_LINES:
@@ -148,7 +151,7 @@ def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
 
 
 def rotation_to_up(up: _Floats) -> _Floats:
-    """The smallest rotation [3, 3] that turns a unit vector to +z."""
+    """The smallest rotation [3, 3] that rotates a unit vector to +z."""
     target = np.array([0.0, 0.0, 1.0])
     axis = np.cross(up, target)
     cosine = float(up @ target)

@@ -15,7 +15,7 @@ _TAG = "camera.focal_length.35mm_equivalent"
 _SHORTEST, _LONGEST = 6.0, 1200.0
 
 
-def said_focal_length(
+def container_focal_length(
     tags: tuple[tuple[str, str], ...], size: tuple[int, int], pixel_aspect: float = 1.0
 ) -> float | None:
     """The focal length that a container gives, converted by the diagonal of the pictures.
@@ -34,7 +34,7 @@ def said_focal_length(
     return millimetres / _FILM_DIAGONAL * math.hypot(size[0] * pixel_aspect, size[1])
 
 
-def doubtful_lens(tags: tuple[tuple[str, str], ...]) -> str | None:
+def implausible_focal_length(tags: tuple[tuple[str, str], ...]) -> str | None:
     """Describe an implausible focal length that a container gives; None if there is none."""
     text = _tag_value(tags).strip()
     if not text or _millimetres(text) is not None:

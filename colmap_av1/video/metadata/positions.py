@@ -77,7 +77,7 @@ class Positions:
     left_out: str | None = None
 
 
-def doubtful_place(tags: tuple[tuple[str, str], ...]) -> str | None:
+def implausible_position(tags: tuple[tuple[str, str], ...]) -> str | None:
     """Describe an invalid position that a container gives for the whole video; None if none.
 
     Args:
