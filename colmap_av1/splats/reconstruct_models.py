@@ -29,7 +29,7 @@ from colmap_av1.util.stages import Kept, remove_products, run_stage
 # Folders of further models, each followed by its number.
 _FOLDER = "model_"
 # A model may be bent if its seams have less than this share of the first model's points with
-# parallax. Bent parts of rendered walks had 16 % of them, straight parts 22 % and more.
+# parallax. A bent part of the rendered walks had 9 %, correct parts at least 16 % except one.
 _FEW_POINTS = 0.2
 
 
