@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_av1.cli.reports import Rows
 from colmap_av1.util.remote import without_secrets
+from colmap_av1.util.texts import on_one_line
 
 if TYPE_CHECKING:
     from colmap_av1.match import MatchReport
@@ -58,6 +59,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 def print_summary(rows: Rows) -> None:
     """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
+    rows = [(on_one_line(name), on_one_line(value)) for name, value in rows]
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
@@ -82,7 +84,7 @@ def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ())
 
 def print_next(report: MatchReport) -> None:
     """Print the commands that map what `match` wrote."""
-    with_colmap, with_ours, densify = report.next_commands
+    with_colmap, with_ours, densify = map(on_one_line, report.next_commands)
     if sys.stdout.isatty():
         # Printed bare, so that they can be copied from any terminal.
         print_text(
@@ -132,8 +134,8 @@ def print_error(message: object) -> None:
 
 def _print_line(text: str) -> None:
     try:
-        # Names of files may hold ends of lines.
-        print(without_secrets(text).replace("\n", "\\n"), file=sys.stderr, flush=True)
+        # Names of files may hold any character.
+        print(on_one_line(without_secrets(text)), file=sys.stderr, flush=True)
     except OSError:  # there is nowhere left to say so
         _silence(sys.stderr)
 
