@@ -15,7 +15,7 @@ import numpy as np
 
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
-from colmap_av1.motion.reading import count_shown_pictures, read_motion
+from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
@@ -110,7 +110,9 @@ def inspect(
     structure = counts.structure
     if structure.num_shown > 0:
         # Frames that are shown again are not coded frames, and a stream may end with them.
-        structure.num_shown = max(structure.num_shown, count_shown_pictures(video, options))
+        structure.num_shown = count_with_repeats(
+            first_showings(video, options), structure.num_shown
+        )
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frames: give another video")
     # The bitstream is read first because only its parser limits the frame size.
