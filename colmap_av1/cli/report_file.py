@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from colmap_av1.errors import OptionError
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.plain import plain
@@ -34,11 +36,17 @@ def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
 
 @contextmanager
 def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
-    """Write why the body failed, if it is wanted."""
+    """Write why the body failed, if it is wanted.
+
+    Raises:
+        OptionError: the file of the report is another one.
+    """
+    path = getattr(namespace, "report_json", None)
+    if path is not None:
+        _check_report(Path(path))
     try:
         yield
     except Exception as error:
-        path = getattr(namespace, "report_json", None)
         if path is not None:
             from colmap_av1.util.failures import failure_of
 
@@ -46,6 +54,21 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
             with suppress(OSError):  # the error itself is reported in any case
                 _write(path, {"failure": failure, "cpu_seconds": cpu_seconds()})
         raise
+
+
+def _check_report(path: Path) -> None:
+    """Refuse to replace a file that is not a report.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if not os.path.lexists(path):
+        return
+    found: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        found = json.loads(path.read_bytes()) if path.is_file() else None
+    if not (isinstance(found, dict) and "cpu_seconds" in found):
+        raise OptionError(f"{path}: exists and is not a report: give another file")
 
 
 def _write(path: str, facts: dict[str, Any]) -> None:
