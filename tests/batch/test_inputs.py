@@ -48,6 +48,12 @@ def test_lists(folder: Path) -> None:
     assert found[4] == Video("g", "s3://bucket/dir/g.mkv")
 
 
+def test_a_list_with_a_mark_of_byte_order(folder: Path) -> None:
+    videos = folder.parent / "videos.txt"
+    videos.write_text("videos/b.mp4\nvideos/a.webm\n", encoding="utf-8-sig")
+    assert names(videos) == ["videos/b", "videos/a"]
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -82,6 +88,7 @@ def test_an_output_among_the_inputs(folder: Path) -> None:
         ("x.mp4\t/x", "name"),
         ("x.mp4\t.batch/x", "name"),
         ("batch.json.mp4", "name"),
+        ("x.mp4\tbatch-1-of-2.csv", "name"),
     ],
 )
 def test_names_that_clash(lines: str, message: str, tmp_path: Path) -> None:
