@@ -106,8 +106,8 @@ def test_bad_shards(shard: str) -> None:
 
 class _Hangs(http.server.BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
-        if self.path == "/none.mp4":
-            self.send_error(404)
+        if self.path != "/hangs.mp4":
+            self.send_error(int(self.path[1:4]))
             return
         self.send_response(200)
         self.send_header("Content-Length", "1000")
@@ -137,10 +137,25 @@ def server() -> Iterator[str]:
 def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
-    videos.write_text(f"{server}/hangs.mp4\n{server}/none.mp4\n")
+    videos.write_text(f"{server}/hangs.mp4\n{server}/404.mp4\n")
     options = BatchOptions(stall=2, retries=0)
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()
     assert "2 seconds" in text
     assert "no such file" in text
+
+
+def test_a_server_that_is_out_of_order_has_not_lost_the_file(server: str, tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    videos = tmp_path / "list"
+    addresses = [f"{server}/503.mp4", f"{server}/403.mp4?sig=SECRET", "http://127.0.0.1:1/x.mp4"]
+    videos.write_text("\n".join(addresses))
+    report = run_batch(videos, tmp_path / "out", ReadOptions(), options=BatchOptions(retries=1))
+    assert report.failed == {"reading or writing": 3}
+    assert report.num_retried == 3
+    text = (tmp_path / "out" / "batch.csv").read_text()
+    for word in ("503", "403", "connect"):
+        assert word in text
+    assert "SECRET" not in text
+    assert "no such file" not in text
