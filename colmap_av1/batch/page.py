@@ -7,7 +7,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -162,8 +163,9 @@ def _number(name: str, value: float) -> str:
 
 def _thumbnail(row: Row, into: Output) -> str | None:
     """The thumbnail of a video in base64; None if there is none."""
-    try:
-        content = into.read(f"{row.name}/{THUMBNAIL}") if row.state == "done" else None
-    except OSError:  # The page is useful without it.
-        content = None
+    name, content = PurePosixPath(row.name), None
+    if row.state != "done" or name.is_absolute() or ".." in name.parts:
+        return None
+    with suppress(OSError, ValueError):  # The page is useful without it.
+        content = into.read(f"{name}/{THUMBNAIL}")
     return base64.b64encode(content).decode() if content else None

@@ -111,6 +111,16 @@ def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
     assert {row[0]: row[-2] for row in page.tables["quantiles"]}["points"] == "299"
 
 
+@pytest.mark.parametrize("name", ["../secret", "{root}/secret", "a\0b", "a\ud800"])
+def test_thumbnails_are_those_of_the_output(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "thumbnail.jpg").write_bytes(JPEG)
+    write_rows(out, [Row(name.format(root=tmp_path), "/x", "done", points=1)])
+    write_page(out)
+    assert "base64" not in (out / "report.html").read_text()
+
+
 def row_text(field: str, value: object) -> str:
     """A file of rows, one of whose values is altered."""
     facts = {**vars(Row("x", "/x", "done")), field: value}
@@ -126,6 +136,7 @@ def row_text(field: str, value: object) -> str:
         (row_text("state", "<script>alert(1)</script>"), "damaged"),
         (row_text("seconds", "<script>"), "damaged"),
         (row_text("points", [1]), "damaged"),
+        (row_text("points", 10**400), "damaged"),
         ("[]", "damaged"),
         ('{"rows": [\n  {"name": ' + "[" * 100_000, "damaged"),
     ],
