@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import os
+import tarfile
 import threading
 import time
 from collections.abc import Iterator
@@ -62,6 +63,7 @@ def test_a_list_with_a_mark_of_byte_order(folder: Path) -> None:
         ("empty", "no video"),
         ("none.mp4", "no such file"),
         ("binary", "line 1"),
+        ("videos.tar", "line 1"),
         ("gopher9://x/y.mp4", "gopher9"),
     ],
 )
@@ -69,6 +71,8 @@ def test_no_videos(given: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "empty.txt").write_text("\n\n")
     (tmp_path / "empty").mkdir()
     (tmp_path / "binary").write_bytes(bytes(100))
+    with tarfile.open(tmp_path / "videos.tar", "w") as archive:
+        archive.add(tmp_path / "empty.txt", "a.mp4")
     with pytest.raises(OptionError, match=message):
         names(given if "://" in given else tmp_path / given)
 
