@@ -111,6 +111,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     namespace, others = parser.parse_known_args(words)
     if others:
         commands[name].error(f"unrecognized arguments: {' '.join(others)}")
+    commands[name].refuse_empty(namespace)
     return namespace
 
 
