@@ -250,18 +250,27 @@ def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["batch", "--task", "info", "--output", out]) == 2
 
 
-def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(
+    ("shard", "refused"), [(None, [None, "1/2"]), ("1/2", [None, "1/2", "1/3", "3/3"])]
+)
+def test_one_batch_at_a_time(
+    shard: str | None, refused: list[str | None], clips: Path, tmp_path: Path
+) -> None:
+    out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
     tried = []
 
-    def try_another(counts: Counts, _: object) -> None:
+    def try_others(counts: Counts, _: object) -> None:
         if counts.ended == 1:
-            with pytest.raises(OptionError, match="another batch"):
-                run_batch(clips, out, ReadOptions())
-            tried.append(True)
+            for other in refused:
+                with pytest.raises(OptionError, match="another batch"):
+                    run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))
+                tried.append(other)
 
-    run_batch(clips / "a" / "clip0.mp4", out, ReadOptions(), options=ONCE, watch=try_another)
-    assert tried == [True]
+    options = BatchOptions(retries=0, shard=shard)
+    run_batch(video, out, ReadOptions(), options=options, watch=try_others)
+    assert tried == refused
+    for other in refused:
+        run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))
 
 
 def test_a_video_without_a_model(clips: Path, tmp_path: Path) -> None:

@@ -98,6 +98,15 @@ def test_a_page(tmp_path: Path) -> None:
     assert page.keys[-1][points] == "5000"  # what is sorted by
 
 
+def test_a_video_in_the_rows_of_several_runs_counts_once(tmp_path: Path) -> None:
+    """The first run was one of two shards, the second one has all videos."""
+    write_rows(tmp_path, [Row("a", "/a", "done"), Row("b", "/b", "failed")], "batch-1-of-2.json")
+    write_rows(tmp_path, [Row(n, f"/{n}", "done") for n in "abc"])
+    write_page(tmp_path)
+    text = " ".join((tmp_path / "report.html").read_text().split())
+    assert "3 videos, 3 done, 0 failed" in text
+
+
 def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
     rows = [Row(f"v{i:03}", f"/v{i}", "done", points=i) for i in range(300)]
     rows[250] = Row("v250", "/v250", "failed", "damaged", error="x")
