@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from colmap_av1.cli.terminal import renamed
 from colmap_av1.errors import OptionError
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import whole_file
@@ -73,4 +74,4 @@ def _check_report(path: Path) -> None:
 
 def _write(path: str, facts: dict[str, Any]) -> None:
     with whole_file(Path(path)) as partial:
-        partial.write_text(json.dumps(plain(facts), indent=1, allow_nan=False) + "\n")
+        partial.write_text(json.dumps(plain(facts, renamed), indent=1, allow_nan=False) + "\n")

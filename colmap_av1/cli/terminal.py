@@ -22,9 +22,28 @@ if TYPE_CHECKING:
 
 PROGRAM = "colmap-av1"
 
+# Paths of files that exist while a command runs, and the names that replace them in texts.
+_NAMES: dict[str, str] = {}
+
 
 class StreamError(Exception):
     """Standard output takes nothing more, for the reason that is its cause."""
+
+
+def show_as(path: str, name: str) -> None:
+    """Replace a path by a name in all texts from now on, also after the file is gone."""
+    _NAMES[path] = name
+
+
+def renamed(text: str) -> str:
+    """The text with the names of `show_as`."""
+    for path, name in _NAMES.items():
+        text = text.replace(path, name)
+    return text
+
+
+def _as_shown(text: str) -> str:
+    return on_one_line(renamed(text))
 
 
 @contextmanager
@@ -59,7 +78,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 def print_summary(rows: Rows) -> None:
     """A table on a terminal; elsewhere one line each, name and value parted by a tab."""
-    rows = [(on_one_line(name), on_one_line(value)) for name, value in rows]
+    rows = [(_as_shown(name), _as_shown(value)) for name, value in rows]
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
@@ -84,7 +103,7 @@ def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ())
 
 def print_next(report: MatchReport) -> None:
     """Print the commands that map what `match` wrote."""
-    with_colmap, with_ours, densify = map(on_one_line, report.next_commands)
+    with_colmap, with_ours, densify = map(_as_shown, report.next_commands)
     if sys.stdout.isatty():
         # Printed bare, so that they can be copied from any terminal.
         print_text(
@@ -135,7 +154,7 @@ def print_error(message: object) -> None:
 def _print_line(text: str) -> None:
     try:
         # Names of files may hold any character.
-        print(on_one_line(without_secrets(text)), file=sys.stderr, flush=True)
+        print(_as_shown(without_secrets(text)), file=sys.stderr, flush=True)
     except OSError:  # there is nowhere left to say so
         _silence(sys.stderr)
 
