@@ -113,6 +113,8 @@ def test_reports_replace_nothing_but_reports(
     (line,) = capsys.readouterr().err.splitlines()
     assert report in line
     assert contents(work) == before
+    assert main(["info", "--video", "v.mp4", "--report_json", "none/r.json"]) == 2
+    assert "none/r.json: cannot be written" in capsys.readouterr().err
     for status, again in ((2, "none.mp4"), (0, "v.mp4"), (0, "v.mp4")):
         assert main(["info", "--video", again, "--report_json", "r.json", "--quiet"]) == status
 
