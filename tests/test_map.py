@@ -191,6 +191,21 @@ def test_no_model(database: Path, images: Path, tmp_path: Path) -> None:
     Path(log[0]).unlink()
 
 
+def test_two_at_once_into_one_folder(database: Path, images: Path, tmp_path: Path) -> None:
+    """The one that ends first writes its model; the other one says why it cannot."""
+    output, waiting = tmp_path / "model", [True]
+
+    def map_beside(*_: object) -> None:
+        if waiting:
+            waiting.clear()
+            map_database(database, images, output)
+
+    with pytest.raises(ModelError, match="not empty"):
+        map_database(database, images, output, progress=map_beside)
+    assert [p.name for p in tmp_path.iterdir()] == ["model"]
+    assert read_model(output / "0").num_reg_images() == NUM_IMAGES
+
+
 def test_interrupt_leaves_nothing(database: Path, images: Path, tmp_path: Path) -> None:
     def interrupt(stage: str, done: int, total: int | None) -> None:
         if done >= 2:

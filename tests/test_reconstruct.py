@@ -26,6 +26,7 @@ from sequences import model_poses
 from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
+from colmap_av1.cli.reports import reconstruct_rows
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model
@@ -185,6 +186,17 @@ def test_report(made: ReconstructReport, tmp_path: Path) -> None:
     with pycolmap.Database.open(tmp_path / "copy.db") as database:
         assert database.num_images() == made.num_key_images == len(range(0, NUM_IMAGES, 2)) + 1
         assert database.num_verified_image_pairs() > NUM_IMAGES
+
+
+def test_forward_motion_is_reported(made: ReconstructReport) -> None:
+    assert not made.forward_motion
+    assert "motion" not in dict(reconstruct_rows(made))
+    (said,) = (
+        value
+        for name, value in reconstruct_rows(replace(made, forward_motion=True))
+        if name == "motion"
+    )
+    assert "forward" in said
 
 
 def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:

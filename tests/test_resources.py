@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import struct
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import Encode, make_frames
 
 from colmap_av1.errors import ColmapAv1Error, HlocError, ImageError, ModelError, OptionError
 from colmap_av1.geometry.colmap_model import are_whole, read_model
@@ -265,3 +268,24 @@ def test_picture_of_many_pixels(tmp_path: Path, side: int) -> None:
     with pytest.raises(ImageError, match=re.escape(str(path))) as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
+
+
+_WITH_LITTLE_MEMORY = """
+import resource, sys
+from pathlib import Path
+from colmap_av1.cli import main
+assert main(["info", "--video", sys.argv[1]]) == 0
+used = resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (used + (4 << 20), resource.RLIM_INFINITY))
+sys.exit(main(["info", "--video", sys.argv[2]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits address space as Linux does")
+def test_out_of_memory_is_one_line(encode: Encode, clip: Path, tmp_path: Path) -> None:
+    large = encode(make_frames(2, 3840, 2160), tmp_path / "large.mp4")
+    words = [sys.executable, "-c", _WITH_LITTLE_MEMORY, str(clip), str(large)]
+    run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    (line,) = run.stderr.splitlines()
+    assert "out of memory" in line
+    assert run.returncode == 2

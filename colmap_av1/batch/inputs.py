@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import glob
 import os
 import posixpath
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -41,6 +43,7 @@ VIDEO_SUFFIXES = (
     ".y4m",
 )
 _SPECIAL = frozenset("*?[")
+_OF_ROWS = re.compile(rf"{ROWS}(-\d+-of-\d+)?\.")
 _LONGEST_LINE = 1 << 16
 _LONGEST_PART = 240  # Bytes of a file name; file systems allow 255, and suffixes are appended.
 
@@ -113,7 +116,7 @@ def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[
 def _check_name(video: Video) -> None:
     parts = video.name.split("/")
     unfit = {"", ".", ".."} & set(parts) or parts[0] in (HIDDEN, PAGE)
-    unfit = unfit or parts[0].startswith(f"{ROWS}.") or "\n" in video.name
+    unfit = unfit or _OF_ROWS.match(parts[0]) is not None or "\n" in video.name
     if unfit or any(len(os.fsencode(part)) > _LONGEST_PART for part in parts):
         raise OptionError(
             f"{without_secrets(video.address)}: '{video.name}' cannot be the name of its folder: "
@@ -171,8 +174,10 @@ def _of_list(word: str) -> Iterator[tuple[str, str]]:
                     f"{without_secrets(word)}: line {number} is not a path: give a text file "
                     "with one video on each line, or a video with a usual suffix such as .mp4"
                 )
+            mark = codecs.BOM_UTF8 if number == 1 else b""
             # File names need not be valid UTF-8.
-            address, tab, name = os.fsdecode(line.rstrip(b"\r\n")).partition("\t")
+            text = os.fsdecode(line.removeprefix(mark).rstrip(b"\r\n"))
+            address, tab, name = text.partition("\t")
             if not address.strip():
                 continue
             if not is_url(address) and folder and address[0] != "/":

@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,8 @@ class Output:
         """Create the output if it is missing, and lock a shard of the videos.
 
         Raises:
-            OptionError: the output cannot be created, or another batch has locked the shard.
+            OptionError: the output cannot be created, another batch has locked the shard, or one
+                with another number of shards, which has some of the same videos, is at work.
         """
         lock = self._root / HIDDEN / f"{ROWS}{shard}.lock"
         try:
@@ -87,13 +88,21 @@ class Output:
             lock.touch()
         except OSError as error:
             raise OptionError(cannot_write(self._root, error)) from error
-        with only_run(lock) as alone:
-            if not alone:
+        others = [lock.parent / name for name in self._other_locks(lock)]
+        with only_run(lock) as alone, ExitStack() as opened:
+            if not alone or not all([opened.enter_context(only_run(other)) for other in others]):
                 raise OptionError(
                     f"{self._root}: another batch is writing to it: wait until it ends, or give "
                     "another output"
                 )
+            opened.close()
             yield
+
+    def _other_locks(self, lock: Path) -> list[str]:
+        """The locks of runs with another number of shards."""
+        names = os.listdir(lock.parent)
+        number = lock.name.rpartition("-of-")[2]
+        return sorted(n for n in names if n.endswith(".lock") and n.rpartition("-of-")[2] != number)
 
 
 class StoreOutput(Output):

@@ -7,7 +7,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -104,7 +105,7 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
 
 
 def _rows(into: Output, place: str) -> list[Row]:
-    """The rows of all shards."""
+    """The rows of all shards; of a video that runs with other shards had, too, one that is done."""
     try:
         names = batch_files(into)
     except OSError as error:
@@ -113,13 +114,15 @@ def _rows(into: Output, place: str) -> list[Row]:
         ) from error
     if not names:
         raise OptionError(f"{place}: has no {ROWS}.json: give the output of a batch")
-    rows = []
+    rows: dict[str, Row] = {}
     for name in names:
         try:
-            rows += [row_of(facts) for facts in json.loads(into.read(name) or b"")["rows"]]
+            for row in map(row_of, json.loads(into.read(name) or b"")["rows"]):
+                if row.name not in rows or rows[row.name].state == "failed":
+                    rows[row.name] = row
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise OptionError(f"{place}/{name}: damaged: run the batch again") from error
-    return rows
+    return list(rows.values())
 
 
 def _spreads(rows: Sequence[Row]) -> list[Mapping[str, object]]:
@@ -162,8 +165,9 @@ def _number(name: str, value: float) -> str:
 
 def _thumbnail(row: Row, into: Output) -> str | None:
     """The thumbnail of a video in base64; None if there is none."""
-    try:
-        content = into.read(f"{row.name}/{THUMBNAIL}") if row.state == "done" else None
-    except OSError:  # The page is useful without it.
-        content = None
+    name, content = PurePosixPath(row.name), None
+    if row.state != "done" or name.is_absolute() or ".." in name.parts:
+        return None
+    with suppress(OSError, ValueError):  # The page is useful without it.
+        content = into.read(f"{name}/{THUMBNAIL}")
     return base64.b64encode(content).decode() if content else None

@@ -83,6 +83,10 @@ def row_of(facts: object) -> Row:
         ValueError: it is not a row.
     """
     try:
-        return cattrs.structure(facts, Row)
+        row = cattrs.structure(facts, Row)
+        for value in vars(row).values():
+            if isinstance(value, int):
+                float(value)  # which fails for numbers that no page can show
+        return row
     except (cattrs.BaseValidationError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"not a row: {error}") from error

@@ -132,6 +132,7 @@ def run_batch(
         into = output_at(place)
         opened.enter_context(into.opened(shard))
         _refuse_another_task(into, place, work.task)
+        _refuse_files_of_others(into, place, shard)
         _check_scratch(work.scratch)
         everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
         videos = everything[number - 1 :: count]
@@ -216,6 +217,27 @@ def _refuse_another_task(output: Output, place: str, task: str) -> None:
             raise OptionError(
                 f"{without_secrets(place)}: has a batch of the task {earlier}: give another output"
             )
+
+
+def _refuse_files_of_others(output: Output, place: str, shard: str) -> None:
+    """Refuse an output in which other files have the names of the rows.
+
+    Raises:
+        OptionError: so it is.
+    """
+    table = output.read(f"{ROWS}{shard}.csv")
+    is_ours = not table or table.startswith(csv_of([]).rstrip())
+    facts = output.read(f"{ROWS}{shard}.json")
+    if facts is not None and not (table and is_ours):  # beside our table it may be damaged
+        found: object = None
+        with suppress(ValueError, RecursionError):
+            found = json.loads(facts)
+        is_ours = isinstance(found, dict) and {"task", "rows"} <= found.keys()
+    if not is_ours:
+        raise OptionError(
+            f"{without_secrets(place)}: has a {ROWS}{shard}.csv or .json that was not created by a "
+            "batch: give another output"
+        )
 
 
 def _check_scratch(scratch: str) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
-from colmap_av1.cli.terminal import print_note
+from colmap_av1.cli.terminal import print_note, show_as
 from colmap_av1.errors import OptionError
 from colmap_av1.options import BatchOptions
 from colmap_av1.util.remote import absolute, fetch, is_url, without_secrets
@@ -60,4 +60,6 @@ def _fetched(url: str, folder: Path, quiet: bool) -> str:
     except OptionError as error:
         raise OptionError(f"{error}; or download it first, and give its path") from error
     name = PurePosixPath(unquote(urlsplit(url).path)).name
-    return str(copy.rename(folder / name) if name else copy)
+    path = str(copy.rename(folder / name) if name else copy)
+    show_as(path, without_secrets(url))
+    return path

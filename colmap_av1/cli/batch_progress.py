@@ -13,7 +13,8 @@ from rich.text import Text
 
 from colmap_av1.batch.rows import Row
 from colmap_av1.batch.run import Counts, Watch
-from colmap_av1.cli.terminal import PROGRAM, print_warning
+from colmap_av1.cli.terminal import PROGRAM, print_note, print_warning
+from colmap_av1.util.texts import on_one_line
 
 _LINE_EVERY = 30.0  # seconds
 # Largest number of failures that are printed; batch.csv lists all.
@@ -37,7 +38,11 @@ def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task("videos", total=None, rate="", failed="")
-        failures = _Failures(lambda text: progress.console.print(Text(f"{PROGRAM}: {text}")))
+
+        def show(text: str) -> None:
+            progress.console.print(Text(on_one_line(f"{PROGRAM}: {text}")))
+
+        failures = _Failures(show)
 
         def watch(counts: Counts, row: Row | None) -> None:
             failures.show(row)
@@ -67,7 +72,7 @@ class _Failures:
         if self._num_shown > _MOST_LINES:
             self._show("warning: further failures are in batch.csv")
             return
-        self._show(f"warning: {row.name}: {row.reason}: {row.error}".replace("\n", "\\n"))
+        self._show(f"warning: {row.name}: {row.reason}: {row.error}")
 
 
 class _Lines:
@@ -80,7 +85,7 @@ class _Lines:
 
     def hear(self, about: str) -> None:
         if not self._quiet:
-            print(f"{PROGRAM}: {about}", file=sys.stderr)
+            print_note(about)
 
     def watch(self, counts: Counts, row: Row | None) -> None:
         self._failures.show(row)
@@ -94,7 +99,7 @@ class _Lines:
             minutes = (counts.total - counts.ended) / rate / 60
             words += f", {rate:.2g} per second, {minutes:.0f} minutes left"
         failed = _failed(counts)
-        print(f"{PROGRAM}: {words}{failed and f', {failed}'}", file=sys.stderr)
+        print_note(f"{words}{failed and f', {failed}'}")
 
 
 def _failed(counts: Counts) -> str:

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 from colmap_av1.cli.terminal import print_error, print_text
 
 BAD_INPUT = 2
+_PATH = "PATH"
 # The negative numbers that argparse does not take for options.
 _NUMBER = re.compile(r"-\d+|-\d*\.\d+")
 
@@ -58,6 +59,13 @@ class Parser(argparse.ArgumentParser):
                 near = difflib.get_close_matches(name, known, n=1)
                 meant = f": did you mean {near[0]}?" if near else ""
                 self.error(f"there is no option {name}{meant}")
+
+    def refuse_empty(self, namespace: argparse.Namespace) -> None:
+        """Exit if a path is empty, as of a variable that is not set: it would be this folder."""
+        for action in self._actions:
+            value = getattr(namespace, action.dest, None) if action.metavar == _PATH else None
+            if "" in (value if isinstance(value, list) else [value]):
+                self.error(f"{action.option_strings[0]} is empty: give a path")
 
 
 def _like_an_option(word: str) -> bool:

@@ -69,6 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         print_error(f"{where}{_reason(error)}: fix that, or give another path")
         return BAD_INPUT
+    except (MemoryError, ImportError) as error:
+        # Libraries that do not fit are not imported.
+        if isinstance(error, ImportError) and "failed to map segment" not in str(error):
+            raise
+        print_error("out of memory: free some, or allow this process more")
+        return BAD_INPUT
     except KeyboardInterrupt:
         print_note("interrupted")
         return _INTERRUPTED
@@ -107,6 +113,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     namespace, others = parser.parse_known_args(words)
     if others:
         commands[name].error(f"unrecognized arguments: {' '.join(others)}")
+    commands[name].refuse_empty(namespace)
     return namespace
 
 

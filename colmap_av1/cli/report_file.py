@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from colmap_av1.cli.terminal import renamed
+from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.plain import plain
@@ -34,20 +37,46 @@ def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
 
 @contextmanager
 def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
-    """Write the reason if the body fails, if requested."""
+    """Write the reason if the body fails, if requested.
+
+    Raises:
+        OptionError: the file for the report exists and is not a report.
+    """
+    path = getattr(namespace, "report_json", None)
+    if path is not None:
+        _check_report(Path(path))
     try:
         yield
     except Exception as error:
-        path = getattr(namespace, "report_json", None)
         if path is not None:
             from colmap_av1.util.failures import failure_of
 
             failure = dataclasses.asdict(failure_of(error))
-            with suppress(OSError):  # the error itself is reported in any case
+            with suppress(OptionError):  # the error itself is reported in any case
                 _write(path, {"failure": failure, "cpu_seconds": cpu_seconds()})
         raise
 
 
+def _check_report(path: Path) -> None:
+    """Refuse to replace a file that is not a report.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if not os.path.lexists(path):
+        return
+    found: object = None
+    if path.is_file():
+        with suppress(OSError, ValueError, RecursionError), path.open("rb") as file:
+            start = file.read(1)
+            found = json.loads(start + file.read()) if start == b"{" else None
+    if not (isinstance(found, dict) and "cpu_seconds" in found):
+        raise OptionError(f"{path}: exists and is not a report: give another file")
+
+
 def _write(path: str, facts: dict[str, Any]) -> None:
-    with whole_file(Path(path)) as partial:
-        partial.write_text(json.dumps(plain(facts), indent=1, allow_nan=False) + "\n")
+    try:
+        with whole_file(Path(path)) as partial:
+            partial.write_text(json.dumps(plain(facts, renamed), indent=1, allow_nan=False) + "\n")
+    except OSError as error:
+        raise OptionError(cannot_write(Path(path), error)) from error

@@ -122,6 +122,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("key images", str(report.num_key_images)),
         ("tracks", f"{report.num_tracks}, {report.num_pose_tracks} for the poses"),
         ("mapper", report.mapper),
+        *_motion_row(report.forward_motion),
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
@@ -135,6 +136,11 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
     if report.resumed:
         rows.append(("resumed stages", ", ".join(report.resumed)))
     return [*rows, *_seconds_rows(report.seconds)]
+
+
+def _motion_row(is_forward: bool) -> Rows:
+    """Motion along the camera's axis, which leaves the focal length uncertain."""
+    return [("motion", "forward: give known intrinsics by --camera_params")] if is_forward else []
 
 
 def _shutter_row(read_outs: Sequence[float | None]) -> Rows:

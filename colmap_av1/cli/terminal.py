@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_av1.cli.reports import Rows
 from colmap_av1.util.remote import without_secrets
+from colmap_av1.util.texts import on_one_line
 
 if TYPE_CHECKING:
     from colmap_av1.match import MatchReport
@@ -21,9 +22,28 @@ if TYPE_CHECKING:
 
 PROGRAM = "colmap-av1"
 
+# Paths of files that exist while a command runs, and the names that replace them in texts.
+_NAMES: dict[str, str] = {}
+
 
 class StreamError(Exception):
     """Standard output cannot be written; the cause is the system's error."""
+
+
+def show_as(path: str, name: str) -> None:
+    """Replace a path by a name in all texts from now on, also after the file is gone."""
+    _NAMES[path] = name
+
+
+def renamed(text: str) -> str:
+    """The text with the names of `show_as`."""
+    for path, name in _NAMES.items():
+        text = text.replace(path, name)
+    return text
+
+
+def _as_shown(text: str) -> str:
+    return on_one_line(renamed(text))
 
 
 @contextmanager
@@ -58,6 +78,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 def print_summary(rows: Rows) -> None:
     """Print rows as a table on a terminal, and otherwise as lines of name, tab and value."""
+    rows = [(_as_shown(name), _as_shown(value)) for name, value in rows]
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
@@ -82,7 +103,7 @@ def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ())
 
 def print_next(report: MatchReport) -> None:
     """Print the commands that map what `match` wrote."""
-    with_colmap, with_ours, densify = report.next_commands
+    with_colmap, with_ours, densify = map(_as_shown, report.next_commands)
     if sys.stdout.isatty():
         # Printed without markup, so that they can be copied from any terminal.
         print_text(
@@ -132,8 +153,8 @@ def print_error(message: object) -> None:
 
 def _print_line(text: str) -> None:
     try:
-        # File names may contain line breaks.
-        print(without_secrets(text).replace("\n", "\\n"), file=sys.stderr, flush=True)
+        # File names may contain any character.
+        print(_as_shown(without_secrets(text)), file=sys.stderr, flush=True)
     except OSError:  # nowhere left to report it
         _silence(sys.stderr)
 

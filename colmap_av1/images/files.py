@@ -31,6 +31,7 @@ from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.spread import evenly_spread
+from colmap_av1.video.container import check_memory
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
@@ -446,6 +447,7 @@ def image_size(path: Path) -> tuple[int, int]:
     except PermissionError as error:
         raise ImageError(f"{path}: no permission to read it: change that") from error
     except (av.error.FFmpegError, OSError, ValueError) as error:
+        check_memory(error)
         raise ImageError(f"{path}: is not a readable image: remove it") from error
     if size == (0, 0):
         raise ImageError(f"{path}: is not a readable image: remove it")

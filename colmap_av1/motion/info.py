@@ -15,7 +15,7 @@ import numpy as np
 
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
-from colmap_av1.motion.reading import count_shown_pictures, read_motion
+from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
@@ -28,7 +28,9 @@ _KEY_FRAME, _INTRA_ONLY_FRAME = 0, 2
 _MIN_INTER_SHARE = 0.35
 _MIN_BITS_PER_PIXEL = 0.03
 _MIN_KEY_FRAME_DISTANCE = 12
-_MIN_MOTION = 0.1
+# The picture hardly moves if it moves by less than this in nearly all frames. Half of the frames
+# repeat the one before if a higher frame rate was made from a lower one.
+_MIN_MOTION, _NEARLY_ALL = 0.1, 0.9
 # Tracks break where the picture moves faster than this share of its longer side per frame, as at a
 # fast turn. Walks with such turns have more than this share of such frames, other clips none.
 _FAST_MOTION, _MAX_FAST_SHARE = 0.08, 0.05
@@ -110,7 +112,9 @@ def inspect(
     structure = counts.structure
     if structure.num_shown > 0:
         # Frames that are shown again are not coded frames, and a stream may end with them.
-        structure.num_shown = max(structure.num_shown, count_shown_pictures(video, options))
+        structure.num_shown = count_with_repeats(
+            first_showings(video, options), structure.num_shown
+        )
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frames: give another video")
     # The bitstream is read first because only its parser limits the frame size.
@@ -128,7 +132,7 @@ def inspect(
     fast = _FAST_MOTION * max(width, height)
     fast_share = float(np.mean(np.array(counts.motion) > fast)) if counts.motion else 0.0
     reasons = list(structure.reasons(bits_per_pixel))
-    if median_motion < _MIN_MOTION:
+    if counts.motion and np.quantile(counts.motion, _NEARLY_ALL) < _MIN_MOTION:
         reasons.append(
             f"the picture moves by {median_motion:.2f} px per frame: the camera hardly moves, "
             "there is no parallax"

@@ -110,13 +110,31 @@ def read_motion(
         )
 
 
-def count_shown_pictures(video: str | PathLike[str], options: ReadOptions) -> int:
-    """Number of pictures that the bitstream shows up to the first damage, repeated ones included.
+def first_showings(video: str | PathLike[str], options: ReadOptions) -> NDArray[np.int32]:
+    """For each picture that the headers of a stream show, the display index of its first showing.
+
+    A stream may show a picture several times. Such pictures are not among those of `read_motion`.
+
+    Returns:
+        int32 [num_shown], up to the first damage of the headers.
 
     Raises:
         LimitError, OptionError, VideoError: as `read_motion`.
     """
-    return len(_read_index(video, options).shown)
+    shown = np.array(_read_index(video, options).shown, dtype=np.int64)
+    _, first, number = np.unique(shown, return_index=True, return_inverse=True)
+    return first[number].astype(np.int32)
+
+
+def count_with_repeats(first: NDArray[np.int32], num_shown: int) -> int:
+    """Number of shown frames if those that repeat earlier ones at the end count, too.
+
+    Args:
+        first: see `first_showings`.
+        num_shown: number of frames up to the last one that `read_motion` has read.
+    """
+    new = np.flatnonzero(first[num_shown:] >= num_shown)
+    return num_shown + int(new[0]) if len(new) else max(num_shown, len(first))
 
 
 def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:

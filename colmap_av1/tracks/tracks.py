@@ -191,6 +191,40 @@ class Tracks:
         so_far = np.concatenate([[0], np.cumsum(counted[self.frame])])
         return self.keep_tracks(np.diff(so_far[self.offsets]) >= min_frames)
 
+    def with_repeats(self, first: NDArray[np.int32]) -> Tracks:
+        """Observe pictures that are shown again as at their first showing.
+
+        Args:
+            first: int32 [n] for each frame the frame that first shows its picture; n is at least
+                `num_frames`.
+
+        Returns:
+            Tracks in the same order; the same object if no picture is shown again.
+        """
+        repeats = np.flatnonzero(first != np.arange(len(first)))
+        if len(repeats) == 0:
+            return self
+        # The observations of each frame, and how often they are repeated.
+        order = self.order_by_frame()
+        starts = np.searchsorted(self.frame[order], first[repeats], side="left")
+        ends = np.searchsorted(self.frame[order], first[repeats], side="right")
+        copies = [order[start:end] for start, end in zip(starts, ends, strict=True)]
+        source = np.concatenate([np.arange(self.num_observations), *copies])
+        added = np.repeat(repeats, [len(copy) for copy in copies])
+        frame = np.concatenate([self.frame, added.astype(np.int32)])
+        track = self.track[source]
+        place = np.lexsort([frame, track])
+        lengths = np.bincount(track, minlength=self.num_tracks)
+        return replace(
+            self,
+            num_frames=len(first),
+            offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            frame=frame[place],
+            xy=self.xy[source[place]],
+            sigma=self.sigma[source[place]],
+            confirmed=self.confirmed[source[place]],
+        )
+
     def every_nth(self, n: int) -> Tracks:
         """Keep every n-th track, beginning with the first."""
         return self.keep_tracks(np.arange(self.num_tracks) % n == 0)

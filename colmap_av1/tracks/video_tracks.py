@@ -20,7 +20,7 @@ from colmap_av1.errors import (
 )
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, inspect
-from colmap_av1.motion.reading import read_motion
+from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import (
     EncodeOptions,
     MatchOptions,
@@ -239,7 +239,15 @@ def track_video(
         with clock.measure("tracks"):
             presented = source.pictures.presented
             stored = frames if frames is None or presented is None else presented[frames]
-            tracks = build_tracks(motion, options.tracks, count, frames=stored)
+            first = first_showings(source.stream, options.read)
+            coded = None
+            if stored is not None:
+                coded = np.unique(first[stored[stored < len(first)]])
+            tracks = build_tracks(motion, options.tracks, count, frames=coded)
+            first = first[: count_with_repeats(first, tracks.num_frames)]
+            tracks = tracks.with_repeats(first)
+            if stored is not None:  # the first showing of a frame may not be among the frames
+                tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
             num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
             tracks = remove_overlays(tracks)
             overlay_share = 1 - len(tracks.offsets) / num_tracks
@@ -266,7 +274,7 @@ def track_video(
     # The size of the whole file is an upper bound of the rate, so a low rate is truly low.
     bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels
     notes += _notes(source, overlay_share, structure.reasons(bits_per_pixel))
-    inter_share = _inter_share(structure, num_frames, presented)
+    inter_share = _inter_share(structure, first, presented)
     return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
 
 
@@ -290,10 +298,15 @@ def _notes(source: VideoSource, overlay_share: float, reasons: Sequence[str]) ->
 
 
 def _inter_share(
-    structure: Structure, num_frames: int, presented: NDArray[np.int32] | None
+    structure: Structure, first: NDArray[np.int32], presented: NDArray[np.int32] | None
 ) -> NDArray[np.float32]:
-    """Share of inter units in each frame that players show, see `TrackedVideo`."""
-    share = np.array([structure.inter_share_of.get(i, 0.0) for i in range(num_frames)], np.float32)
+    """Share of inter units in each frame that players show, see `TrackedVideo`.
+
+    A picture that is shown again has the share of its first showing, or 1 if that has no motion.
+    """
+    num_frames = len(first)
+    share = np.array([structure.inter_share_of.get(i, 0.0) for i in first.tolist()], np.float32)
+    share[(share == 0) & (first != np.arange(num_frames))] = 1
     if presented is None:
         return share
     presented = presented[presented < num_frames]

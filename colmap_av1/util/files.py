@@ -116,11 +116,14 @@ def whole_file(path: Path) -> Iterator[Path]:
         The hidden path to write to.
 
     Raises:
-        OSError: the file cannot be created or renamed.
+        OSError: the file cannot be created or renamed, or another program wrote it meanwhile.
     """
+    before = _version(path)
     with _held(path, lambda partial: partial.touch(exist_ok=False), os.O_RDWR) as partial:
         try:
             yield partial
+            if _version(path) != before:
+                raise OSError(errno.EEXIST, "another program wrote it meanwhile", str(path))
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -350,6 +353,15 @@ def may_read(path: Path) -> bool:
     except OSError:
         return True
     return True
+
+
+def _version(path: Path) -> tuple[int, ...] | None:
+    """What changes when a file is replaced or written to; None if there is none."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _is_folder(path: Path) -> bool:

@@ -23,6 +23,7 @@ _BLOCK = 1 << 22
 # Keys of the tag or time of a version of an object: S3 and Azure, HTTP, Google.
 _TAGS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "updated")
 EXTRA = "colmap-av1[remote]"
+_MISSING = (404, 410)  # HTTP status codes
 
 
 def without_secrets(text: str) -> str:
@@ -179,11 +180,25 @@ def _as_os_error(error: BaseException, address: str) -> BaseException:
     if isinstance(error, ColmapAv1Error) or not isinstance(error, Exception):
         return error
     if isinstance(error, FileNotFoundError):
-        return _missing(address)
+        reason = _other_reason(error)
+        if reason is None:
+            return _missing(address)
+        return OSError(errno.EIO, without_secrets(reason), without_secrets(address))
     if isinstance(error, OSError) and error.errno is not None:
         return error
     reason = next(iter(str(error).splitlines()), "") or type(error).__name__
     return OSError(errno.EIO, without_secrets(reason), without_secrets(address))
+
+
+def _other_reason(error: FileNotFoundError) -> str | None:
+    """Why a file was not found, if a server did not say that it is missing.
+
+    fsspec raises this error for every answer of a web server but success, and if there is none.
+    """
+    status = getattr(error.__cause__, "status", None)
+    if isinstance(status, int):
+        return None if status in _MISSING else f"the server answers with HTTP status {status}"
+    return str(error.__cause__) if isinstance(error.__cause__, OSError) else None
 
 
 def _missing(address: str) -> VideoError:

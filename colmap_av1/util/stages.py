@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -201,7 +201,9 @@ def _finished(record: Path, key: str, into: Path, kind: type[_Result]) -> Kept[_
         return None
     if not all(is_as_recorded(into / name, file) for name, file in body["files"].items()):
         return None
-    return _kept(body, kind, resumed=True)
+    with suppress(cattrs.BaseValidationError, TypeError, ValueError, KeyError):
+        return _kept(body, kind, resumed=True)
+    return None
 
 
 def _read_record(record: Path) -> dict[str, Any] | None:
@@ -212,7 +214,22 @@ def _read_record(record: Path) -> dict[str, Any] | None:
         return None
     if not isinstance(body, dict) or body.pop("digest", None) != _json_digest(body):
         return None
-    return body
+    return body if _is_record(body) else None
+
+
+def _is_record(body: dict[str, Any]) -> bool:
+    """Whether a record has the parts of one; a manipulated record may have others."""
+    files = body.get("files")
+    return (
+        {"key", "result"} <= body.keys()
+        and isinstance(files, dict)
+        and not any("\0" in name for name in files)
+        and all(file is None or _is_file_record(file) for file in files.values())
+    )
+
+
+def _is_file_record(file: object) -> bool:
+    return isinstance(file, dict) and file.keys() == {"bytes", "times", "digest"}
 
 
 def _write_record(record: Path, body: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import os
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -15,12 +16,29 @@ _LARGEST = 1 << 28
 _MOST_SHOWN = 40
 # Number of names that a message shows.
 _MOST_NAMED = 4
+# Unicode's categories of characters that control a terminal or end a line, and the characters that
+# change the direction of text.
+_CONTROLS = ("Cc", "Zl", "Zp")
+_DIRECTIONS = frozenset("\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def shown(text: str, most: int = _MOST_SHOWN) -> str:
     """The start of a text for a message, without characters that control a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:most])
+
+
+def on_one_line(text: str) -> str:
+    """The text for a terminal: line ends, tabs and other control characters become escapes."""
+    return "".join(_escaped(c) if _is_control(c) else c for c in text)
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in _CONTROLS or character in _DIRECTIONS
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode()
 
 
 def some_names(names: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +25,7 @@ from colmap_av1.video.unchanged import FileState, file_state
 
 # Edit lists drop or hide samples that a later frame may reference, so all samples are read.
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
+_SPARE_MEMORY = 1 << 26  # bytes
 _IVF_FRAME_HEADER_SIZE = 12
 _IVF_RATE_OFFSET = 16  # frame rate and time scale, 32 bits each
 _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
@@ -204,6 +205,7 @@ class VideoStream:
             try:
                 packet = next(demuxed, None)
             except (av.error.FFmpegError, OSError) as error:
+                check_memory(error)
                 raise BitstreamError(
                     f"{self.file}: damaged after packet {index}: {reason_of(error)}"
                 ) from error
@@ -378,6 +380,7 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
     except (PermissionError, av.error.FFmpegError, OSError, ValueError) as error:
         if file is not None:
             file.close()
+        check_memory(error)
         if isinstance(error, PermissionError):
             raise VideoError(
                 f"{path}: no permission to read it: change its permissions or give another file"
@@ -392,6 +395,27 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
         container.close()
         if file is not None:
             file.close()
+
+
+def check_memory(error: BaseException) -> None:
+    """Check that an error of FFmpeg is not for a lack of memory.
+
+    FFmpeg gives the same error for a packet of an impossible size.
+
+    Raises:
+        MemoryError: little memory is left.
+    """
+    if isinstance(error, MemoryError):
+        bytearray(_SPARE_MEMORY)
+
+
+@contextmanager
+def until_damage() -> Iterator[None]:
+    """End the body without an error where a file is damaged."""
+    try:
+        yield
+    except (av.error.FFmpegError, OSError) as error:
+        check_memory(error)
 
 
 def _find_av1_stream(container: Any, path: Path) -> Any:
@@ -484,7 +508,7 @@ def _measured_length(path: Path, index: int, step: Fraction) -> tuple[int, float
         step: seconds from one picture to the next.
     """
     times: list[Fraction] = []
-    with open_container(path) as container, suppress(av.error.FFmpegError, OSError):
+    with open_container(path) as container, until_damage():
         for packet in container.demux(container.streams[index]):
             if packet.size and packet.pts is not None:
                 times.append(packet.pts * packet.time_base)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import subprocess
@@ -47,6 +48,8 @@ from colmap_av1.video.unchanged import unchanged
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
 # Begins the comment tag that records the source and settings of a stream, by which a kept stream
 # is recognized.
+# Bytes at the start, in the middle and at the end of a video that identify it.
+_SAMPLE = 1 << 16
 _MARK = "colmap-av1"
 # Containers that store the tag.
 _KEPT_FORMATS = (".mp4", ".mkv", ".webm")
@@ -143,7 +146,7 @@ def encode(
         *copied,
     ]
     # fmt: on
-    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _size(path)}
+    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _source(path)}
     if scaling(options):
         mark["downscale"] = float(options.downscale or 1)
 
@@ -186,7 +189,7 @@ def stream_of(
     """The AV1 stream of a video in another codec: the stream kept by an earlier run, or a new one.
 
     A kept stream is reused if it is complete, newer than the video, and made from a file of the
-    same size with the settings that `options` ask for.
+    same size and content with the settings that `options` ask for.
 
     Args:
         video: a video that ffmpeg decodes.
@@ -352,8 +355,18 @@ def _count_packets(stream: Path) -> int:
         return 0
 
 
-def _size(video: Path) -> int:
-    return video.stat().st_size
+def _source(video: Path) -> str:
+    """Identifies the content of a video: its size and a digest of parts of it.
+
+    Videos without compression often have the same size.
+    """
+    size = video.stat().st_size
+    digest = hashlib.sha256()
+    with video.open("rb") as file:
+        for start in (0, size // 2, size - _SAMPLE):
+            file.seek(max(0, start))
+            digest.update(file.read(_SAMPLE))
+    return f"{size}:{digest.hexdigest()[:16]}"
 
 
 def _mark(facts: Mapping[str, object]) -> str:
@@ -375,7 +388,7 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
 
 def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
     """Whether a kept stream was made from the video with these options."""
-    if mark.get("encoder") not in ENCODERS or mark.get("source") != str(_size(video)):
+    if mark.get("encoder") not in ENCODERS or mark.get("source") != _source(video):
         return False
     encoder = None if options.encoder == "auto" else options.encoder
     speed = options.speed

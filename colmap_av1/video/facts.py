@@ -25,6 +25,7 @@ from colmap_av1.video.container import (
     find_video_stream,
     open_container,
     open_stream,
+    until_damage,
 )
 from colmap_av1.video.display import Display, shown_size, turn_of_matrix
 from colmap_av1.video.metadata.spherical import projection_of
@@ -155,7 +156,7 @@ def _presented_frames(path: Path, num_entries: int) -> NDArray[np.int32] | None:
         return None
     # Packets come in coding order, which can differ from the order of the pictures.
     packets: list[tuple[int, bool]] = []
-    with open_container(path) as container, contextlib.suppress(av.error.FFmpegError, OSError):
+    with open_container(path) as container, until_damage():
         demuxed = container.demux(find_video_stream(container, path))
         for number, packet in enumerate(p for p in demuxed if p.size):
             time = packet.pts if packet.pts is not None else number
@@ -198,7 +199,7 @@ def picture_times(video: Video) -> NDArray[np.float64] | None:
     times: list[float] = []
     with (
         open_container(video.path) as container,
-        contextlib.suppress(av.error.FFmpegError, OSError),
+        until_damage(),
     ):
         for packet in container.demux(container.streams[video.index]):
             if packet.size and packet.pts is None:
@@ -218,7 +219,7 @@ def with_counted_packets(file: _File) -> _File:
     if file.num_packets is not None:
         return file
     count = 0
-    with open_container(file.path) as container, contextlib.suppress(av.error.FFmpegError, OSError):
+    with open_container(file.path) as container, until_damage():
         for packet in container.demux(find_video_stream(container, file.path)):
             count += packet.size > 0
     return dataclasses.replace(file, num_packets=count)

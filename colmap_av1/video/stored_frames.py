@@ -14,6 +14,7 @@ import av.logging
 from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.video.container import (
     ENCRYPTED,
+    check_memory,
     find_decodable_stream,
     is_encrypted,
     open_container,
@@ -84,11 +85,13 @@ def decode_stream(
             has_packet = True
             yield from context.decode(packet)
     except (av.error.FFmpegError, OSError) as error:
+        check_memory(error)
         damage = error
     # The decoder delays frames; those before the damage are still valid.
     try:
         yield from context.decode(None)
     except (av.error.FFmpegError, OSError) as error:
+        check_memory(error)
         damage = damage or error
     if damage is not None:
         raise BitstreamError(f"{path}: cannot be decoded further: {reason_of(damage)}") from damage

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
+from colmap_av1.video.container import check_memory
 
 Image = NDArray[np.uint8]
 # Fixed, because x264's output depends on the number of threads.
@@ -147,4 +148,5 @@ def _output(path: Path) -> Iterator[Path]:
         with whole_file(path) as partial:
             yield partial
     except (OSError, av.error.FFmpegError) as error:
+        check_memory(error)
         raise OptionError(cannot_write(path, error)) from error

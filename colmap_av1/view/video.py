@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
-from colmap_av1.motion.reading import read_motion
+from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.tracks.tracks import Tracks, build_tracks
 from colmap_av1.util.files import check_new_file
@@ -100,6 +100,8 @@ def view_video(
         chained = build_tracks(
             read_motion(video, read), tracks, lambda done: report("tracks", done, total)
         )
+        first = first_showings(video, read if read is not None else ReadOptions())
+        chained = chained.with_repeats(first[: count_with_repeats(first, chained.num_frames)])
         # The motion was read first: its reader limits the frame size, and the decoder does not.
         opened = read_video(video, operating_point)
         chained = chained.as_displayed(opened.display, opened.presented)

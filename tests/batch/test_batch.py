@@ -142,6 +142,40 @@ def test_another_task_in_one_output_is_refused(clips: Path, tmp_path: Path) -> N
     assert files_of(out) == before
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("batch.csv", "my,table"),
+        ("batch.json", '{"my": "notes"}'),
+        ("batch.json", "my notes"),
+        ("batch-1-of-1.csv", "my,table"),
+    ],
+)
+def test_files_of_others_with_the_names_of_rows_stay(
+    name: str, content: str, clips: Path, tmp_path: Path
+) -> None:
+    video, options = clips / "a" / "clip0.mp4", ONCE
+    if "-of-" in name:
+        options = BatchOptions(retries=0, shard="1/1")
+    (tmp_path / name).write_text(content)
+    with pytest.raises(OptionError, match="not created by a batch"):
+        run_batch(video, tmp_path, ReadOptions(), options=options)
+    assert (tmp_path / name).read_text() == content
+    assert not (tmp_path / "clip0").exists()
+
+
+def test_damaged_rows_are_written_anew(clips: Path, tmp_path: Path) -> None:
+    video = clips / "a" / "clip0.mp4"
+    run_batch(video, tmp_path, ReadOptions(), options=ONCE)
+    rows = rows_of(tmp_path)
+    (tmp_path / "batch.json").write_text('{"task": "in')
+    assert run_batch(video, tmp_path, ReadOptions(), options=ONCE).num_kept == 1
+    (tmp_path / "batch.csv").write_text("")
+    assert run_batch(video, tmp_path, ReadOptions(), options=ONCE).num_kept == 1
+    assert rows_of(tmp_path) == rows
+    write_page(tmp_path)
+
+
 def test_what_was_stopped_while_it_was_written(clips: Path, tmp_path: Path) -> None:
     """Files that an interrupted run had put into the folder of a video are replaced."""
     out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
@@ -216,18 +250,27 @@ def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["batch", "--task", "info", "--output", out]) == 2
 
 
-def test_one_batch_at_a_time(clips: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(
+    ("shard", "refused"), [(None, [None, "1/2"]), ("1/2", [None, "1/2", "1/3", "3/3"])]
+)
+def test_one_batch_at_a_time(
+    shard: str | None, refused: list[str | None], clips: Path, tmp_path: Path
+) -> None:
+    out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
     tried = []
 
-    def try_another(counts: Counts, _: object) -> None:
+    def try_others(counts: Counts, _: object) -> None:
         if counts.ended == 1:
-            with pytest.raises(OptionError, match="another batch"):
-                run_batch(clips, out, ReadOptions())
-            tried.append(True)
+            for other in refused:
+                with pytest.raises(OptionError, match="another batch"):
+                    run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))
+                tried.append(other)
 
-    run_batch(clips / "a" / "clip0.mp4", out, ReadOptions(), options=ONCE, watch=try_another)
-    assert tried == [True]
+    options = BatchOptions(retries=0, shard=shard)
+    run_batch(video, out, ReadOptions(), options=options, watch=try_others)
+    assert tried == refused
+    for other in refused:
+        run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))
 
 
 def test_a_video_without_a_model(clips: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import os
+import tarfile
 import threading
 import time
 from collections.abc import Iterator
@@ -48,6 +49,12 @@ def test_lists(folder: Path) -> None:
     assert found[4] == Video("g", "s3://bucket/dir/g.mkv")
 
 
+def test_a_list_with_a_mark_of_byte_order(folder: Path) -> None:
+    videos = folder.parent / "videos.txt"
+    videos.write_text("videos/b.mp4\nvideos/a.webm\n", encoding="utf-8-sig")
+    assert names(videos) == ["videos/b", "videos/a"]
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -56,6 +63,7 @@ def test_lists(folder: Path) -> None:
         ("empty", "no video"),
         ("none.mp4", "no such file"),
         ("binary", "line 1"),
+        ("videos.tar", "line 1"),
         ("gopher9://x/y.mp4", "gopher9"),
     ],
 )
@@ -63,6 +71,8 @@ def test_no_videos(given: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "empty.txt").write_text("\n\n")
     (tmp_path / "empty").mkdir()
     (tmp_path / "binary").write_bytes(bytes(100))
+    with tarfile.open(tmp_path / "videos.tar", "w") as archive:
+        archive.add(tmp_path / "empty.txt", "a.mp4")
     with pytest.raises(OptionError, match=message):
         names(given if "://" in given else tmp_path / given)
 
@@ -82,6 +92,7 @@ def test_an_output_among_the_inputs(folder: Path) -> None:
         ("x.mp4\t/x", "name"),
         ("x.mp4\t.batch/x", "name"),
         ("batch.json.mp4", "name"),
+        ("x.mp4\tbatch-1-of-2.csv", "name"),
     ],
 )
 def test_names_that_clash(lines: str, message: str, tmp_path: Path) -> None:
@@ -99,8 +110,8 @@ def test_bad_shards(shard: str) -> None:
 
 class _Hangs(http.server.BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
-        if self.path == "/none.mp4":
-            self.send_error(404)
+        if self.path != "/hangs.mp4":
+            self.send_error(int(self.path[1:4]))
             return
         self.send_response(200)
         self.send_header("Content-Length", "1000")
@@ -130,10 +141,25 @@ def server() -> Iterator[str]:
 def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
-    videos.write_text(f"{server}/hangs.mp4\n{server}/none.mp4\n")
+    videos.write_text(f"{server}/hangs.mp4\n{server}/404.mp4\n")
     options = BatchOptions(stall=2, retries=0)
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()
     assert "2 seconds" in text
     assert "no such file" in text
+
+
+def test_a_server_that_is_out_of_order_has_not_lost_the_file(server: str, tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    videos = tmp_path / "list"
+    addresses = [f"{server}/503.mp4", f"{server}/403.mp4?sig=SECRET", "http://127.0.0.1:1/x.mp4"]
+    videos.write_text("\n".join(addresses))
+    report = run_batch(videos, tmp_path / "out", ReadOptions(), options=BatchOptions(retries=1))
+    assert report.failed == {"reading or writing": 3}
+    assert report.num_retried == 3
+    text = (tmp_path / "out" / "batch.csv").read_text()
+    for word in ("503", "403", "connect"):
+        assert word in text
+    assert "SECRET" not in text
+    assert "no such file" not in text

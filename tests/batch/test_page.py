@@ -98,6 +98,15 @@ def test_a_page(tmp_path: Path) -> None:
     assert page.keys[-1][points] == "5000"  # what is sorted by
 
 
+def test_a_video_in_the_rows_of_several_runs_counts_once(tmp_path: Path) -> None:
+    """The first run was one of two shards, the second one has all videos."""
+    write_rows(tmp_path, [Row("a", "/a", "done"), Row("b", "/b", "failed")], "batch-1-of-2.json")
+    write_rows(tmp_path, [Row(n, f"/{n}", "done") for n in "abc"])
+    write_page(tmp_path)
+    text = " ".join((tmp_path / "report.html").read_text().split())
+    assert "3 videos, 3 done, 0 failed" in text
+
+
 def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
     rows = [Row(f"v{i:03}", f"/v{i}", "done", points=i) for i in range(300)]
     rows[250] = Row("v250", "/v250", "failed", "damaged", error="x")
@@ -109,6 +118,16 @@ def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
         *(f"v{i:03}" for i in range(9)),
     ]
     assert {row[0]: row[-2] for row in page.tables["quantiles"]}["points"] == "299"
+
+
+@pytest.mark.parametrize("name", ["../secret", "{root}/secret", "a\0b", "a\ud800"])
+def test_thumbnails_are_those_of_the_output(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "thumbnail.jpg").write_bytes(JPEG)
+    write_rows(out, [Row(name.format(root=tmp_path), "/x", "done", points=1)])
+    write_page(out)
+    assert "base64" not in (out / "report.html").read_text()
 
 
 def row_text(field: str, value: object) -> str:
@@ -126,6 +145,7 @@ def row_text(field: str, value: object) -> str:
         (row_text("state", "<script>alert(1)</script>"), "damaged"),
         (row_text("seconds", "<script>"), "damaged"),
         (row_text("points", [1]), "damaged"),
+        (row_text("points", 10**400), "damaged"),
         ("[]", "damaged"),
         ('{"rows": [\n  {"name": ' + "[" * 100_000, "damaged"),
     ],

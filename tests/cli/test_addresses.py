@@ -68,6 +68,30 @@ def test_a_url_is_as_good_as_its_file(
     assert os.listdir(scratch) == []
 
 
+def test_texts_name_the_url_not_the_copy(
+    server: str,
+    tmp_path: Path,
+    scratch: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The copy is gone when they are read."""
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    monkeypatch.chdir(tmp_path)
+    url, report = f"{server}/a%20clip.mp4?sig=SECRET", tmp_path / "r.json"
+    words = ["--video", url, "--report_json", str(report)]
+    assert main(["match", "--database", "a.db", *words]) == 0
+    texts = [*capsys.readouterr(), report.read_text()]
+    Path(tmp_path / "served" / "a clip.mp4").write_text("no video")
+    assert main(["info", *words]) == 2
+    texts += [*capsys.readouterr(), report.read_text()]
+    for text in texts:
+        assert "SECRET" not in text
+        assert str(scratch) not in text
+    for place in (0, 2, 4, 5):
+        assert f"{server}/a%20clip.mp4" in texts[place]
+
+
 def test_urls_that_cannot_be_read(
     server: str, scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

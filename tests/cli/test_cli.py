@@ -221,6 +221,35 @@ def test_names_of_files_that_are_no_text_or_several_lines(clip: Path, tmp_path: 
     assert run.stderr.count(b"\n") == 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_would_control_a_terminal(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = "\x1b]0;x\x07 \x1b[2J\rok\tb\nc\x9b\u2028\u202e\u3000.mp4"
+    (tmp_path / odd).symlink_to(clip)
+    video = ["--video", str(tmp_path / odd)]
+    assert main(["info", *video]) == 0
+    out = capsys.readouterr().out
+    table = [line.split("\t") for line in out.splitlines()]
+    assert {len(row) for row in table} == {2}
+    assert "\\x1b[2J\\rok\\tb\\nc\\x9b\\u2028\\u202e\u3000.mp4" in table[0][1]
+    assert main(["match", *video, "--database", str(tmp_path / f"{odd}.db")]) == 0
+    out += capsys.readouterr().out
+    batch = ["batch", "--task", "info", "--output", str(tmp_path / "out")]
+    broken = tmp_path / "\x1b[2J\r.mp4"
+    broken.write_text("no video")
+    assert main([*batch, "--inputs", str(broken)]) == 1
+    for words in ([f"--{odd}"], [odd], ["--operating_point", odd]):
+        with pytest.raises(SystemExit):
+            main(["info", *video, *words])
+    assert main(["info", "--video", odd]) == 2
+    printed = capsys.readouterr()
+    shown = out + printed.out + printed.err
+    assert all(c == "\n" or ord(c) >= 32 for c in shown.replace("\t", ""))
+    assert not {"\x7f", "\x9b", "\u2028", "\u202e"} & set(shown)
+    assert len(printed.err.splitlines()) == printed.err.count("colmap-av1: ")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
 def test_output_that_nobody_reads(clip: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "colmap_av1", "info", "--video", str(clip)]

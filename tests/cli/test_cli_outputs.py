@@ -102,6 +102,23 @@ def test_files_of_others_stay(words: str, work: Path, capsys: pytest.CaptureFixt
     assert contents(work) == before
 
 
+@pytest.mark.parametrize(
+    ("video", "report"), [("v.mp4", "v.mp4"), ("none.mp4", "notes.log"), ("v.mp4", "frames")]
+)
+def test_reports_replace_nothing_but_reports(
+    video: str, report: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(work)
+    assert main(["info", "--video", video, "--report_json", report]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert report in line
+    assert contents(work) == before
+    assert main(["info", "--video", "v.mp4", "--report_json", "none/r.json"]) == 2
+    assert "none/r.json: cannot be written" in capsys.readouterr().err
+    for status, again in ((2, "none.mp4"), (0, "v.mp4"), (0, "v.mp4")):
+        assert main(["info", "--video", again, "--report_json", "r.json", "--quiet"]) == status
+
+
 AGAIN = [
     ("view --model model --output view.png", "view.png"),
     ("view --model model --output view.jpg", "view.jpg"),

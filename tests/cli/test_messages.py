@@ -74,6 +74,31 @@ def test_values_that_begin_like_options(
     assert way_out in error
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["match", "--video", "v.mp4", "--database", "a.db", "--image_path", ""],
+        ["match", "--video", "v.mp4", "--database", "a.db", "--mask_path="],
+        ["reconstruct", "--video", "v.mp4", "--output", ""],
+        ["batch", "--task", "info", "--inputs", "v.mp4", "", "--output", "out"],
+        ["batch", "--task", "match", "--inputs", "v.mp4", "--output", "out", "--mask_path="],
+        ["view", "--model", "", "--output", "out.html"],
+    ],
+)
+def test_paths_that_are_empty(
+    words: list[str],
+    tmp_path: Path,
+    clip: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As of variables of a shell that are not set."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(clip, "v.mp4")
+    assert "empty" in told(words, capsys)
+    assert os.listdir() == ["v.mp4"]
+
+
 def test_values_below_zero_are_values(capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--cosine", "-0.5"], ["--cosine=-1e-3"], ["--cosine", "-1"]):
         error = told(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)

@@ -60,6 +60,17 @@ def test_poor_streams(
     assert any(reason in r for r in report.reasons), report.reasons
 
 
+def test_frames_that_are_there_twice_move_all_the_same(encode: Encode, tmp_path: Path) -> None:
+    """As where a higher frame rate was made of a lower one, or a camera pauses."""
+    frames = make_frames(16)
+    for number, repeats in enumerate(
+        (np.repeat(frames, 2, axis=0), frames[[*range(12), *[11] * 14]])
+    ):
+        report = inspect(encode(repeats, tmp_path / f"{number}.mp4", *AV1))
+        assert report.median_motion < 0.1
+        assert report.good, report.reasons
+
+
 def test_fast_turns(encode: Encode, tmp_path: Path) -> None:
     """The picture moves by a tenth of its width in a fifth of the frames."""
     steps = np.where(np.arange(40) % 20 < 4, 20, 2)

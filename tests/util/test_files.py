@@ -102,6 +102,23 @@ def test_a_folder_that_is_there_gets_the_content(tmp_path: Path) -> None:
     assert (output / "points2").read_text() == "2"
 
 
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_file_that_another_program_writes_meanwhile_stays(tmp_path: Path, is_there: bool) -> None:
+    output = tmp_path / "a.mp4"
+    if is_there:
+        output.write_text("old")
+
+    def write_both() -> None:
+        with whole_file(output) as ours, whole_file(output) as theirs:
+            ours.write_text("ours")
+            theirs.write_text("theirs")
+
+    with pytest.raises(FileExistsError, match="meanwhile"):
+        write_both()
+    assert output.read_text() == "theirs"
+    assert names_in(tmp_path) == ["a.mp4"]
+
+
 @locks
 @pytest.mark.parametrize("how", ["whole_file", "whole_folder", "scratch_folder"])
 def test_what_the_killed_left_is_removed(how: str, tmp_path: Path) -> None:

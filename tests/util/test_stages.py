@@ -207,6 +207,31 @@ def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[
     check_made_again(stage)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"files": ["images/a.png"]},
+        {"files": {"images/a.png": 5}},
+        {"files": {"images/a.png": {"bytes": 5000}}},
+        {"files": {"images/\0": None}},
+        {"result": 5},
+        {"result": {"found": "x", "sizes": None}},
+        {"result": None, "files": {}},
+    ],
+)
+def test_a_record_that_was_made_to_mislead(tmp_path: Path, changes: dict[str, object]) -> None:
+    """Its digest fits its content, and its key the input."""
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/a.png"])
+    record = output / ".stages" / "a.json"
+    body = {**json.loads(record.read_text()), **changes}
+    del body["digest"]
+    shutil.rmtree(output / "images")
+    record.write_text(json.dumps({**body, "digest": stages._json_digest(body)}))
+    assert not run_with(output, 1, ["images/a.png"]).resumed
+    assert texts(output) == {"images/a.png": "1"}
+
+
 def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
     options = MatchOptions()
     assert not stage.run(options).resumed

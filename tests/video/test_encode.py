@@ -226,6 +226,20 @@ def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_p
         stream_of(video, tmp_path / "out.ivf")
 
 
+def test_stream_of_a_raw_video_is_not_taken_for_another(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """Without compression, videos of one shape have one size."""
+    videos = []
+    for change in ("null", "hflip"):
+        how = ["-f", "lavfi", "-i", "testsrc=s=64x64:r=25", "-frames:v", "4", "-vf", change]
+        videos.append(ffmpeg(*how, "-pix_fmt", "yuv420p", tmp_path / f"{change}.y4m"))
+        os.utime(videos[-1], (0, 0))
+    assert videos[0].stat().st_size == videos[1].stat().st_size
+    stream = tmp_path / "stream.mp4"
+    stream_of(videos[0], stream)
+    assert stream_of(videos[0], stream).reused
+    assert not stream_of(videos[1], stream).reused
+
+
 def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
     other = tmp_path / "other.mp4"

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import AV1, SHARED, Encode, Ffmpeg, make_frames
+from ivf_files import frame_headers, ivf_of, with_repeats
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
@@ -417,36 +418,10 @@ def test_ivf_in_units_of_time_finer_than_frames(clip: Path, tmp_path: Path, is_c
 
 def test_pictures_that_are_shown_again_at_the_end_count(clip: Path, tmp_path: Path) -> None:
     """Players show 4 coded pictures and then the first one of them 20 times more."""
-    data = ivf_of(clip)
-    starts = frame_headers(data)
-    end = starts[4][0]
-    # A temporal delimiter, and a frame header that shows the frame in slot 0.
-    unit = bytes([0x12, 0x00, 0x1A, 0x01, 0x88])
-    again = b"".join(struct.pack("<IQ", len(unit), 4 + k) + unit for k in range(20))
-    path = tmp_path / "again.ivf"
-    path.write_bytes(data[:end] + again)
+    path = with_repeats(clip, tmp_path / "again.ivf", range(4), [(3, 0, 20)])
     assert len(list(decode_frames(path))) == 24
     report = inspect(path)
     assert (report.num_shown, report.num_coded) == (24, 4)
-
-
-def ivf_of(clip: Path) -> bytes:
-    found = list(packets(clip))
-    body = b"".join(struct.pack("<IQ", len(p.data), p.index) + bytes(p.data) for p in found)
-    with av.open(str(clip)) as container:
-        size = container.streams.video[0].width, container.streams.video[0].height
-    head = struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"AV01", *size, 25, 1, len(found), 0)
-    return head + body
-
-
-def frame_headers(ivf: bytes | bytearray) -> list[tuple[int, int]]:
-    """Position of each frame's header, and its time."""
-    found, at = [], 32
-    while at < len(ivf):
-        size, pts = struct.unpack_from("<IQ", ivf, at)
-        found.append((at, pts))
-        at += 12 + size
-    return found
 
 
 def test_animated_avif_is_its_track(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:

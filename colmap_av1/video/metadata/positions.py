@@ -7,20 +7,18 @@ demuxes all of these, including .srt files.
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import av.error
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
 from colmap_av1.util.texts import shown
-from colmap_av1.video.container import VideoFile, open_container
+from colmap_av1.video.container import VideoFile, open_container, until_damage
 from colmap_av1.video.metadata.gpmf import Payload, read_payload
 from colmap_av1.video.metadata.places import are_places
 from colmap_av1.video.metadata.subtitles import holds_position, read_position, to_places
@@ -167,7 +165,7 @@ def _first_picture(video: VideoFile, container: Any) -> float:
     if "mov" not in video.container:
         return _start(stream)
     with (
-        contextlib.suppress(av.error.FFmpegError, OSError),
+        until_damage(),
         open_container(video.path) as unedited,
     ):
         shown = next((p for p in container.demux(stream) if p.size and p.pts is not None), None)
@@ -204,7 +202,7 @@ def _packets(container: Any) -> dict[int, list[_Packet]]:
         if hasattr(other, "discard"):  # newer PyAV can skip other streams without reading them
             other.discard = type(other.discard)(_READ if other in streams else _SKIP)
     data = {stream.index for stream in container.streams.data}
-    with contextlib.suppress(av.error.FFmpegError, OSError):
+    with until_damage():
         for packet in container.demux(streams):
             index, content = packet.stream.index, bytes(packet)
             if (
