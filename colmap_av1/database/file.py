@@ -17,6 +17,7 @@ from pathlib import Path
 from colmap_av1.database.layout import SCHEMA, USER_VERSION, check_layout
 from colmap_av1.errors import DatabaseError, cannot_write
 from colmap_av1.util.files import remove_leftovers, whole_file
+from colmap_av1.util.memory import check_memory
 
 # Seconds to wait for another writer. A process that is only closing the file finishes sooner.
 _BUSY_TIMEOUT = 2.0
@@ -122,6 +123,13 @@ def _connect(path: Path, how: str, named: Path) -> Iterator[sqlite3.Connection]:
             yield connection
     except sqlite3.Error as error:
         raise DatabaseError(_explain(named, error, reading="mode=ro" in how)) from error
+    except MemoryError as error:
+        if error.args:  # not of SQLite
+            raise
+        check_memory(error)
+        raise DatabaseError(
+            f"{named}: it is damaged: restore it from a copy, or give another path"
+        ) from error
 
 
 def _run_nothing(connection: sqlite3.Connection) -> None:

@@ -30,8 +30,8 @@ from colmap_av1.images.names import (
 from colmap_av1.options.images import check_extension
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
+from colmap_av1.util.memory import check_memory
 from colmap_av1.util.spread import evenly_spread
-from colmap_av1.video.container import check_memory
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video

@@ -9,6 +9,7 @@ from pathlib import Path
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _UNKNOWN = 8 << 30
+_SPARE = 1 << 26  # bytes
 
 
 def usable_memory() -> int:
@@ -36,6 +37,18 @@ def _machine_memory() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # Windows
         return _UNKNOWN
+
+
+def check_memory(error: BaseException) -> None:
+    """Check that an error of a library that reads a file is not for a lack of memory.
+
+    FFmpeg and SQLite give the same error for a damaged file that declares an impossible size.
+
+    Raises:
+        MemoryError: little memory is left.
+    """
+    if isinstance(error, MemoryError):
+        bytearray(_SPARE)
 
 
 def give_back_free_memory() -> None:

@@ -20,12 +20,12 @@ import av.logging
 from av.stream import Disposition
 
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
+from colmap_av1.util.memory import check_memory
 from colmap_av1.video.cut_off import is_fragmented_mp4_cut, is_matroska_cut
 from colmap_av1.video.unchanged import FileState, file_state
 
 # Edit lists drop or hide samples that a later frame may reference, so all samples are read.
 _CONTAINER_OPTIONS = {"ignore_editlist": "1"}
-_SPARE_MEMORY = 1 << 26  # bytes
 _IVF_FRAME_HEADER_SIZE = 12
 _IVF_RATE_OFFSET = 16  # frame rate and time scale, 32 bits each
 _IVF_ONE_TO_ONE = (1).to_bytes(4, "little") * 2
@@ -395,18 +395,6 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
         container.close()
         if file is not None:
             file.close()
-
-
-def check_memory(error: BaseException) -> None:
-    """Check that an error of FFmpeg is not for a lack of memory.
-
-    FFmpeg gives the same error for a packet of an impossible size.
-
-    Raises:
-        MemoryError: little memory is left.
-    """
-    if isinstance(error, MemoryError):
-        bytearray(_SPARE_MEMORY)
 
 
 @contextmanager

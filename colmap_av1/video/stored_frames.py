@@ -12,9 +12,9 @@ import av.error
 import av.logging
 
 from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.util.memory import check_memory
 from colmap_av1.video.container import (
     ENCRYPTED,
-    check_memory,
     find_decodable_stream,
     is_encrypted,
     open_container,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
-from colmap_av1.video.container import check_memory
+from colmap_av1.util.memory import check_memory
 
 Image = NDArray[np.uint8]
 # Fixed, because x264's output depends on the number of threads.

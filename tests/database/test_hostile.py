@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import PROJECT
 from existing_database import (
     CAMERA,
     LAYOUTS,
@@ -262,6 +263,16 @@ def test_pages_that_refer_to_each_other(tmp_path: Path, sound: bytes) -> None:
     found = messages(path, tmp_path)
     assert len(found) == len(opened_by_all(path, tmp_path)), found.keys()
     assert all("end" in text for text in found.values()), found
+
+
+def test_a_layout_for_which_sqlite_reports_a_lack_of_memory(tmp_path: Path) -> None:
+    content = bytearray((PROJECT / "tests" / "data" / "seeds" / "database" / "4.2.db").read_bytes())
+    start = content.index(b"CREATE TABLE sqlite_")
+    content[start : start + 55] = b"\xff" * 55
+    path = tmp_path / "a.db"
+    path.write_bytes(content)
+    with pytest.raises(DatabaseError, match="damaged"):
+        check(path)
 
 
 def test_nothing_of_the_layout_is_run(tmp_path: Path, sound: bytes) -> None:
