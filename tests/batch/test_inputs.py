@@ -142,7 +142,7 @@ def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
     videos.write_text(f"{server}/hangs.mp4\n{server}/404.mp4\n")
-    options = BatchOptions(stall=2, retries=0)
+    options = BatchOptions(stall=6, retries=0)
     report = run_batch(videos, tmp_path / "out", ReadOptions(), options=options)
     assert report.failed == {"reading or writing": 1, "unreadable": 1}
     text = (tmp_path / "out" / "batch.csv").read_text()
