@@ -169,7 +169,7 @@ def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None
         )
         context = RunContext()
         with open_source(
-            read_video(courtyard), options.source, beside=tmp_path / "x", context=context
+            read_video(courtyard), options.source, next_to=tmp_path / "x", context=context
         ) as source:
             found[downscale] = track_video(
                 source, options.tracking, one_size=True, context=context
