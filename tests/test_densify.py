@@ -136,7 +136,7 @@ def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: P
         densify(tmp_path, SCENE, tmp_path / "dense")
     (tmp_path / "empty").mkdir()
     write_model(tmp_path / "empty", {7: truth.camera}, [], no_points())
-    with pytest.raises(ModelError, match="pose"):
+    with pytest.raises(ModelError, match="registered"):
         densify(tmp_path / "empty", SCENE, tmp_path / "dense")
     few = true_model(tmp_path / "few", truth, range(20))
     with pytest.raises(ImageError, match="frames"):
