@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
@@ -118,7 +118,7 @@ class LongRangeCheck:
     def __init__(
         self,
         images: Sequence[ModelImage],
-        cameras: Mapping[int, Any],
+        cameras: Mapping[int, pycolmap.Camera],
         points_of: Callable[[int], _Floats],
     ) -> None:
         self._images = images
@@ -170,7 +170,9 @@ class LongRangeCheck:
             num_features=int(np.median(sizes)) if sizes else 0,
         )
 
-    def _errors(self, i: int, j: int, xa: NDArray[Any], xb: NDArray[Any]) -> _Floats:
+    def _errors(
+        self, i: int, j: int, xa: NDArray[np.floating], xb: NDArray[np.floating]
+    ) -> _Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
         a, b = self._images[i].cam_from_world, self._images[j].cam_from_world
         normalised = [
@@ -185,7 +187,9 @@ class LongRangeCheck:
 
 
 def model_long_range_errors(
-    reconstruction: Any, image_path: Path, progress: Progress = no_progress
+    reconstruction: pycolmap.Reconstruction,
+    image_path: Path,
+    progress: Progress = no_progress,
 ) -> LongRangeErrors:
     """Run the long-range check on a few pairs of a model's images.
 
@@ -207,7 +211,7 @@ def model_long_range_errors(
         points = [reconstruction.points3D[point_id].xyz for point_id in ids]
         return np.array(points, dtype=np.float64).reshape(-1, 3)
 
-    check = LongRangeCheck(images, reconstruction.cameras, points_of)
+    check = LongRangeCheck(images, dict(reconstruction.cameras), points_of)
     for done, index in enumerate(check.wanted, start=1):
         image = images[index]
         picture = read_image(image_file(image_path, image.name))
@@ -225,7 +229,7 @@ def model_long_range_errors(
 
 def _far_pairs(
     images: Sequence[ModelImage],
-    cameras: Sequence[Any],
+    cameras: Sequence[pycolmap.Camera],
     points_of: Callable[[int], _Floats],
 ) -> NDArray[np.int32]:
     """Choose a few pairs of images that are far apart in time and overlap by their poses.
@@ -254,7 +258,7 @@ def _far_pairs(
     return np.array(found[:half] + spread[:half], dtype=np.int32).reshape(-1, 2)
 
 
-def _sees_same(points: _Floats, poses: _Floats, camera: Any) -> bool:
+def _sees_same(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> bool:
     """Whether the second image sees most of the points of the first from a similar viewpoint.
 
     Args:
