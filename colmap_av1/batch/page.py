@@ -105,7 +105,7 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
 
 
 def _rows(into: Output, place: str) -> list[Row]:
-    """The rows of all shards; of a video that runs with other shards had, too, one that is done."""
+    """The rows of all shards, one per video; a finished row replaces a failed one."""
     try:
         names = batch_files(into)
     except OSError as error:

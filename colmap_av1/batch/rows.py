@@ -86,7 +86,7 @@ def row_of(facts: object) -> Row:
         row = cattrs.structure(facts, Row)
         for value in vars(row).values():
             if isinstance(value, int):
-                float(value)  # which fails for numbers that no page can show
+                float(value)  # The page cannot show larger integers.
         return row
     except (cattrs.BaseValidationError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"not a row: {error}") from error

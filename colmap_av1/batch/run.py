@@ -220,15 +220,16 @@ def _refuse_another_task(output: Output, place: str, task: str) -> None:
 
 
 def _refuse_files_of_others(output: Output, place: str, shard: str) -> None:
-    """Refuse an output in which other files have the names of the rows.
+    """Check that existing tables in the output were written by a batch.
 
     Raises:
-        OptionError: so it is.
+        OptionError: another program wrote a file with the name of a table.
     """
     table = output.read(f"{ROWS}{shard}.csv")
     is_ours = not table or table.startswith(csv_of([]).rstrip())
     facts = output.read(f"{ROWS}{shard}.json")
-    if facts is not None and not (table and is_ours):  # beside our table it may be damaged
+    # With our table, the JSON file is ours even if it is damaged.
+    if facts is not None and not (table and is_ours):
         found: object = None
         with suppress(ValueError, RecursionError):
             found = json.loads(facts)

@@ -61,7 +61,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"there is no option {name}{meant}")
 
     def refuse_empty(self, namespace: argparse.Namespace) -> None:
-        """Exit if a path is empty, as of a variable that is not set: it would be this folder."""
+        """Exit if a path is empty. An unset shell variable would otherwise mean this folder."""
         for action in self._actions:
             value = getattr(namespace, action.dest, None) if action.metavar == _PATH else None
             if "" in (value if isinstance(value, list) else [value]):

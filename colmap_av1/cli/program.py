@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(f"{where}{_reason(error)}: fix that, or give another path")
         return BAD_INPUT
     except (MemoryError, ImportError) as error:
-        # Libraries that do not fit are not imported.
+        # A library that does not fit into memory raises an ImportError.
         if isinstance(error, ImportError) and "failed to map segment" not in str(error):
             raise
         print_error("out of memory: free some, or allow this process more")

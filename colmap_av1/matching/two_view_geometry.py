@@ -48,8 +48,8 @@ class TwoViewGeometry:
         config: configuration.
         inlier_matches: uint32 [n, 2] the inliers, in the order of the matches.
         E: float64 [3, 3] essential matrix on normalised, undistorted coordinates, or None.
-        F: float64 [3, 3] fundamental matrix on pixels, or None, including if E explains so many
-            matches that F was not needed.
+        F: float64 [3, 3] fundamental matrix on pixels; None if E explains enough matches
+            without it, or if none was found.
         H: float64 [3, 3] homography on pixels, or None.
         qvec: float64 [4] (w, x, y, z) rotation from the first camera to the second, or None.
         tvec: float64 [3] translation likewise, of unit length, or None.

@@ -127,7 +127,7 @@ def first_showings(video: str | PathLike[str], options: ReadOptions) -> NDArray[
 
 
 def count_with_repeats(first: NDArray[np.int32], num_shown: int) -> int:
-    """Number of shown frames if those that repeat earlier ones at the end count, too.
+    """Number of shown frames, including repeats of earlier frames at the end.
 
     Args:
         first: see `first_showings`.

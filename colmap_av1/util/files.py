@@ -356,7 +356,7 @@ def may_read(path: Path) -> bool:
 
 
 def _version(path: Path) -> tuple[int, ...] | None:
-    """What changes when a file is replaced or written to; None if there is none."""
+    """Values that change when a file is replaced or written to; None if it does not exist."""
     try:
         status = path.lstat()
     except OSError:

@@ -218,7 +218,7 @@ def _read_record(record: Path) -> dict[str, Any] | None:
 
 
 def _is_record(body: dict[str, Any]) -> bool:
-    """Whether a record has the parts of one; a manipulated record may have others."""
+    """Whether a record has the expected fields and types."""
     files = body.get("files")
     return (
         {"key", "result"} <= body.keys()

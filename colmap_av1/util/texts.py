@@ -29,7 +29,7 @@ def shown(text: str, most: int = _MOST_SHOWN) -> str:
 
 
 def on_one_line(text: str) -> str:
-    """The text for a terminal: line ends, tabs and other control characters become escapes."""
+    """The text with line ends, tabs and other control characters replaced by escapes."""
     return "".join(_escaped(c) if _is_control(c) else c for c in text)
 
 

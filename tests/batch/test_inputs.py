@@ -119,6 +119,8 @@ class _Hangs(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.do_HEAD()
+        if self.path != "/hangs.mp4":
+            return
         self.wfile.write(b"first bytes")
         self.wfile.flush()
         time.sleep(60)
