@@ -149,7 +149,7 @@ def test_the_report_needs_no_other_file(compared):
     assert not re.search(r'(href|src)="(?!data:)|@import|url\(', html)
     for named in ("no.h5", "8 of 8", "poses.txt"):
         assert named in html
-    assert len(re.findall("<tr><td>av1 [+] all tracks</td>", html)) == 3
+    assert len(re.findall("<tr><td>av1 [+] all tracks</td>", html)) == 4
     assert len(set(sources)) == len(sources)
 
 

@@ -21,6 +21,7 @@ def test_distances_of_known_clouds() -> None:
     assert distances.completeness == pytest.approx(np.mean(far))
     assert distances.chamfer == pytest.approx((0.2 + np.mean(far)) / 2)
     assert distances.hausdorff == pytest.approx(far[-1])
+    assert distances.mean_hausdorff == pytest.approx((0.3 + far[-1]) / 2)
     assert distances.robust_hausdorff < distances.hausdorff
     assert distances.extent == pytest.approx(0.9 * 3)
 

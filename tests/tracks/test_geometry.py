@@ -225,6 +225,14 @@ def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
     centres = -np.einsum("nij,ni->nj", truth[:, :, :3], truth[:, :, 3])
     assert errors.extent == pytest.approx(np.linalg.norm(np.ptp(centres, axis=0)), rel=0.01)
 
+    # The robust alignment ignores a pose that is far off, and its distance still counts.
+    off[3, :, 3] += [0, 0, 100]
+    far = pose_errors(off, truth)
+    assert far.robust_median < 0.01
+    distances = [100, 0.3]
+    assert far.robust_rms == pytest.approx(np.hypot(*distances) / np.sqrt(59), rel=0.01)
+    assert far.ate < far.robust_rms
+
     assert pose_errors(np.full_like(truth, np.nan), truth) is None
     with pytest.raises(ValueError, match="59"):
         pose_errors(truth[:59], truth)

@@ -18,6 +18,7 @@ class CloudDistances:
         accuracy: mean distance from a point of the cloud to the nearest reference point.
         completeness: mean distance from a reference point to the nearest point of the cloud.
         hausdorff: the largest of all these distances, which a single outlier determines.
+        mean_hausdorff: mean of the largest distances of both directions, as in arXiv 2605.14629.
         robust_hausdorff: the larger of the two 95th percentiles.
         extent: diagonal of the box that contains the middle 90 % of the reference on each axis.
     """
@@ -25,6 +26,7 @@ class CloudDistances:
     accuracy: float
     completeness: float
     hausdorff: float
+    mean_hausdorff: float
     robust_hausdorff: float
     extent: float
 
@@ -55,6 +57,7 @@ def cloud_distances(
         accuracy=float(to_reference.mean()),
         completeness=float(to_points.mean()),
         hausdorff=float(max(to_reference.max(), to_points.max())),
+        mean_hausdorff=float((to_reference.max() + to_points.max()) / 2),
         robust_hausdorff=float(max(np.quantile(to_reference, 0.95), np.quantile(to_points, 0.95))),
         extent=float(np.linalg.norm(middle[1] - middle[0])),
     )

@@ -32,6 +32,7 @@ from colmap_av1.evaluate.report.tables import (
     lengths_table,
     milestones_table,
     models_table,
+    published_table,
     renderings_table,
 )
 from colmap_av1.images.files import read_image
@@ -76,7 +77,10 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     if curves is not None:
         figures["training"] = [_Figure("training.svg", "Renderings over time", curves)]
     figures["crops"] = _crop_figures(report.columns)
-    tables = {"models": models_table(report), "cost": cost_table(report.columns)}
+    tables = {"models": models_table(report)}
+    if report.pose_reference or report.cloud_reference:
+        tables["published"] = published_table(report)
+    tables["cost"] = cost_table(report.columns)
     tables["lengths"] = lengths_table(report.columns)
     if any(column.training is not None for column in report.columns):
         tables["renderings"] = renderings_table(report.columns)

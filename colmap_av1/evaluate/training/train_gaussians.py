@@ -31,6 +31,7 @@ try:
     import numpy as np
     import torch
     from gsplat.strategy import DefaultStrategy
+    from gsplat.strategy.ops import reset_opa
     from pytorch_msssim import ssim
 except ImportError as error:
     print(f"3D Gaussians need the package {error.name}: {_INSTALL}", file=sys.stderr)
@@ -161,6 +162,10 @@ def train(
             optimizer.zero_grad(set_to_none=True)
         falling.step()
         strategy.step_post_backward(gaussians, optimizers, state, iteration, info)
+        # The strategy of gsplat 1.5.3 never resets opacities: its condition contains `0 & step`.
+        # Without resets the Gaussians multiply: 4.6 million after 10,000 iterations on 450x800.
+        if iteration % _RESET_EVERY == 0 and iteration < strategy.refine_stop_iter:
+            reset_opa(gaussians, optimizers, state, value=2 * strategy.prune_opa)
         yield iteration
 
 
