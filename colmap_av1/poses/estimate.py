@@ -232,9 +232,7 @@ def _pose_stages(
         keyed=keyed,
         has_picture_positions=has_picture_positions,
     )
-    links = matched.result.links
-    if links.gaps or links.fast:
-        posed = remapped_poses(run, posed, image_set)
+    posed = remapped_poses(run, posed, image_set)
     return replace(posed, far_views=_long_range_check(run, posed, image_set))
 
 
@@ -256,10 +254,14 @@ def trusted_tracks(
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     """Map the adjusted observations again, and use the result if that lowers the cost.
 
-    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if the
-    adjustment did not use corners.
+    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if links
+    replace no motion, if the adjusted model holds together well, or if the adjustment did not use
+    corners.
     """
     if posed.adjustment is None or not posed.has_picture_positions:
+        return posed
+    links, adjusted = posed.matches.result.links, posed.adjustment.result
+    if not (links.gaps or links.fast) or not (adjusted.doubtful_seams or adjusted.turns):
         return posed
     again = remap_stage(run, image_set, posed.adjustment)
     if not again.result.is_better:

@@ -47,7 +47,7 @@ def rays_of(camera: pycolmap.Camera, samples: int = 2) -> Floats:
 def render(
     rays: Floats,
     cam_from_world: Floats,
-    textures: list[NDArray[np.float32]],
+    textures: NDArray[np.float32],
     *,
     walls: Floats = ROOM,
     boxes: Floats = BOXES,
@@ -64,8 +64,9 @@ def render(
     """
     rotation = cam_from_world[:, :, :3]
     origin = -np.einsum("nij,ni->nj", rotation, cam_from_world[:, :, 3])
-    direction = np.einsum("nij,nwsi->nwsj", rotation, rays).astype(np.float32)
-    start = origin[:, None, None, :].astype(np.float32)
+    # Coordinates come first, because NumPy reduces a short last axis slowly.
+    direction = np.einsum("nij,nwsi->jnws", rotation, rays).astype(np.float32, order="C")
+    start = origin.T[:, :, None, None].astype(np.float32)
     with np.errstate(divide="ignore"):
         step = 1 / direction
     best, face = _leave(start, step, walls)
@@ -74,16 +75,15 @@ def render(
         closer = near < best
         best = np.where(closer, near, best)
         face = np.where(closer, 3 * (number + 1) + axis, face)
-    hit = start + best[..., None] * direction
+    hit = start + best * direction
     axis, texture = face % 3, face % len(textures)
-    u = np.where(axis == 0, hit[..., 1], hit[..., 0])
-    v = np.where(axis == 2, hit[..., 1], hit[..., 2])
+    u = np.where(axis == 0, hit[1], hit[0])
+    v = np.where(axis == 2, hit[1], hit[2])
     columns, rows = (w % _PERIOD * (_TEXELS / _PERIOD) for w in (u, v))
-    rows += texture * (_TEXELS + 1)  # Stacked, each with its first row repeated.
+    rows += texture * (_TEXELS + 1)
     shape = (best.shape[0], -1)
-    atlas = np.concatenate([np.pad(t, ((0, 1), (0, 1), (0, 0)), mode="wrap") for t in textures])
     seen = cv2.remap(
-        atlas,
+        textures.reshape(-1, _TEXELS + 1, 3),
         columns.reshape(shape).astype(np.float32),
         rows.reshape(shape).astype(np.float32),
         cv2.INTER_LINEAR,
@@ -92,8 +92,11 @@ def render(
     return np.clip(picture.round(), 0, 255).astype(np.uint8)
 
 
-def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
-    """Seamless textures with several scales, float32 [_TEXELS, _TEXELS, 3]."""
+def make_textures(count: int = 6) -> NDArray[np.float32]:
+    """Seamless textures with several scales, float32 [count, _TEXELS + 1, _TEXELS + 1, 3].
+
+    The first row and column of each are repeated at its end, for interpolation.
+    """
     rng = np.random.default_rng(_SEED)
     made = []
     for _ in range(count):
@@ -106,25 +109,26 @@ def make_textures(count: int = 6) -> list[NDArray[np.float32]]:
             edge = round(2 * scale)
             total += share * large[edge : edge + _TEXELS, edge : edge + _TEXELS]
         grey = total.mean(axis=2, keepdims=True)
-        made.append(128 + 38 * (grey + 0.3 * (total - grey)))
-    return made
+        texture = 128 + 38 * (grey + 0.3 * (total - grey))
+        made.append(np.pad(texture, ((0, 1), (0, 1), (0, 0)), mode="wrap"))
+    return np.stack(made)
 
 
 def _leave(start: Any, step: Any, walls: Floats) -> tuple[Any, Any]:
     """Intersections of rays with the room's walls, from inside: ray parameter and axis."""
-    low, high = walls.astype(np.float32)
+    low, high = walls.astype(np.float32)[:, :, None, None, None]
     far = np.maximum((low - start) * step, (high - start) * step)
-    axis = far.argmin(axis=-1)
-    return far.min(axis=-1), axis
+    return far.min(axis=0), far.argmin(axis=0)
 
 
 def _enter(start: Any, step: Any, box: Any) -> tuple[Any, Any]:
     """Intersections of rays with a box: ray parameter, infinite for a miss, and axis."""
-    one, two = (box[0] - start) * step, (box[1] - start) * step
+    low, high = box[:, :, None, None, None]
+    one, two = (low - start) * step, (high - start) * step
     near, far = np.minimum(one, two), np.maximum(one, two)
-    first, last = near.max(axis=-1), far.min(axis=-1)
+    first, last = near.max(axis=0), far.min(axis=0)
     met = (first < last) & (first > 0)
-    return np.where(met, first, np.inf), near.argmax(axis=-1)
+    return np.where(met, first, np.inf), near.argmax(axis=0)
 
 
 def look(centre: Floats, target: Floats) -> Floats:

@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -172,11 +173,11 @@ def furniture(seed: int) -> Floats:
     return np.array(boxes)
 
 
-def textures() -> list[NDArray[np.float32]]:
+def textures() -> NDArray[np.float32]:
     """Textures of the faces, see `room.render`: the outer walls and some boxes are plain."""
     made = room.make_textures(NUM_FACES)
-    plain = [128 + (texture - 128) * np.float32(PLAIN / 38) for texture in made[:3]]
-    return [*plain, *made[3:]]
+    made[:3] = 128 + (made[:3] - 128) * np.float32(PLAIN / 38)
+    return made
 
 
 def pictures(seed: int) -> Iterator[NDArray[np.uint8]]:
@@ -204,13 +205,13 @@ def pictures(seed: int) -> Iterator[NDArray[np.uint8]]:
         yield np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
 
-def make_clip(path: Path, seed: int) -> None:
-    """Render a walk, and encode it as H.264, as phones do."""
+def make_clip(path: Path, seed: int, num_frames: int | None = None) -> None:
+    """Render the first frames of a walk, and encode them as H.264, as phones do."""
     raw = f"-f rawvideo -pix_fmt bgr24 -s {WIDTH}x{HEIGHT} -r {RATE} -i -".split()
     encoder = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"]
     subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *encoder, str(path)],
-        input=b"".join(picture.tobytes() for picture in pictures(seed)),
+        input=b"".join(picture.tobytes() for picture in islice(pictures(seed), num_frames)),
         check=True,
     )
 
