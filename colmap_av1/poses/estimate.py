@@ -254,9 +254,9 @@ def trusted_tracks(
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     """Map the adjusted observations again, and use the result if that lowers the cost.
 
-    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if links
-    replace no motion, if the adjusted model holds together well, or if the adjustment did not use
-    corners.
+    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if
+    links replace no motion, if the adjusted model holds together well, or if the adjustment did not
+    use corners.
     """
     if posed.adjustment is None or not posed.has_picture_positions:
         return posed
