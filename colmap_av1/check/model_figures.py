@@ -37,7 +37,7 @@ class ModelFigures:
     focal_lengths: tuple[float, float]
 
 
-def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
+def model_figures(model: pycolmap.Reconstruction | Path) -> ModelFigures:
     """Compute the figures of a model, given as pycolmap.Reconstruction or as a folder.
 
     Raises:

@@ -65,7 +65,8 @@ class EncodeOptions(Options):
     effort: Literal["auto", "full", "quick"] = option(
         "auto",
         "full: an exact motion search, for poses from motion alone; quick: half the time, for "
-        "poses that are refined on the pictures; auto: quick in reconstruct, else full",
+        "poses that are refined on the pictures; auto: quick in reconstruct and in match with a "
+        "joint estimate, else full",
     )
     downscale: float | None = option(
         None,
