@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import read_model, write_model
 from colmap_av1.geometry.posed_model import (
@@ -79,16 +80,24 @@ def _zooming_cameras(run: Run, model: PosedModel, loss_scale: float) -> set[int]
     trial = _adjusted(run, trial, [loss_scale], _TRIAL_TOLERANCE)
     focal = np.array([trial.cameras[image.camera_id].mean_focal_length() for image in trial.images])
     camera_of_image = np.array([image.camera_id for image in model.images])
-    camera_of_observation = camera_of_image[model.points.image]
-    before, after = (robust_costs(reprojection_errors(m), loss_scale) for m in (model, trial))
     zooming = set()
     for number in np.unique(camera_of_image).tolist():
-        own = focal[camera_of_image == number]
-        seen = camera_of_observation == number
-        gain = 1 - after[seen].sum() / before[seen].sum()
+        is_own = camera_of_image == number
+        own = focal[is_own]
+        before, after = (_mean_cost(m, is_own, loss_scale) for m in (model, trial))
+        gain = 1 - after / before
         if own.max() > _MIN_RANGE * own.min() and gain > _MIN_GAIN:
             zooming.add(number)
     return zooming
+
+
+def _mean_cost(model: PosedModel, is_own: NDArray[np.bool_], loss_scale: float) -> float:
+    """Mean cost of the observations in some images.
+
+    Points behind the camera do not count: COLMAP drops them during the adjustment.
+    """
+    errors = reprojection_errors(model)[is_own[model.points.image]]
+    return float(robust_costs(errors[np.isfinite(errors)], loss_scale).mean())
 
 
 def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> PosedModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from colmap_av1.cli.reports import reconstruct_rows
 from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.map import map_database
 from colmap_av1.match import match
 from colmap_av1.options import (
@@ -25,7 +27,8 @@ from colmap_av1.options import (
     MatchOptions,
     ReconstructOptions,
 )
-from colmap_av1.reconstruct import reconstruct
+from colmap_av1.poses.zoom import with_own_cameras
+from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames
 
 ZOOM = 1.2
@@ -77,6 +80,18 @@ def test_a_zoom_is_found_by_match(
     assert errors.num_poses == 20
     assert errors.ate < 0.003 * errors.extent
     assert len(model.cameras) == model.num_reg_images()
+
+
+def test_a_point_behind_a_camera_is_no_zoom(made: ReconstructReport, tmp_path: Path) -> None:
+    """COLMAP drops its observation, so the trial has fewer than the model."""
+    model = posed_model(read_model(made.output / "sparse" / "0"), with_points=True)
+    first = model.images[model.points.image[0]]
+    xyz = model.points.xyz.copy()
+    xyz[0] = first.cam_from_world[:, :3].T @ ([0.0, 0.0, -1.0] - first.cam_from_world[:, 3])
+    behind = replace(model, points=replace(model.points, xyz=xyz))
+    run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
+    found = with_own_cameras(run, behind, [1.0], refine_intrinsics=True)
+    assert found.cameras.keys() == model.cameras.keys()
 
 
 def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> None:
