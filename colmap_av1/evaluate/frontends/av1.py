@@ -30,5 +30,5 @@ def av1_frontend(refine: Literal["none", "lk"], preset: Preset, options: MatchOp
 def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
     images = ImageOptions(frame_list=frame_list(footage, database.with_name("frames.txt")))
     options = replace(options, camera=footage.camera, images=images, on_existing="error")
-    folder = footage.image_path if footage.existed else None
-    return match(database, footage.video, image_path=folder, options=options).seconds
+    report = match(database, footage.video, image_path=footage.image_path, options=options)
+    return report.seconds

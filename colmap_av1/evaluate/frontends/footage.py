@@ -43,7 +43,6 @@ class Footage:
         camera: camera options of all images.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         warnings: warnings from choosing the images.
-        existed: whether the images existed before; such images may be scaled.
     """
 
     video: Path
@@ -56,7 +55,6 @@ class Footage:
     camera: CameraOptions
     forward_motion: bool = False
     warnings: tuple[str, ...] = ()
-    existed: bool = False
 
 
 def choose_footage(
@@ -84,7 +82,6 @@ def choose_footage(
 
     def make() -> dict[str, Any]:
         context = RunContext.of(options.run, progress=progress)
-        existed = bool(existing_images(images, options.images.file_name))
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
                 video,
@@ -105,7 +102,6 @@ def choose_footage(
             "pixel_aspect": prepared.pixel_aspect,
             "forward_motion": _is_forward_motion(prepared, video.path, options),
             "warnings": prepared.tracked.video.warnings,
-            "existed": existed,
         }
 
     given = (options.images, options.camera, options.read, options.encode, options.tracks)
