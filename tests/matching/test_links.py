@@ -225,34 +225,6 @@ def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.shared
-def test_text_over_the_pictures_is_no_place_seen_again(
-    shared: Path, encode: Encode, tmp_path: Path
-) -> None:
-    """As drones' displays are recorded: the same in all pictures, 130 of which it would link."""
-    left_out = {*range(29, 39), *range(56, 66)}
-    clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
-    frames = np.array([picture for i, picture in enumerate(clip) if i not in left_out])
-    lines = {28: "DJI MINI 4 PRO  H 34.2m", 56: "D 112m HS 4.1 VS 0.0", 84: "REC 4K30 HDR 1/400"}
-    lines |= {742: "(c) Skyview Films GmbH", 770: "2026-05-11 ISO100 EV-0.3"}
-    for frame in frames:
-        for y, line in lines.items():
-            cv2.putText(frame, line, (14, y), cv2.FONT_HERSHEY_SIMPLEX, 0.75, (255, 255, 255), 2)
-    display = encode(frames, tmp_path / "display.mp4")
-    report = match(tmp_path / "a.db", display)
-    assert report.links.frames_of_gaps() == [(28, 29), (45, 46)]
-    assert report.links.num_links > 20
-    assert report.links.num_revisits < 25
-
-
-def test_no_picture_is_decoded_for_a_calm_video(shared: Path, tmp_path: Path) -> None:
-    """The selection of tracks that are matched leaves fewer of them long than there are."""
-    report = match(tmp_path / "a.db", shared / "sequences" / "log_building" / "clip.mp4")
-    assert report.links.num_images == 0
-    assert report.links.fast == ()
-
-
-@pytest.mark.slow
 def test_jerk_that_only_the_model_shows(
     encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,23 +260,6 @@ def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None
     assert alignment_error(found, centres) < bound * extent
 
 
-@pytest.mark.slow
-@pytest.mark.shared
-def test_cut_to_what_was_seen_elsewhere_needs_few_features(
-    shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The images on either side of the cut show nothing in common, others do."""
-    monkeypatch.delattr("colmap_av1.matching.links.thorough_plan")
-    clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
-    cut = encode(np.array([*clip[60:], *clip[:30], *clip[46:60]]), tmp_path / "cut.mp4")
-    report = match(tmp_path / "a.db", cut)
-    assert report.links.frames_of_gaps() == [(24, 25), (54, 55)]
-    assert report.links.frames_of_gaps("contradicted") == [(24, 25), (54, 55)]
-    assert report.links.frames_of_gaps("no overlap") == []
-    assert report.links.num_revisits >= 2
-    assert check(tmp_path / "a.db").num_connected_images == 69
-
-
 def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
     """A cut from one place to another that shows nothing of the first."""
     first = np.array([image[:128, :192] for image in pictures()[:14]])
@@ -335,19 +290,3 @@ def test_frames_of_one_colour(
             encode(grey, tmp_path / "grey.mp4"),
             options=MatchOptions(links=LinkOptions(links=links), images=ImageOptions(every=1)),
         )
-
-
-@pytest.mark.slow
-@pytest.mark.shared
-def test_camera_too_fast_for_motion_is_linked(shared: Path, tmp_path: Path) -> None:
-    """A drone whose pictures move by 85 px a frame: the encoder finds next to no motion."""
-    video = shared / "sequences" / "drone_park" / "clip.mp4"
-    report = match(tmp_path / "a.db", video)
-    assert report.links.frames_of_gaps("no overlap") == []
-    assert len(report.links.gaps) == 36
-    assert len(report.links.frames_of_gaps("contradicted")) > 12
-    assert check(tmp_path / "a.db").num_connected_images == 37
-    # No focal length is known, and what the camera flies over is flat.
-    options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
-    models = pycolmap.incremental_mapping(tmp_path / "a.db", tmp_path, tmp_path / "model", options)
-    assert models[0].num_reg_images() == 37
