@@ -322,10 +322,10 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     assert 'alt="Renderings over time"' in text
 
     # What fails leaves its line, and figures of the clouds.
-    for command, told in (("false {data}", str(log)), ("echo {data}", "0 renderings")):
+    for command, message in (("false {data}", str(log)), ("echo {data}", "0 renderings")):
         options = replace(options, trainer=command)
         (column,) = compare(video, output, reference=truth, options=options).columns
-        assert told in column.training_error
+        assert message in column.training_error
         assert column.model.num_registered == 8
         page = unescape((output / "report.html").read_text())
         assert column.training_error in page
@@ -386,11 +386,11 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         "av1=a.h5:b.h5": "name",
         "../x=a.h5:b.h5": "name",
     }
-    for frontends, told in refused.items():
+    for frontends, message in refused.items():
         assert main([*given, "--frontends", frontends]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1
-        assert told in error
+        assert message in error
     for trainer in ("train {scene}", "train {data} {", "train"):
         assert main([*given, "--trainer", trainer]) == 2
         error = capsys.readouterr().err

@@ -37,7 +37,7 @@ from colmap_av1.reconstruct import ReconstructReport
 # Few tracks are mapped quickly.
 MATCHING = MatchOptions(
     images=ImageOptions(every=EVERY),
-    density=DensityOptions(preset="sparse", max_tracks_per_image=150),
+    density=DensityOptions(preset="sparse", max_tracks_per_image=300),
     verify=VerifyOptions(verify="pairs"),
 )
 
@@ -75,7 +75,7 @@ def test_model(database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_p
     assert (report.num_images, report.num_registered) == (NUM_IMAGES, (NUM_IMAGES,))
     assert [told for told in placed if told[0] == "poses"][-1] == ("poses", NUM_IMAGES, NUM_IMAGES)
     model = read_model(report.model)
-    assert report.figures.num_points == model.num_points3D() > 100
+    assert report.figures.num_points == model.num_points3D() > 300
     assert report.figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())
     assert pose_errors(model_poses(model, 60), truth.cam_from_world).rotation < 1
     # The clip is in colour.
@@ -224,7 +224,7 @@ def test_command(
     assert main(words) == 0
     rows = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
     assert rows["images registered"] == f"{NUM_IMAGES} of {NUM_IMAGES}"
-    assert int(rows["points"]) > 100
+    assert int(rows["points"]) > 300
     assert rows["model written to"] == str(tmp_path / "model" / "0")
     assert main(words) == 2
     error = capsys.readouterr().err

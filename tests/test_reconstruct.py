@@ -456,8 +456,8 @@ def test_images_that_are_left_out_are_named(copy: Path, monkeypatch: pytest.Monk
     assert found.num_registered == len(written) < NUM_IMAGES
     every = [f"frame_{EVERY * i:06d}.jpg" for i in range(NUM_IMAGES)]
     missing = [name for name in every if name not in written]
-    (told,) = [note for note in found.warnings if f"{len(missing)} of {NUM_IMAGES}" in note]
-    assert missing[0] in told
+    (warning,) = [note for note in found.warnings if f"{len(missing)} of {NUM_IMAGES}" in note]
+    assert missing[0] in warning
 
 
 def test_without_adjustment(made: ReconstructReport, truth: Truth, copy: Path) -> None:
@@ -541,9 +541,9 @@ def test_command_line(
     words += ["--points", "survey", "--gaussians", str(tmp_path / "init.ply")]
     assert main(words) == 0
     assert f"element vertex {made.num_points}\n".encode() in (tmp_path / "init.ply").read_bytes()
-    told = capsys.readouterr()
-    assert f"points\t{made.num_points}, " in told.out
-    assert "resumed stages\ttracks, " in told.out
+    printed = capsys.readouterr()
+    assert f"points\t{made.num_points}, " in printed.out
+    assert "resumed stages\ttracks, " in printed.out
     model = copy / "sparse" / "0"
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
@@ -555,9 +555,9 @@ def test_command_line(
     # Brush takes the last .ply of a folder, or init.ply: there is one only where it is wanted.
     assert main([*words, "--gaussians", str(tmp_path / "dense" / "init.ply")]) == 0
     assert [p.name for p in tmp_path.glob("dense/*.ply")] == ["init.ply"]
-    told = capsys.readouterr()
-    assert "agree with the poses" in told.out
-    covered = re.search(r"coverage\t(\S+)% of the images, (\S+)% in", told.out)
+    printed = capsys.readouterr()
+    assert "agree with the poses" in printed.out
+    covered = re.search(r"coverage\t(\S+)% of the images, (\S+)% in", printed.out)
     assert covered is not None
     assert float(covered[1]) > 99 > float(covered[2]) > 80
     assert main([*words, "--max_points", "7"]) == 2

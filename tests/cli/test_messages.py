@@ -26,7 +26,7 @@ LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
 posix = pytest.mark.skipif(os.name != "posix", reason="there are no such files or users")
 
 
-def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def error_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line that a command which refuses its input says."""
     try:
         status: object = main(words)
@@ -42,10 +42,10 @@ def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     pipe, database = str(tmp_path / "pipe"), str(tmp_path / "a.db")
     os.mkfifo(pipe)
     for command in (["info"], ["match", "--database", database], ["encode", "--output", "x.mp4"]):
-        error = told([*command, "--video", pipe], capsys)
+        error = error_of([*command, "--video", pipe], capsys)
         assert "pipe" in error
     words = ["match", "--database", database, "--video", str(clip), "--frame_list", pipe]
-    assert "regular file" in told(words, capsys)
+    assert "regular file" in error_of(words, capsys)
     assert os.listdir(tmp_path) == ["pipe"]
 
 
@@ -70,7 +70,7 @@ def test_lists_with_a_mark_of_byte_order(clip: Path, tmp_path: Path, encoding: s
 def test_values_that_begin_like_options(
     words: list[str], way_out: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = told(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
+    error = error_of(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
     assert way_out in error
 
 
@@ -95,19 +95,19 @@ def test_paths_that_are_empty(
     """As of variables of a shell that are not set."""
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(clip, "v.mp4")
-    assert "empty" in told(words, capsys)
+    assert "empty" in error_of(words, capsys)
     assert os.listdir() == ["v.mp4"]
 
 
 def test_values_below_zero_are_values(capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--cosine", "-0.5"], ["--cosine=-1e-3"], ["--cosine", "-1"]):
-        error = told(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
+        error = error_of(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
         assert "none.mp4" in error
 
 
 def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["info"], ["match", "--database", "a.db"], ["reconstruct", "--output", "out"]):
-        error = told([*command, "--video", "none.mp4", "--operating_point", "99"], capsys)
+        error = error_of([*command, "--video", "none.mp4", "--operating_point", "99"], capsys)
         assert "operating_point" in error
 
 
@@ -115,7 +115,7 @@ def test_operating_points_that_this_stream_has_not(
     clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for video, point in ((clip, 1), (LAYERS, 2)):
-        error = told(["info", "--video", str(video), "--operating_point", str(point)], capsys)
+        error = error_of(["info", "--video", str(video), "--operating_point", str(point)], capsys)
         assert f"operating_point {point}" in error
 
 
@@ -130,7 +130,7 @@ def test_colours_that_there_are_none_of(
     words = ["match", "--quiet", "--video", str(reserved), "--database"]
     assert main([*words, str(tmp_path / "a.db")]) == 0
     with_images = [*words, str(tmp_path / "b.db"), "--image_path", str(tmp_path / "images")]
-    assert "colour matrix" in told(with_images, capsys)
+    assert "colour matrix" in error_of(with_images, capsys)
     assert sorted(os.listdir(tmp_path)) == ["a.db", "v.mp4"]
 
 

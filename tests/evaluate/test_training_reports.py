@@ -63,8 +63,8 @@ def train_with(split: Split, program: str, milestones: tuple[int, ...] = (2, 6))
 
 def test_a_command_renders_at_milestones(split: Split) -> None:
     training = train_with(split, TRAINER, (6, 2, 8, 20))
-    told = [(state.iteration, state.seconds, state.num_gaussians) for state in training.states]
-    assert told == [(2, 4, 200), (6, 12, 600), (8, 16, 800)]
+    states = [(state.iteration, state.seconds, state.num_gaussians) for state in training.states]
+    assert states == [(2, 4, 200), (6, 12, 600), (8, 16, 800)]
     psnr = [state.mean("psnr_y") for state in training.states]
     assert psnr[0] < psnr[1] < psnr[2] == 60
     assert (training.seconds, training.metrics.psnr_y.tolist()) == (16, [60, 60])
@@ -84,16 +84,16 @@ def test_a_command_renders_at_milestones(split: Split) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("str(stop)", "str(stop + 1)", "0 renderings"),
         ("iterations,seconds", "steps,seconds", r"times\.csv"),
         ("{2 * stop}", "nan", r"times\.csv"),
     ],
 )
-def test_what_a_command_did_not_write(split: Split, old: str, new: str, told: str) -> None:
+def test_what_a_command_did_not_write(split: Split, old: str, new: str, message: str) -> None:
     assert old in TRAINER
-    with pytest.raises(EvaluationError, match=told):
+    with pytest.raises(EvaluationError, match=message):
         train_with(split, TRAINER.replace(old, new))
     assert not (split.data.parent / "training" / "result.json").exists()
 

@@ -1,4 +1,4 @@
-"""Images that are all blurred are told."""
+"""Images that are all blurred are reported."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def test_blurred_images_are_told(sharp: list[NDArray[np.uint8]], tmp_path: Path)
     files = [tmp_path / f"{index}.png" for index in range(len(sharp))]
     for file, picture in zip(files, sharp, strict=True):
         cv2.imwrite(str(file), gaussian(picture))
-    told = blur_warning(files)
-    assert told is not None
-    assert told.startswith(f"{tmp_path}: the images are blurred")
+    warning = blur_warning(files)
+    assert warning is not None
+    assert warning.startswith(f"{tmp_path}: the images are blurred")
     # One that is blurred among sharp ones is nothing to tell.
     for file, picture in zip(files[1:], sharp[1:], strict=True):
         cv2.imwrite(str(file), picture)
@@ -67,9 +67,9 @@ def test_motion_blur_is_told(
     files = [tmp_path / f"{index}.png" for index in range(3)]
     for file, picture in zip(files, sharp, strict=False):
         cv2.imwrite(str(file), along_a_line(picture, length, radians))
-    told = blur_warning(files)
-    assert told is not None
-    assert "blurred" in told
+    warning = blur_warning(files)
+    assert warning is not None
+    assert "blurred" in warning
 
 
 @pytest.mark.shared

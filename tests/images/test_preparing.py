@@ -45,16 +45,16 @@ def prepared(
 
 
 def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
-    clock, told = Clock(), set()
+    clock, stages = Clock(), set()
     found = prepare_images(
         read_video(clip),
         None,
         replace(OPTIONS, images=ImageOptions(num_images=5)),
         listed={},
         next_to=NEXT_TO,
-        context=RunContext(clock, lambda stage, done, total: told.add(stage)),
+        context=RunContext(clock, lambda stage, done, total: stages.add(stage)),
     )
-    assert "looking" not in told
+    assert "looking" not in stages
     assert "decoding" not in clock.seconds
     assert found.tracked.chosen.names == image_names("frame_%06d.png", found.tracked.chosen.frames)
     assert found.size == (192, 128)

@@ -54,9 +54,9 @@ def test_bent_model_is_told(
     assert found.warning() is not None
     words = ["check", "--strict", "--model", str(bent), "--image_path", str(images)]
     assert main(words) == _FAILED_CHECK
-    told = capsys.readouterr()
-    assert "long-range epipolar error" in told.out
-    assert "doubled" in told.err
+    printed = capsys.readouterr()
+    assert "long-range epipolar error" in printed.out
+    assert "doubled" in printed.err
     whole = ["check", "--strict", "--model", str(made.output / "sparse" / "0")]
     assert main([*whole, "--image_path", str(images)]) == 0
 

@@ -153,8 +153,8 @@ def test_what_is_asked_for() -> None:
 def test_command(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--video", str(clip), "--rolling_shutter=12.5"]
     assert main(["match", "--database", str(tmp_path / "a.db"), *words]) == 0
-    told = capsys.readouterr().out
-    assert "rolling shutter\t12.5 ms" in told
+    printed = capsys.readouterr().out
+    assert "rolling shutter\t12.5 ms" in printed
     report = match(tmp_path / "b.db", clip)
     assert report.read_outs == (None,)
 
@@ -168,9 +168,9 @@ def test_info_tells_the_read_out_time(
     assert "rolling shutter" not in without
     words += ["--rolling_shutter", "estimate"]
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert told.startswith(without)
-    assert told[len(without) :].startswith("rolling shutter\t")
+    printed = capsys.readouterr().out
+    assert printed.startswith(without)
+    assert printed[len(without) :].startswith("rolling shutter\t")
 
     def track(source: VideoSource, *_: object, **__: object) -> TrackedVideo:
         tracks = tracks_of(0.45)

@@ -163,19 +163,19 @@ def test_what_lies_over_the_picture_is_told_of(encode: Encode, tmp_path: Path) -
 def test_stages_do_not_count_twice(clip: Path) -> None:
     clock = Clock()
     lk = replace(OPTIONS, refine=RefineOptions(refine="lk"))
-    told: list[tuple[str, int, int | None]] = []
+    calls: list[tuple[str, int, int | None]] = []
     with clock.measure("all"):
         track_video(
             opened(clip),
             lk.tracking,
             one_size=True,
-            context=RunContext(clock, lambda *w: told.append(w)),
+            context=RunContext(clock, lambda *w: calls.append(w)),
         )
     whole = clock.seconds.pop("all")
     assert min(clock.seconds.values()) >= 0
     assert sum(clock.seconds.values()) <= whole
-    assert ("motion", 16, 16) in told
-    assert told[-1] == ("refinement", 16, 16)
+    assert ("motion", 16, 16) in calls
+    assert calls[-1] == ("refinement", 16, 16)
 
 
 @pytest.fixture

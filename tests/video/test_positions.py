@@ -70,14 +70,14 @@ def test_no_position_that_can_be_one(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path,
     ],
 )
 def test_a_place_that_is_none_is_told(said: str, why: str | None) -> None:
-    told = implausible_position((("com.apple.quicktime.location.iso6709", said),))
+    warning = implausible_position((("com.apple.quicktime.location.iso6709", said),))
     if why is None:
-        assert told is None
+        assert warning is None
         return
-    assert told is not None
-    assert why in told
-    assert told.isprintable()
-    assert len(told) < 140
+    assert warning is not None
+    assert why in warning
+    assert warning.isprintable()
+    assert len(warning) < 140
 
 
 def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) -> None:
@@ -96,32 +96,32 @@ def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) 
         found = read_positions(read_file(video))
         return (len(found.times), found.left_out) if found is not None else (0, None)
 
-    count, told = of_gopro(gps5(np.vstack([PLACES, wrong[:3]])))
+    count, warning = of_gopro(gps5(np.vstack([PLACES, wrong[:3]])))
     assert count == len(PLACES)
-    assert told is not None
-    assert told.endswith("gopro.mp4: ignored 3 invalid GPS positions")
+    assert warning is not None
+    assert warning.endswith("gopro.mp4: ignored 3 invalid GPS positions")
     for body in (gps5(no_fix), gps5(PLACES, fix=0), payload[:100]):
-        count, told = of_gopro(body)
+        count, warning = of_gopro(body)
         assert count == 0
-        assert told is not None
-        assert "no fix" in told
+        assert warning is not None
+        assert "no fix" in warning
     assert of_gopro(grav(np.eye(3))) == (0, None)
 
-    count, told = of_drone(dji_text(np.vstack([PLACES, wrong[:2]]), 25))
+    count, warning = of_drone(dji_text(np.vstack([PLACES, wrong[:2]]), 25))
     assert count == len(PLACES)
-    assert told is not None
-    assert " 2 " in told
+    assert warning is not None
+    assert " 2 " in warning
     stamp = "1\n00:00:00,000 --> 00:00:01,000\n"
     for text in ("[latitude: abc] [longitude: ] GPS(--,nan,1e999)", "Lat 59.3293 Lon 18.0686"):
-        count, told = of_drone(f"{stamp}{text}\n\n")
+        count, warning = of_drone(f"{stamp}{text}\n\n")
         assert count == 0
-        assert told is not None
-        assert told.endswith("has no positions in a known format")
+        assert warning is not None
+        assert warning.endswith("has no positions in a known format")
     # As cameras leave it that were switched off, and what is no .srt file.
     for text in ("", "no subtitles"):
         beside.write_text(text)
-        count, told = of_drone(text)
-        assert told == f"{beside} has no positions in a known format"
+        count, warning = of_drone(text)
+        assert warning == f"{beside} has no positions in a known format"
     # Without a fix, and subtitles of another kind.
     assert of_drone(dji_text(no_fix, 25)) == (0, None)
     assert of_drone(f"{stamp}Hello there\n\n") == (0, None)
