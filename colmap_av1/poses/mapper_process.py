@@ -105,9 +105,10 @@ def _adjust(settings: dict[str, Any]) -> None:
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]
-    for scale, tolerance in zip(
-        settings["loss_scales"], settings["function_tolerances"], strict=True
-    ):
+    scales, tolerances = settings["loss_scales"], settings["function_tolerances"]
+    for number, (scale, tolerance) in enumerate(zip(scales, tolerances, strict=True)):
+        if number > 0:
+            solver.initial_trust_region_radius = settings["late_trust_radius"]
         options.ceres.loss_function_scale = scale
         solver.function_tolerance = tolerance
         pycolmap.bundle_adjustment(model, options)

@@ -51,12 +51,10 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # With fewer tracks per image than this, a failed initialization is blamed on the tracks.
 _FEW_TRACKS = 100
-# The global mapper initializes from this number of tracks per image, the longest ones, and its
-# optimizations end at this relative change of the cost. This takes half the time of 200 tracks and
-# COLMAP's tolerance, and the adjustment that follows ends at the same poses. Links between videos
-# are short tracks, so where poses depend on them all tracks are used.
+# The global mapper initializes from this number of tracks per image, the longest ones, which takes
+# half the time of 200, and the adjustment that follows ends at the same poses. All tracks are used
+# where poses depend on links, which are short tracks, and in fast turns, where few tracks are long.
 START_TRACKS = 100
-TOLERANCE = 1e-4
 # The selection of tracks for bundle adjustment, and the scales of its robust loss in pixels. Half
 # of the observations have errors below 0.3 to 0.4 px; larger ones have drifted. The first
 # adjustment has a larger scale: the mapper may leave images whose observations are all far off.
@@ -133,8 +131,7 @@ def pose_stage(
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
-    start_tracks = None if depends_on_links else START_TRACKS
-    tolerance = TOLERANCE if mapping.adjust and not depends_on_links else None
+    start_tracks = None if depends_on_links or links.fast else START_TRACKS
     attempts = [
         MapOptions(
             mapper=mapper,
@@ -157,7 +154,7 @@ def pose_stage(
                 num_images=len(keyed.images.names),
                 progress=progress,
                 start_tracks=start_tracks,
-                tolerance=tolerance,
+                adjusted_later=mapping.adjust,
             )
             return [
                 posed_model(read_model(Path(models) / str(number)))
@@ -192,7 +189,7 @@ def pose_stage(
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, attempts, start_tracks, tolerance, pycolmap.__version__],
+        [matched.digest, attempts, start_tracks, mapping.adjust, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],

@@ -35,7 +35,6 @@ from colmap_av1.poses.pose_stages import (
     FROM_PICTURES,
     LOSS_SCALES,
     START_TRACKS,
-    TOLERANCE,
     AdjustedResult,
     adjust_in,
     refines_intrinsics,
@@ -106,7 +105,6 @@ def remap_stage(
         [
             adjusted.digest,
             START_TRACKS,
-            TOLERANCE,
             LOSS_SCALES,
             _LEAST_KEPT,
             run.options.match.verify,
@@ -145,7 +143,7 @@ def _map_tracks(
             num_images=len(known.images),
             progress=run.progress,
             start_tracks=START_TRACKS,
-            tolerance=TOLERANCE,
+            adjusted_later=True,
         )
         return posed_model(read_model(models / "0")) if sizes else None
 
