@@ -49,9 +49,9 @@ _MAX_FOCAL_FACTOR, _MAX_DISTORTION_CHANGE = 2.0, 0.5
 _MAPPER_LIMITS = 0.1, 10.0, 1.0
 # About this many points are adjusted.
 _NUM_ADJUSTED = 200
-# The mapper adjusts few images with 100 iterations, up to five times after each image, and with this
-# gradient tolerance. Intrinsics may diverge slowly.
-_NUM_ITERATIONS, _GRADIENT_TOLERANCE = 300, 0.1
+# The mapper adjusts few images up to five times, with 100 iterations and this gradient tolerance.
+# Some intrinsics diverge slowly.
+_NUM_ITERATIONS, _GRADIENT_TOLERANCE = 500, 0.1
 
 
 @dataclass(frozen=True)

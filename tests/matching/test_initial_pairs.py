@@ -149,6 +149,18 @@ def test_camera_adjusted_far_off() -> None:
     assert num_demoted > 5
 
 
+def test_camera_adjusted_far_off_after_many_iterations() -> None:
+    """Focal length and two distortion parameters diverge slowly from two views."""
+    camera = make_camera(CameraOptions(camera_model="RADIAL"), WIDTH, HEIGHT)
+    keypoints, matches = turned_views(0.3, 0.1, 120, np.random.default_rng(1))
+    (geometry,) = verify_pairs(keypoints, PAIR, [matches], camera)
+    matched = MatchedImages(keypoints, PAIR, [matches], [geometry], False)
+    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    poses = [np.eye(3, 4), np.hstack([turn, np.array([[0], [0], [1]]) - turn[:, 2:]])]
+    (found,) = demote_bad_initial_pairs(matched, [camera] * 2, Clock(), poses).geometries
+    assert len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS > len(found.inlier_matches)
+
+
 def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
     rng = np.random.default_rng(3)
     keypoints, matches = turned_views(0.5, 0.3, 300, rng)
