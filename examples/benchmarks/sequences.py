@@ -12,7 +12,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1 import CameraOptions, ImageOptions, VideoError
+from colmap_av1 import CameraOptions, ImageOptions, MatchOptions, VerifyOptions, VideoError
 from colmap_av1.evaluate import Footage, FrontendRun, make_frontends, run_frontend
 from colmap_av1.evaluate.metrics.poses import frame_number, read_poses
 from colmap_av1.geometry.colmap_model import posed_images
@@ -22,8 +22,9 @@ from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.facts import read_video
 
-# The front-ends with default options, by name.
-FRONTENDS = make_frontends()
+# The front-ends by name. Image pairs are verified separately: the joint estimate would discard the
+# tracks that are measured.
+FRONTENDS = make_frontends(MatchOptions(verify=VerifyOptions(verify="pairs")))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ def make_frontends(
     match = match if match is not None else MatchOptions()
     learned = learned if learned is not None else LearnedOptions()
     return {
-        # "av1" uses the bitstream alone; "av1-refined" refines tracks in the decoded pictures.
+        # "av1-refined" refines tracks in the decoded pictures.
         "av1": av1_frontend("none", "default", match),
         "av1-sparse": av1_frontend("none", "sparse", match),
         "av1-dense": av1_frontend("none", "dense", match),
