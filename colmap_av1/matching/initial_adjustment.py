@@ -28,8 +28,16 @@ _Floats = NDArray[np.float64]
 # a time, and takes the first it finds; if it finds none, it goes on to the other images. Here, at
 # least the first number of images and at most the second are tried.
 _NUM_FIRST_IMAGES, _MAX_IMAGES = 16, 100
+# The mapper's limits of inliers and angle. The next ones are tried if no pair meets the first ones.
+_LIMITS = (
+    (INITIAL_MIN_INLIERS, INITIAL_MIN_ANGLE),
+    (INITIAL_MIN_INLIERS // 2, INITIAL_MIN_ANGLE),
+    (INITIAL_MIN_INLIERS // 2, INITIAL_MIN_ANGLE / 2),
+)
 # The mapper estimates a pair's pose anew by RANSAC: fewest trials, and largest error in pixels.
 _NUM_TRIALS, _MAX_ERROR = 30, 4.0
+# Neighbours are at most this many images apart.
+_NEIGHBOURS = 2
 # Estimates of each pair's pose, with different seeds.
 _NUM_SEEDS = 2
 # The mapper may accept or reject a pair this close to its limits at random: a factor of the inliers
@@ -37,7 +45,7 @@ _NUM_SEEDS = 2
 _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
 # A quick test with about this many inliers rejects pairs below this share of the angle.
 _NUM_QUICK = 64
-_QUICK_SHARE = 0.75
+_QUICK_SHARE = 0.5
 # Rotations differ if the angle between them exceeds this share of the triangulation angle: from a
 # known rotation, and between two estimates of the same pair.
 _WRONG, _SAME = 0.25, 0.05
@@ -194,7 +202,8 @@ def runaway_starts(
     The mapper first adjusts focal length and distortion to two images alone. If their matches do
     not determine these, the values may end anywhere: no third image registers, and the mapper
     writes the two images as its first model. Pairs are tried in the mapper's order, for each image
-    up to the first pair that the mapper certainly accepts and that is stable.
+    up to the first pair that the mapper certainly accepts and that is stable. If there is no such
+    pair, they are tried again with the mapper's lower limits.
 
     Args:
         matched: the images.
@@ -203,30 +212,48 @@ def runaway_starts(
 
     Returns:
         Indices of pairs. Empty if no poses are known and no tried pair is stable, as no other pair
-        would then be a better start.
+        would then be a better start. If poses are known and no pair meets the mapper's first
+        limits, all pairs with few inliers but those that are certainly stable.
     """
-    starts: dict[int, _Start | None] = {}
-    num_certain = 0
-    for num_looked, of_image in enumerate(_in_order(matched, cameras)):
-        if num_looked >= _NUM_FIRST_IMAGES and num_certain:
-            break
-        for k in of_image:
-            if k not in starts:
-                pair = matched.pairs[k].tolist()
-                starts[k] = _try_start(matched, cameras, pair, matched.geometries[k], known)
-            start = starts[k]
-            if start is not None and start.is_stable and start.is_certain:
-                num_certain += 1
-                break
-    stable = {k: start.is_stable for k, start in starts.items() if start is not None}
-    if not (known.cam_from_world or any(stable.values())):
-        return []
-    return [k for k in sorted(stable) if not stable[k]]
-
-
-def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Iterator[list[int]]:
-    """Yield the pairs of each image in the order in which the mapper tries images and pairs."""
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
+    runaway, sure = set[int](), set[int]()
+    for limits in _LIMITS:
+        starts: dict[int, _Start | None] = {}
+        for num_looked, of_image in enumerate(_in_order(matched, cameras, counts, limits[0])):
+            if num_looked >= _NUM_FIRST_IMAGES and sure:
+                break
+            for k in of_image:
+                if k in runaway:
+                    continue
+                if k not in starts:
+                    pair = matched.pairs[k].tolist()
+                    geometry = matched.geometries[k]
+                    starts[k] = _try_start(matched, cameras, pair, geometry, known, limits=limits)
+                start = starts[k]
+                if start is not None and start.is_stable and start.is_certain:
+                    sure.add(k)
+                    break
+        stable = {k: start.is_stable for k, start in starts.items() if start is not None}
+        if known.cam_from_world or any(stable.values()):
+            runaway |= {k for k, is_stable in stable.items() if not is_stable}
+        if sure:
+            break
+    if known.cam_from_world and limits != _LIMITS[0]:
+        # The mapper tries hundreds of pairs with few inliers, and RANSAC may give any of them a
+        # wrong pose with a large angle. Neighbours keep their inliers, which connect them.
+        apart = np.diff(matched.pairs.reshape(-1, 2), axis=1)[:, 0] > _NEIGHBOURS
+        few = (counts >= INITIAL_MIN_INLIERS // 2) & (counts < INITIAL_MIN_INLIERS)
+        runaway |= set(np.flatnonzero(apart & few).tolist()) - sure
+    return sorted(runaway)
+
+
+def _in_order(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    counts: NDArray[np.intp],
+    min_inliers: int,
+) -> Iterator[list[int]]:
+    """Yield the pairs of each image in the order in which the mapper tries images and pairs."""
     used = np.where(counts >= MIN_INLIERS, counts, 0)
     pairs = matched.pairs.reshape(-1, 2)
     totals = np.zeros(len(cameras), dtype=np.intp)
@@ -234,7 +261,7 @@ def _in_order(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> Ite
         np.add.at(totals, side, used)
     known = np.array([camera.has_prior_focal_length for camera in cameras], dtype=bool)
     for image in np.lexsort((-totals, ~known))[:_MAX_IMAGES]:
-        own = np.flatnonzero((pairs == image).any(axis=1) & (counts >= INITIAL_MIN_INLIERS))
+        own = np.flatnonzero((pairs == image).any(axis=1) & (counts >= min_inliers))
         yield own[np.argsort(-counts[own], kind="stable")].tolist()
 
 
@@ -257,33 +284,41 @@ def _try_start(
     pair: Sequence[int],
     geometry: TwoViewGeometry,
     known: KnownPoses,
+    *,
+    limits: tuple[int, float],
 ) -> _Start | None:
-    """Begin a model with a pair as the mapper does; None if the mapper rejects the pair."""
+    """Begin a model with a pair as the mapper does; None if the mapper rejects the pair.
+
+    `limits` are the fewest inliers and the smallest angle in degrees, see `_LIMITS`.
+    """
+    min_inliers, min_angle = limits
     some = _some_inliers(matched, cameras, pair, geometry)
     pose = _pose(geometry, some)
-    if pose is None or not _is_wide(
-        pose, triangulation_angle(pose[:, :3], some.rays), _QUICK_SHARE
-    ):
+    if pose is None:
+        return None
+    angle = triangulation_angle(pose[:, :3], some.rays)
+    if not _is_wide(pose, angle / min_angle, _QUICK_SHARE):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
     rotations, certain = list[_Floats](), list[bool]()
     for rows, pose, angle in _poses(inliers):
         # A pose just below the limits is tried, too: with another seed the mapper may accept it.
-        if len(rows) * _MARGIN < INITIAL_MIN_INLIERS or not _is_wide(pose, angle, 1 / _MARGIN):
+        share = angle / min_angle
+        if len(rows) * _MARGIN < min_inliers or not _is_wide(pose, share, 1 / _MARGIN):
             continue
         rotation = pose[:, :3]
         if known.contradict(pair, rotation, angle):
             return _Start(is_stable=False, is_certain=False)
         # Adjustment from nearly the same pose has the same result, so it is not repeated.
         if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
-            is_stable = _is_stable(inliers, rows, pose)
+            is_stable = _is_stable(inliers, rows, pose, min_angle)
             if is_stable is None:
                 continue
             if not is_stable:
                 return _Start(is_stable=False, is_certain=False)
         rotations.append(rotation)
-        enough = len(rows) >= _MARGIN * INITIAL_MIN_INLIERS
-        certain.append(enough and _is_wide(pose, angle, _MARGIN))
+        enough = len(rows) >= _MARGIN * min_inliers
+        certain.append(enough and _is_wide(pose, share, _MARGIN))
     if not certain:
         return None
     return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
@@ -312,10 +347,13 @@ def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
     return None if E is None else pose_of_essential(E, inliers)
 
 
-def _is_wide(pose: _Floats, angle: float, margin: float) -> bool:
-    """Whether a pair meets the mapper's limits of angle and forward motion, within a margin."""
+def _is_wide(pose: _Floats, share: float, margin: float) -> bool:
+    """Whether a pair meets the mapper's limits of angle and forward motion, within a margin.
+
+    `share` is the pair's angle divided by the smallest one that the mapper accepts.
+    """
     most = INITIAL_MAX_FORWARD_MOTION + (_FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN)
-    return bool(angle >= margin * INITIAL_MIN_ANGLE and abs(pose[2, 3]) <= most)
+    return bool(share >= margin and abs(pose[2, 3]) <= most)
 
 
 def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:
@@ -348,7 +386,9 @@ def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, 
             yield rows, pose, triangulation_angle(pose[:, :3], rays)
 
 
-def _is_stable(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) -> bool | None:
+def _is_stable(
+    inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats, min_angle: float
+) -> bool | None:
     """Whether bundle adjustment keeps the intrinsics; None if too few points are triangulated."""
     x = [own[:, rows] for own in inliers.x]
     points = cv2.triangulatePoints(np.eye(3, 4), pose, *x)
@@ -362,7 +402,7 @@ def _is_stable(inliers: PairInliers, rows: NDArray[np.uint32], pose: _Floats) ->
     sides = np.stack([seen - pose[:, 3], seen])
     lengths = np.linalg.norm(sides, axis=2)
     cosine = (sides[0] * sides[1]).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-12)
-    inside &= np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) >= INITIAL_MIN_ANGLE
+    inside &= np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) >= min_angle
     if inside.sum() < INITIAL_MIN_POINTS:
         return None
     some = np.flatnonzero(inside)[:: max(1, np.count_nonzero(inside) // _NUM_ADJUSTED)]

@@ -68,7 +68,7 @@ def map_poses(
     num_images: int,
     progress: Progress,
     start_tracks: int | None = None,
-    adjusted_later: bool = False,
+    ends_early: bool = False,
 ) -> tuple[int, ...]:
     """Map a database in a separate process, see `run_mapper`.
 
@@ -82,7 +82,7 @@ def map_poses(
         progress: called in the stage "poses" with the number of images registered so far.
         start_tracks: number of tracks per image, the longest ones, that the global mapper starts
             from; the others are triangulated and adjusted afterwards. None uses all.
-        adjusted_later: end global bundle adjustment early, because the poses are adjusted later.
+        ends_early: end global bundle adjustment early, because the poses are adjusted later.
 
     Returns:
         Number of registered images of each model, in descending order; empty if there is no model.
@@ -92,7 +92,7 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
-    tolerance = _MAPPER_TOLERANCE if adjusted_later else None
+    tolerance = _MAPPER_TOLERANCE if ends_early else None
     settings |= {"start_tracks": start_tracks, "tolerance": tolerance}
     progress("poses", 0, num_images)
     sizes: list[int] = []

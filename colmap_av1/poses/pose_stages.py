@@ -132,6 +132,8 @@ def pose_stage(
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
     start_tracks = None if depends_on_links or links.fast else START_TRACKS
+    # Where poses depend on links, walks with fast turns bend if the mapper ends early.
+    ends_early = mapping.adjust and not depends_on_links
     attempts = [
         MapOptions(
             mapper=mapper,
@@ -154,7 +156,7 @@ def pose_stage(
                 num_images=len(keyed.images.names),
                 progress=progress,
                 start_tracks=start_tracks,
-                adjusted_later=mapping.adjust,
+                ends_early=ends_early,
             )
             return [
                 posed_model(read_model(Path(models) / str(number)))
@@ -189,7 +191,7 @@ def pose_stage(
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, attempts, start_tracks, mapping.adjust, pycolmap.__version__],
+        [matched.digest, attempts, start_tracks, ends_early, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],

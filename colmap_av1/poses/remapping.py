@@ -143,7 +143,7 @@ def _map_tracks(
             num_images=len(known.images),
             progress=run.progress,
             start_tracks=START_TRACKS,
-            adjusted_later=True,
+            ends_early=True,
         )
         return posed_model(read_model(models / "0")) if sizes else None
 

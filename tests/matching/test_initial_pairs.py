@@ -161,6 +161,29 @@ def test_camera_adjusted_far_off_after_many_iterations() -> None:
     assert len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS > len(found.inlier_matches)
 
 
+def test_pairs_with_few_inliers_if_no_pair_has_a_large_angle() -> None:
+    """The mapper tries these first then, and might begin with any of them by chance."""
+    rng = np.random.default_rng(0)
+    pairs = np.array([[0, 1], [2, 9], [3, 4]], dtype=np.int32)
+    nothing = np.empty((0, 2), np.float32)
+    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
+    poses = [np.eye(3, 4) for _ in range(10)]
+    geometries = []
+    for (i, j), count, angle in zip(pairs.tolist(), (400, 80, 80), (12.0, 7.0, 7.0), strict=True):
+        views, matches = two_views(4.0, rng, count, angle)
+        keypoints[i], keypoints[j] = views
+        turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
+        poses[j] = np.column_stack([turn, turn @ [-np.radians(angle), 0, 0]])
+        geometries.append(verified(views, matches))
+    matched = MatchedImages(
+        keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
+    )
+    found = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), poses).geometries
+    assert found[0] is geometries[0]
+    assert len(found[1].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
+    assert found[2] is geometries[2]
+
+
 def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
     rng = np.random.default_rng(3)
     keypoints, matches = turned_views(0.5, 0.3, 300, rng)
