@@ -1,8 +1,8 @@
-"""Find initial pairs whose bundle adjustment in COLMAP's mapper makes the intrinsics diverge."""
+"""Find pairs with which COLMAP's incremental mapper should not begin a model."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
-    INITIAL_LEAST_ANGLE,
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
@@ -46,6 +45,8 @@ _MARGIN, _FORWARD_MARGIN = 1.1, 0.02
 # A quick test with about this many inliers rejects pairs below this share of the angle.
 _NUM_QUICK = 64
 _QUICK_SHARE = 0.5
+# A pair with a wrong pose may begin a model if it has this share of the angle.
+_WIDE_SHARE = 0.75
 # Rotations differ if the angle between them exceeds this share of the triangulation angle: from a
 # known rotation, and between two estimates of the same pair.
 _WRONG, _SAME = 0.25, 0.05
@@ -165,14 +166,17 @@ class KnownPoses:
 
     def misleading_pairs(
         self, matched: MatchedImages, cameras: Sequence[pycolmap.Camera]
-    ) -> list[int]:
-        """Find pairs with a wrong pose and an angle that is wide enough for an initial pair.
+    ) -> dict[int, float]:
+        """Find pairs with a wrong pose.
 
         Args:
             matched: the images.
             cameras: the camera of each image.
+
+        Returns:
+            The triangulation angle in degrees of these pairs, by index, according to their pose.
         """
-        found = []
+        found = {}
         for k, (pair, geometry) in enumerate(
             zip(matched.pairs.tolist(), matched.geometries, strict=True)
         ):
@@ -185,19 +189,18 @@ class KnownPoses:
             if pose is None:
                 continue
             angle = triangulation_angle(pose[:, :3], some.rays)
-            if angle >= _QUICK_SHARE * INITIAL_LEAST_ANGLE and self.contradict(
-                pair, pose[:, :3], angle
-            ):
-                found.append(k)
+            if self.contradict(pair, pose[:, :3], angle):
+                found[k] = angle
         return found
 
 
-def runaway_starts(
+def bad_initial_pairs(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
-    known: KnownPoses = KnownPoses(),
+    known: KnownPoses,
+    misleading: Mapping[int, float],
 ) -> list[int]:
-    """Find initial pairs with which bundle adjustment makes the intrinsics diverge.
+    """Find initial pairs with a wrong pose, or with intrinsics that diverge in an adjustment.
 
     The mapper first adjusts focal length and distortion to two images alone. If their matches do
     not determine these, the values may end anywhere: no third image registers, and the mapper
@@ -209,21 +212,29 @@ def runaway_starts(
         matched: the images.
         cameras: the camera of each image.
         known: known poses, which the pose of a pair must not contradict.
+        misleading: triangulation angle in degrees of pairs whose pose is wrong, by index.
 
     Returns:
-        Indices of pairs. Empty if no poses are known and no tried pair is stable, as no other pair
-        would then be a better start. If poses are known and no pair meets the mapper's first
-        limits, all pairs with few inliers but those that are certainly stable.
+        Indices of pairs. Pairs that diverge are not among them if no poses are known and no tried
+        pair is stable, as no other pair would then be a better start. If poses are known and no
+        pair meets the mapper's first limits, all pairs with few inliers are among them, except
+        those that are certainly stable.
     """
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
-    runaway, sure = set[int](), set[int]()
+    bad, sure = set[int](), set[int]()
     for limits in _LIMITS:
+        # Pairs that the mapper rejects keep their inliers, however wrong their pose is.
+        bad |= {
+            k
+            for k, angle in misleading.items()
+            if counts[k] >= limits[0] and angle >= _WIDE_SHARE * limits[1]
+        }
         starts: dict[int, _Start | None] = {}
         for num_looked, of_image in enumerate(_in_order(matched, cameras, counts, limits[0])):
             if num_looked >= _NUM_FIRST_IMAGES and sure:
                 break
             for k in of_image:
-                if k in runaway:
+                if k in bad:
                     continue
                 if k not in starts:
                     pair = matched.pairs[k].tolist()
@@ -235,7 +246,7 @@ def runaway_starts(
                     break
         stable = {k: start.is_stable for k, start in starts.items() if start is not None}
         if known.cam_from_world or any(stable.values()):
-            runaway |= {k for k, is_stable in stable.items() if not is_stable}
+            bad |= {k for k, is_stable in stable.items() if not is_stable}
         if sure:
             break
     if known.cam_from_world and limits != _LIMITS[0]:
@@ -243,8 +254,8 @@ def runaway_starts(
         # wrong pose with a large angle. Neighbours keep their inliers, which connect them.
         apart = np.diff(matched.pairs.reshape(-1, 2), axis=1)[:, 0] > _NEIGHBOURS
         few = (counts >= INITIAL_MIN_INLIERS // 2) & (counts < INITIAL_MIN_INLIERS)
-        runaway |= set(np.flatnonzero(apart & few).tolist()) - sure
-    return sorted(runaway)
+        bad |= set(np.flatnonzero(apart & few).tolist()) - sure
+    return sorted(bad)
 
 
 def _in_order(

@@ -13,13 +13,13 @@ from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_adjustment import (
     KnownPoses,
     PairInliers,
+    bad_initial_pairs,
     inliers_of,
     pose_of_essential,
     pose_of_homography,
-    runaway_starts,
     triangulation_angle,
 )
-from colmap_av1.matching.mapper_limits import INITIAL_MIN_ANGLE, INITIAL_MIN_INLIERS
+from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.util.progress import Clock
@@ -27,10 +27,8 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# If no pair meets the mapper's limits for an initial pair, it halves them: first the inliers, then
-# the angle in degrees.
+# If no pair meets the mapper's limits for an initial pair, it halves the number of inliers.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
-_MIN_ANGLE = INITIAL_MIN_ANGLE / 2
 # The pose of the homography is wrong if its triangulation angle and its error both exceed those of
 # the essential matrix by these factors. If the parallax of nearby images is below the mapper's
 # noise limit of 4 px, the angle is two to ten times as large and the error of most matches two to
@@ -53,7 +51,8 @@ def demote_bad_initial_pairs(
     (`EstimateTwoViewGeometryPose`). If the matches contradict this pose, or if bundle adjustment of
     the pair alone makes the intrinsics diverge, a model that begins with the pair fails after a few
     images, and the mapper still writes it first. A demoted pair keeps enough inliers to connect its
-    images; tracks continue through the pairs between.
+    images; tracks continue through the pairs between. Pairs keep all inliers if the mapper finds a
+    good pair before it lowers its limits to theirs.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -65,16 +64,16 @@ def demote_bad_initial_pairs(
     """
     geometries = list(matched.geometries)
     with clock.measure("verification"):
+        known = KnownPoses(poses)
+        misleading = known.misleading_pairs(matched, cameras)
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):
-                # The remaining inliers decide as well as all of them.
+                # Some of the inliers decide as well as all of them.
                 few = _demoted(geometry)
-                if _is_contradicted(few, inliers_of(matched, cameras, pair, few)):
-                    geometries[k] = few
-        known = KnownPoses(poses)
-        for k in known.misleading_pairs(replace(matched, geometries=geometries), cameras):
-            geometries[k] = _demoted(geometries[k])
-        for k in runaway_starts(replace(matched, geometries=geometries), cameras, known):
+                angle = _contradicted_angle(few, inliers_of(matched, cameras, pair, few))
+                if angle is not None:
+                    misleading[k] = angle
+        for k in bad_initial_pairs(matched, cameras, known, misleading):
             geometries[k] = _demoted(geometries[k])
     return replace(matched, geometries=geometries)
 
@@ -88,20 +87,19 @@ def _may_start(geometry: TwoViewGeometry) -> bool:
     )
 
 
-def _is_contradicted(geometry: TwoViewGeometry, inliers: PairInliers) -> bool:
-    """Whether the matches contradict the pose of the homography."""
+def _contradicted_angle(geometry: TwoViewGeometry, inliers: PairInliers) -> float | None:
+    """Triangulation angle of the homography's pose in degrees, if the matches contradict it."""
     of_pair = geometry.E
     assert of_pair is not None
     assert geometry.H is not None
     pose = pose_of_homography(geometry.H, inliers)
     angle = triangulation_angle(pose[:, :3], inliers.rays)
-    if angle < _MIN_ANGLE:
-        return False
     rotation = pose_of_essential(of_pair, inliers)[:, :3]
     if angle < _ANGLE_FACTOR * triangulation_angle(rotation, inliers.rays):
-        return False
+        return None
     of_pose = essential_of_poses(np.eye(3, 4), pose)
-    return _error(of_pose, inliers.x) > _ERROR_FACTOR * _error(of_pair, inliers.x)
+    is_wrong = _error(of_pose, inliers.x) > _ERROR_FACTOR * _error(of_pair, inliers.x)
+    return angle if is_wrong else None
 
 
 def _error(E: _Floats, x: Sequence[_Floats]) -> float:
