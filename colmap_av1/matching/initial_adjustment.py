@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -229,24 +229,10 @@ def bad_initial_pairs(
             for k, angle in misleading.items()
             if counts[k] >= limits[0] and angle >= _WIDE_SHARE * limits[1]
         }
-        starts: dict[int, _Start | None] = {}
-        for num_looked, of_image in enumerate(_in_order(matched, cameras, counts, limits[0])):
-            if num_looked >= _NUM_FIRST_IMAGES and sure:
-                break
-            for k in of_image:
-                if k in bad:
-                    continue
-                if k not in starts:
-                    pair = matched.pairs[k].tolist()
-                    geometry = matched.geometries[k]
-                    starts[k] = _try_start(matched, cameras, pair, geometry, known, limits=limits)
-                start = starts[k]
-                if start is not None and start.is_stable and start.is_certain:
-                    sure.add(k)
-                    break
-        stable = {k: start.is_stable for k, start in starts.items() if start is not None}
-        if known.cam_from_world or any(stable.values()):
-            bad |= {k for k, is_stable in stable.items() if not is_stable}
+        starts = _starts(matched, cameras, known, limits=limits, left_out=bad)
+        if known.cam_from_world or any(start.is_stable for start in starts.values()):
+            bad |= {k for k, start in starts.items() if not start.is_stable}
+        sure = {k for k, start in starts.items() if start.is_sure}
         if sure:
             break
     if known.cam_from_world and limits != _LIMITS[0]:
@@ -258,13 +244,42 @@ def bad_initial_pairs(
     return sorted(bad)
 
 
-def _in_order(
+def _starts(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
-    counts: NDArray[np.intp],
-    min_inliers: int,
+    known: KnownPoses,
+    *,
+    limits: tuple[int, float],
+    left_out: Container[int],
+) -> dict[int, _Start]:
+    """Begin models with pairs in the mapper's order, until it would certainly have begun one.
+
+    Returns:
+        The pairs that the mapper may accept, by index.
+    """
+    starts: dict[int, _Start | None] = {}
+    is_sure = False
+    for num_looked, of_image in enumerate(_in_order(matched, cameras, limits[0])):
+        if num_looked >= _NUM_FIRST_IMAGES and is_sure:
+            break
+        for k in of_image:
+            if k in left_out:
+                continue
+            if k not in starts:
+                pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
+                starts[k] = _try_start(matched, cameras, pair, geometry, known, limits=limits)
+            start = starts[k]
+            if start is not None and start.is_sure:
+                is_sure = True
+                break
+    return {k: start for k, start in starts.items() if start is not None}
+
+
+def _in_order(
+    matched: MatchedImages, cameras: Sequence[pycolmap.Camera], min_inliers: int
 ) -> Iterator[list[int]]:
     """Yield the pairs of each image in the order in which the mapper tries images and pairs."""
+    counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
     used = np.where(counts >= MIN_INLIERS, counts, 0)
     pairs = matched.pairs.reshape(-1, 2)
     totals = np.zeros(len(cameras), dtype=np.intp)
@@ -287,6 +302,11 @@ class _Start:
 
     is_stable: bool
     is_certain: bool
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the mapper accepts the pair with any seed, and its model does not diverge."""
+        return self.is_stable and self.is_certain
 
 
 def _try_start(
