@@ -43,6 +43,8 @@ _RIG_HEAD, _SENSOR, _POSE = 8, 8, 56
 _FRAME_HEAD, _DATA_ID = 8 + _POSE, 16
 # Number of points written at a time, to limit memory.
 _CHUNK = 20_000
+# Smallest number of observations of a point.
+_LEAST_VIEWS = 2
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,46 @@ def take_rows(
     lengths = np.diff(offsets)[rows]
     taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
+
+
+def take_points(points: ModelPoints, rows: NDArray[np.int64]) -> ModelPoints:
+    """Select points, in the order of `rows`."""
+    offsets, seen = take_rows(points.offsets, rows)
+    return ModelPoints(
+        points.xyz[rows],
+        points.rgb[rows],
+        points.error[rows],
+        offsets,
+        points.image[seen],
+        points.xy[seen],
+    )
+
+
+def keep_observations(
+    points: ModelPoints, kept: NDArray[np.bool_]
+) -> tuple[ModelPoints, NDArray[np.int64]]:
+    """Keep some of the observations, and the points with two or more of them.
+
+    Args:
+        points: the points.
+        kept: bool [num_observations].
+
+    Returns:
+        The points that are left, and int64 [n] their indices in `points`.
+    """
+    so_far = np.concatenate([[0], np.cumsum(kept)])
+    lengths = np.diff(so_far[points.offsets])
+    enough = lengths >= _LEAST_VIEWS
+    seen = kept & np.repeat(enough, np.diff(points.offsets))
+    left = ModelPoints(
+        points.xyz[enough],
+        points.rgb[enough],
+        points.error[enough],
+        np.concatenate([[0], np.cumsum(lengths[enough])]),
+        points.image[seen],
+        points.xy[seen],
+    )
+    return left, np.flatnonzero(enough)
 
 
 def no_points() -> ModelPoints:

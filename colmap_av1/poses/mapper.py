@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 # Convergence is slow with a robust loss: steps that lower the cost by less than 0.1 % still reduce
 # the long-range epipolar error.
-_ADJUSTMENT_STEPS = 20
-_ADJUSTMENT_TOLERANCE = 1e-4
+ADJUSTMENT_STEPS = 20
+ADJUSTMENT_TOLERANCE = 1e-4
 # Function tolerance of the mapper's global bundle adjustment where another adjustment follows. The
 # poses are the same after it, in half the time.
 _MAPPER_TOLERANCE = 1e-4
@@ -163,8 +163,8 @@ def adjust_model(
     seed: int,
     num_threads: int,
     log: Path,
-    max_steps: int = _ADJUSTMENT_STEPS,
-    tolerance: float = _ADJUSTMENT_TOLERANCE,
+    max_steps: int = ADJUSTMENT_STEPS,
+    tolerance: float = ADJUSTMENT_TOLERANCE,
 ) -> None:
     """Bundle-adjust poses, points and, optionally, intrinsics of a model, which is overwritten.
 

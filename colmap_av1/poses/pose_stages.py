@@ -28,8 +28,14 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.options import DensityOptions, MapOptions, ReconstructOptions, TriangulateOptions
-from colmap_av1.poses.mapper import FEW_SEEN, adjust_model, map_poses, without_unseen_images
+from colmap_av1.options import DensityOptions, MapOptions, TriangulateOptions
+from colmap_av1.poses.adjusting import (
+    LOSS_SCALES,
+    OBSERVATIONS,
+    adjust_posed,
+    refines_intrinsics,
+)
+from colmap_av1.poses.mapper import FEW_SEEN, map_poses, without_unseen_images
 from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
@@ -55,13 +61,10 @@ _FEW_TRACKS = 100
 # half the time of 200, and the adjustment that follows ends at the same poses. All tracks are used
 # where poses depend on links, which are short tracks, and in fast turns, where few tracks are long.
 START_TRACKS = 100
-# The selection of tracks for bundle adjustment, and the scales of its robust loss in pixels. Half
-# of the observations have errors below 0.3 to 0.4 px; larger ones have drifted. The first
-# adjustment has a larger scale: the mapper may leave images whose observations are all far off.
+# The selection of tracks for bundle adjustment.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
 )
-LOSS_SCALES = (1.0, 0.25)
 # If corners are used as well, every second motion track is kept, cut into pieces of eight images.
 # Motion tracks are less accurate than corners, their errors are correlated, and they drift: over
 # twenty images by three times as much as over three, which bends the model.
@@ -219,13 +222,6 @@ def _largest_first(
     return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
 
 
-def refines_intrinsics(options: ReconstructOptions) -> bool:
-    """Whether focal length and distortion are refined; by default if they are not given."""
-    if options.mapping.refine_intrinsics is not None:
-        return options.mapping.refine_intrinsics
-    return options.match.camera.camera_params is None
-
-
 def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
     """Why a mapper found no initial pair, and the remedy."""
     failure = f"COLMAP's {mapper} mapper finds no initial pair"
@@ -374,21 +370,24 @@ def adjustment_stage(
                 followed, placed = corners(Tracks.concatenate(spread, linked), placed)
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
-        with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as model:
-            folder = Path(model)
+        with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
             points = [_black_points(run, placed, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
-            write_model(folder, placed.cameras, placed.images, joined_points(points))
             run.progress("adjustment", 0, 1)
-            adjust_in(run, folder)
+            model = PosedModel(placed.cameras, placed.images, joined_points(points))
+            adjusted = adjust_posed(run, model)
             run.progress("adjustment", 1, 1)
-            adjusted = without_unseen_images(folder)
-        seams = model_seams(adjusted)
-        result = posed_model(adjusted, with_points=True)
-        # Point ids start at 1, in the order of `points`.
-        is_motion = np.array(list(adjusted.points3D)) <= len(points[0].xyz)
+            write_model(
+                folder, adjusted.model.cameras, adjusted.model.images, adjusted.model.points
+            )
+            seen = without_unseen_images(folder)
+        seams = model_seams(seen)
+        result = posed_model(seen, with_points=True)
+        # The ids of points start at 1, in the order of the adjusted model.
+        is_motion = adjusted.points[np.array(list(seen.points3D)) - 1] < len(points[0].xyz)
         with run.clock.measure("adjustment"):
-            result = with_own_cameras(run, result, LOSS_SCALES, refine_intrinsics=refine)
+            result = with_own_cameras(run, result)
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
@@ -409,6 +408,7 @@ def adjustment_stage(
         _LENGTH_WITH_CORNERS,
         (_WITH_CORNERS, FROM_PICTURES) if corners is not None else (FOR_POSES,),
         LOSS_SCALES,
+        OBSERVATIONS,
         FEW_SEEN,
         refine,
         options.mapping.mapper_threads,
@@ -424,18 +424,6 @@ def adjustment_stage(
         into=run.stages,
         products=[f"adjusted{suffix}.npz"],
         make=make,
-    )
-
-
-def adjust_in(run: Run, folder: Path) -> None:
-    """Bundle-adjust the model in a folder in place, with the options of the run."""
-    adjust_model(
-        folder,
-        refine_intrinsics=refines_intrinsics(run.options),
-        loss_scales=LOSS_SCALES,
-        seed=run.options.match.run.seed,
-        num_threads=run.options.mapping.mapper_threads,
-        log=run.stages / "adjustment.log",
     )
 
 

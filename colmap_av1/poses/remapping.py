@@ -16,7 +16,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
-from colmap_av1.geometry.colmap_model import read_model, write_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import (
     PosedModel,
     posed_model,
@@ -30,15 +30,9 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
+from colmap_av1.poses.adjusting import LOSS_SCALES, adjust_posed, refines_intrinsics
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.pose_stages import (
-    FROM_PICTURES,
-    LOSS_SCALES,
-    START_TRACKS,
-    AdjustedResult,
-    adjust_in,
-    refines_intrinsics,
-)
+from colmap_av1.poses.pose_stages import FROM_PICTURES, START_TRACKS, AdjustedResult
 from colmap_av1.poses.posed_images import PosesResult, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
@@ -171,11 +165,8 @@ def _costs(
     if len(agreeing.xyz) == 0:
         return 0.0, 0.0, 0.0
     xy = seen.xy[agreeing.observation].astype(np.float64)
-    with tempfile.TemporaryDirectory() as model:
-        folder = Path(model)
-        write_model(folder, placed.cameras, placed.images, to_model_points(agreeing, view, xy))
-        adjust_in(run, folder)
-        adjusted = posed_model(read_model(folder), with_points=True)
+    points = to_model_points(agreeing, view, xy)
+    adjusted = adjust_posed(run, PosedModel(placed.cameras, placed.images, points)).model
     known_errors = reprojection_errors(known)[in_both][agreeing.observation]
     return (
         len(agreeing.observation) / len(view),

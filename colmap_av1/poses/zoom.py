@@ -8,23 +8,15 @@ has zoomed, and each image gets its own camera.
 from __future__ import annotations
 
 import copy
-import tempfile
 from collections import Counter
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import read_model, write_model
-from colmap_av1.geometry.posed_model import (
-    PosedModel,
-    posed_model,
-    reprojection_errors,
-    robust_costs,
-)
-from colmap_av1.poses.mapper import adjust_model
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, robust_costs
+from colmap_av1.poses.adjusting import LOSS_SCALES, adjust_posed, refines_intrinsics
 from colmap_av1.poses.run import Run
 
 # Number of images that share a trial camera; fewer determine its focal length less well.
@@ -38,30 +30,28 @@ _MIN_GAIN = 0.04
 # See `adjust_model`. Poses that a shared camera has bent need many iterations to converge.
 _TRIAL_TOLERANCE, _TOLERANCE = 1e-3, 1e-4
 _MAX_STEPS = 60
+_LOG = "zoom.log"
 
 
-def with_own_cameras(
-    run: Run, model: PosedModel, loss_scales: Sequence[float], *, refine_intrinsics: bool
-) -> PosedModel:
+def with_own_cameras(run: Run, model: PosedModel) -> PosedModel:
     """Adjust a model with a camera for each image, if the options or a zoom require it.
 
     Args:
         run: inputs and options of the run.
         model: the adjusted model, with points.
-        loss_scales: see `adjust_model`.
-        refine_intrinsics: refine focal length and distortion.
 
     Returns:
         The adjusted model, or the given one.
     """
     single_camera = run.options.match.camera.single_camera
+    refines = refines_intrinsics(run.options)
     shared: Container[int] = ()
     if single_camera is False:
         shared = model.cameras
-    elif single_camera is None and refine_intrinsics:
-        shared = _zooming_cameras(run, model, loss_scales[-1])
+    elif single_camera is None and refines:
+        shared = _zooming_cameras(run, model)
     own = _with_copies(model, shared, 1)
-    if own.cameras.keys() == model.cameras.keys() or not refine_intrinsics:
+    if own.cameras.keys() == model.cameras.keys() or not refines:
         return own
     for number in own.cameras.keys() - model.cameras.keys():
         # The distortion of the shared camera was fitted to the zoom.
@@ -69,22 +59,30 @@ def with_own_cameras(
         params = np.array(camera.params)
         params[list(camera.extra_params_idxs())] = 0.0
         camera.params = params.tolist()
-    return _adjusted(run, own, loss_scales, _TOLERANCE)
+    return adjust_posed(run, own, log=_LOG, max_steps=_MAX_STEPS, tolerance=_TOLERANCE).model
 
 
-def _zooming_cameras(run: Run, model: PosedModel, loss_scale: float) -> set[int]:
+def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
     """Ids of the cameras whose focal length varies between images."""
     trial = _with_copies(model, model.cameras, _GROUP)
     if trial.cameras.keys() == model.cameras.keys():
         return set()
-    trial = _adjusted(run, trial, [loss_scale], _TRIAL_TOLERANCE)
+    scale = LOSS_SCALES[-1]
+    trial = adjust_posed(
+        run,
+        trial,
+        log=_LOG,
+        loss_scales=[scale],
+        max_steps=_MAX_STEPS,
+        tolerance=_TRIAL_TOLERANCE,
+    ).model
     focal = np.array([trial.cameras[image.camera_id].mean_focal_length() for image in trial.images])
     camera_of_image = np.array([image.camera_id for image in model.images])
     zooming = set()
     for number in np.unique(camera_of_image).tolist():
         is_own = camera_of_image == number
         own = focal[is_own]
-        before, after = (_mean_cost(m, is_own, loss_scale) for m in (model, trial))
+        before, after = (_mean_cost(m, is_own, scale) for m in (model, trial))
         gain = 1 - after / before
         if own.max() > _MIN_RANGE * own.min() and gain > _MIN_GAIN:
             zooming.add(number)
@@ -127,26 +125,3 @@ def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> 
         images.append(replace(image, camera_id=number))
     used = {image.camera_id for image in images}
     return replace(model, cameras={i: cameras[i] for i in sorted(used)}, images=images)
-
-
-def _adjusted(
-    run: Run,
-    model: PosedModel,
-    loss_scales: Sequence[float],
-    tolerance: float,
-) -> PosedModel:
-    """Adjust a model with points, see `adjust_model`."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_model(folder, model.cameras, model.images, model.points)
-        adjust_model(
-            folder,
-            refine_intrinsics=True,
-            loss_scales=loss_scales,
-            seed=run.options.match.run.seed,
-            num_threads=run.options.mapping.mapper_threads,
-            log=run.stages / "zoom.log",
-            max_steps=_MAX_STEPS,
-            tolerance=tolerance,
-        )
-        return posed_model(read_model(folder), with_points=True)

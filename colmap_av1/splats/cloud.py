@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_rows
+from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_points
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
@@ -86,19 +86,6 @@ def splat_cloud(
     filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
     kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
     return joined_points([kept, filled])
-
-
-def take_points(points: ModelPoints, rows: _Ints) -> ModelPoints:
-    """Select points, in the order of `rows`."""
-    offsets, seen = take_rows(points.offsets, rows)
-    return ModelPoints(
-        points.xyz[rows],
-        points.rgb[rows],
-        points.error[rows],
-        offsets,
-        points.image[seen],
-        points.xy[seen],
-    )
 
 
 def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:

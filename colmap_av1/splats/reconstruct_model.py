@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, take_points, write_model
 from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import (
@@ -41,7 +41,6 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
-from colmap_av1.splats.cloud import take_points
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage

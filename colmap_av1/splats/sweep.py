@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, no_points
+from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, no_points, take_points
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
@@ -22,7 +22,6 @@ from colmap_av1.geometry.coverage import (
     squares_of_cells,
 )
 from colmap_av1.geometry.masks import make_mask
-from colmap_av1.splats.cloud import take_points
 from colmap_av1.splats.ray_search import (
     LEAST_OTHERS,
     Grey,

@@ -188,8 +188,8 @@ def test_images_without_a_pose_keep_their_matches(
     """Of two scenes, an estimate holds the larger one; both have its camera."""
     pictures = [picture for _, picture in decode_frames(SCENE)]
     videos = [
-        encode(np.stack(pictures[:26]), tmp_path / "one.mp4"),
-        encode(np.stack([p[:, ::-1] for p in pictures[40:58]]), tmp_path / "two.mp4"),
+        encode(np.stack(pictures[:18]), tmp_path / "one.mp4"),
+        encode(np.stack([p[:, ::-1] for p in pictures[40:53]]), tmp_path / "two.mp4"),
     ]
     options = MatchOptions(
         links=LinkOptions(links="none"), camera=CameraOptions(single_camera=True)
@@ -198,7 +198,7 @@ def test_images_without_a_pose_keep_their_matches(
     assert len(read_cameras(report.database)) == 1
     assert report.estimate is not None
     left = report.num_images - report.estimate.num_registered
-    assert left >= 15
+    assert left >= 10
     assert any(f"{left} of {report.num_images} images" in warning for warning in report.warnings)
     assert min(num_keypoints(report.database).values()) > 100
     models = tmp_path / "models"

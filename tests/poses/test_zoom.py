@@ -90,7 +90,7 @@ def test_a_point_behind_a_camera_is_no_zoom(made: ReconstructReport, tmp_path: P
     xyz[0] = first.cam_from_world[:, :3].T @ ([0.0, 0.0, -1.0] - first.cam_from_world[:, 3])
     behind = replace(model, points=replace(model.points, xyz=xyz))
     run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
-    found = with_own_cameras(run, behind, [1.0], refine_intrinsics=True)
+    found = with_own_cameras(run, behind)
     assert found.cameras.keys() == model.cameras.keys()
 
 

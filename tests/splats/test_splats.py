@@ -11,7 +11,7 @@ import pytest
 
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
-from colmap_av1.geometry.colmap_model import ModelPoints, camera_centres
+from colmap_av1.geometry.colmap_model import ModelPoints, camera_centres, take_points
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.triangulation import (
@@ -21,7 +21,7 @@ from colmap_av1.geometry.triangulation import (
     triangulate,
 )
 from colmap_av1.options import TriangulateOptions
-from colmap_av1.splats.cloud import splat_cloud, take_points
+from colmap_av1.splats.cloud import splat_cloud
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 CAMERA = pycolmap.Camera(

@@ -1,0 +1,90 @@
+"""Bundle adjustment on a selection of the observations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from dense_scene import OPTIONS, Truth
+from hypothesis import given
+from hypothesis import strategies as st
+
+from colmap_av1.evaluate.metrics.poses import pose_errors
+from colmap_av1.geometry.colmap_model import ModelPoints, keep_observations, read_model, take_points
+from colmap_av1.geometry.posed_model import posed_model
+from colmap_av1.poses import adjusting
+from colmap_av1.poses.adjusting import adjust_posed, used_observations
+from colmap_av1.reconstruct import ReconstructReport
+
+
+def points_seen_in(views: list[list[int]]) -> ModelPoints:
+    """A point for each list of images."""
+    lengths = [len(own) for own in views]
+    return ModelPoints(
+        np.zeros((len(views), 3)),
+        np.zeros((len(views), 3), np.uint8),
+        np.zeros(len(views)),
+        np.cumsum([0, *lengths]),
+        np.array([image for own in views for image in own], np.int64),
+        np.zeros((sum(lengths), 2)),
+    )
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 30), st.integers(2, 60)), min_size=1, max_size=80),
+    st.integers(1, 30),
+)
+def test_points_and_images_keep_enough(stretches: list[tuple[int, int]], mean: int) -> None:
+    points = points_seen_in([list(range(first, first + count)) for first, count in stretches])
+    num_images = int(points.image.max()) + 1
+    used = used_observations(points, num_images, mean)
+    lengths = np.diff(points.offsets)
+    kept = np.add.reduceat(used, points.offsets[:-1])
+    assert (kept >= np.minimum(lengths, 7)).all()
+    before, after = (
+        np.bincount(points.image[own], minlength=num_images) for own in (used | True, used)
+    )
+    assert (after[before <= mean] == before[before <= mean]).all()
+    if len(used) <= mean * num_images:
+        assert used.all()
+
+
+def test_many_observations_are_thinned_evenly() -> None:
+    points = points_seen_in([list(range(200))] * 1000)
+    used = used_observations(points, 200, 250)
+    in_images = np.bincount(points.image[used])
+    assert in_images.mean() == pytest.approx(250, rel=0.05)
+    assert in_images.min() > 200
+    assert in_images.max() < 300
+
+
+def test_points_with_one_observation_are_dropped() -> None:
+    points = points_seen_in([[0, 1, 2], [0, 1], [2, 3, 4]])
+    left, index = keep_observations(points, np.array([1, 1, 0, 1, 0, 1, 1, 1], np.bool_))
+    assert index.tolist() == [0, 2]
+    assert left.offsets.tolist() == [0, 2, 5]
+    assert left.image.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_half_of_the_observations_determine_the_poses(
+    made: ReconstructReport, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = posed_model(read_model(made.output / "sparse" / "0"), with_points=True)
+    some = take_points(model.points, np.arange(0, len(model.points.xyz), 5))
+    mean = len(some.image) / len(model.images) / 2
+    monkeypatch.setattr(adjusting, "OBSERVATIONS", mean)
+    assert not used_observations(some, len(model.images), mean).all()
+    # Errors of the moved points exceed the first scale of the loss.
+    shift = np.random.default_rng(0).normal(0, 0.01, some.xyz.shape)
+    moved = replace(model, points=replace(some, xyz=some.xyz + shift))
+    run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
+    adjusted = adjust_posed(run, moved)
+    assert len(adjusted.points) == len(adjusted.model.points.xyz) > 0.95 * len(some.xyz)
+    poses = [image.cam_from_world for image in adjusted.model.images]
+    known = [truth.cam_from_world[int(image.name[-10:-4])] for image in adjusted.model.images]
+    errors = pose_errors(np.array(poses), np.array(known))
+    assert errors.num_poses == made.num_registered
+    assert errors.ate < 0.0005 * errors.extent
