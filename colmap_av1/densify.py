@@ -133,6 +133,12 @@ def densify(
         ImageError: the frames of the model's images cannot be determined.
         OptionError: an option does not fit the images, the folder is not empty, or the file for
             Gaussians cannot be made.
+
+    Examples:
+        >>> from colmap_av1 import densify
+        >>> report = densify("my_model/0", "video.mp4", "my_dense_model")
+        >>> report.num_images, report.num_points > 2 * report.num_model_points
+        (10, True)
     """
     options = options if options is not None else DensifyOptions()
     progress = progress if progress is not None else no_progress

@@ -105,6 +105,14 @@ def map_database(
         ModelError: the mapper fails or finds no model; the message names its log.
         OptionError: the output is not empty and must not be replaced, or the known distance does
             not fit the model.
+
+    Examples:
+        >>> from colmap_av1 import map_database
+        >>> report = map_database("my.db", "my_frames", "my_model")
+        >>> report.num_images, report.num_registered
+        (10, (10,))
+        >>> report.model.as_posix()
+        'my_model/0'
     """
     options = options if options is not None else MapOptions()
     place = place if place is not None else PlaceOptions()

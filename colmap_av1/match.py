@@ -205,6 +205,15 @@ def match(
         DatabaseError: the database is locked, is not a COLMAP database, does not match the video,
             or has features of its images, which `options.on_existing` does not allow.
         OptionError: an option conflicts with the videos, their images or another option.
+
+    Examples:
+        >>> from colmap_av1 import ImageOptions, MatchOptions, match
+        >>> options = MatchOptions(images=ImageOptions(every=6))
+        >>> report = match("my.db", "video.mp4", image_path="my_frames", options=options)
+        >>> report.num_frames, report.num_images
+        (60, 10)
+        >>> print(report.next_commands[1])
+        colmap-av1 map --database my.db --image_path my_frames --output my_model
     """
     options = options if options is not None else MatchOptions()
     progress = progress if progress is not None else no_progress

@@ -192,6 +192,13 @@ def reconstruct(
         ModelError: no poses are found, or the output cannot be written.
         OptionError: an option does not fit the video, the folder has other contents, or the file
             of Gaussians cannot be made.
+
+    Examples:
+        >>> from colmap_av1 import ImageOptions, MatchOptions, ReconstructOptions, reconstruct
+        >>> options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=6)))
+        >>> report = reconstruct("video.mp4", "my_scene", options=options)
+        >>> report.num_frames, report.num_images, report.num_registered
+        (60, 10, 10)
     """
     options = (options if options is not None else ReconstructOptions()).with_extension
     progress = progress if progress is not None else no_progress

@@ -66,6 +66,11 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
     Raises:
         OptionError: the output has no batch, a file of the batch is damaged, or the page cannot be
             written.
+
+    Examples:
+        >>> from colmap_av1 import write_page
+        >>> write_page("my_batch")
+        '/.../my_batch/report.html'
     """
     place = absolute(os.fspath(output)).rstrip("/")
     shown_place = without_secrets(place)

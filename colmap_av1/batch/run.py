@@ -120,6 +120,12 @@ def run_batch(
     Raises:
         OptionError: the inputs or options are invalid, or the output cannot be written.
         OSError: the inputs cannot be read.
+
+    Examples:
+        >>> from colmap_av1 import ReadOptions, run_batch
+        >>> report = run_batch("my_videos", "my_batch", ReadOptions())  # `info` for each video
+        >>> report.num_videos, report.num_done, report.failed
+        (2, 1, {'unreadable': 1})
     """
     options = options if options is not None else BatchOptions()
     words = [inputs] if isinstance(inputs, (str, os.PathLike)) else inputs

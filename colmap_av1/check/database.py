@@ -113,6 +113,14 @@ def check(database: str | os.PathLike[str]) -> CheckReport:
 
     Raises:
         DatabaseError: the file is missing, locked, unreadable, or not a COLMAP database.
+
+    Examples:
+        >>> from colmap_av1 import check
+        >>> report = check("my.db")
+        >>> report.num_images, report.image_sizes
+        (10, {(640, 360): 10})
+        >>> report.mappable, report.findings
+        (True, ())
     """
     path = Path(database)
     if is_new(path):

@@ -93,6 +93,11 @@ def export_hloc(
         DatabaseError: the file is missing, unreadable, not a COLMAP database, has no keypoints, or
             holds something that hloc's layout cannot represent.
         OptionError: the folder cannot be written, or a file exists and `overwrite` is not set.
+
+    Examples:
+        >>> from colmap_av1 import export_hloc
+        >>> export_hloc("my.db", "my_hloc")
+        (10, 45)
     """
     options = options if options is not None else ExportOptions()
     path, folder = Path(database), Path(output)
@@ -252,6 +257,16 @@ def read_hloc(features: str | os.PathLike[str], matches: str | os.PathLike[str])
     Raises:
         HlocError: a file is missing, is not an HDF5 file, has no keypoints or no matches, or the
             pairs do not fit the images.
+
+    Examples:
+        >>> from colmap_av1 import read_hloc
+        >>> found = read_hloc("my_hloc/features.h5", "my_hloc/matches.h5")
+        >>> i, j = found.pairs[0]
+        >>> found.names[i], found.names[j]
+        ('frame_000000.png', 'frame_000006.png')
+        >>> in_i, in_j = found.matches[0].T
+        >>> found.keypoints[i][in_i].shape == found.keypoints[j][in_j].shape
+        True
     """
     features, matches = Path(features), Path(matches)
     with _open_hloc(features) as file:

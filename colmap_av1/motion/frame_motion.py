@@ -71,6 +71,15 @@ class FrameMotion:
         use_intrabc: uint8.
         warp_index: int32; row of local_warp_params of the unit's block, -1 without
             a valid local warp.
+
+    Examples:
+        >>> from colmap_av1 import read_motion
+        >>> key_frame, frame, *_ = read_motion("video.mp4")
+        >>> frame.width, frame.height, frame.mv.shape
+        (640, 360, (90, 160, 2, 2))
+        >>> reference = frame.ref_frame[45, 80, 0]  # at the centre of the picture
+        >>> int(frame.ref_display_index[reference])
+        0
     """
 
     decode_index: int

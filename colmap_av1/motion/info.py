@@ -106,6 +106,12 @@ def inspect(
     Raises:
         VideoError: the video cannot be read or shows no frame.
         BitstreamError: the stream is damaged and `options.strict` is set.
+
+    Examples:
+        >>> from colmap_av1 import inspect
+        >>> report = inspect("video.mp4")
+        >>> report.num_shown, report.num_key_frames, report.good
+        (60, 1, True)
     """
     options = options if options is not None else ReadOptions()
     counts = _count(read_motion(video, options), progress)

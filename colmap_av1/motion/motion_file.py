@@ -53,6 +53,15 @@ def export_motion(
         OptionError: the extension is unknown, the file exists, or it cannot be written.
         VideoError: the video cannot be read or has no frames.
         BitstreamError: the stream is damaged and `options.strict` is set.
+
+    Examples:
+        >>> import numpy as np
+        >>> from colmap_av1 import export_motion
+        >>> export_motion("video.mp4", "motion.npz")
+        60
+        >>> with np.load("motion.npz") as file:
+        ...     file["000001/mv"].shape
+        (90, 160, 2, 2)
     """
     path = Path(output)
     writers: dict[str, _Opener] = {".npz": _open_npz, ".h5": _open_h5, ".hdf5": _open_h5}

@@ -82,6 +82,12 @@ def read_motion(
         LimitError: a frame is larger than `options.max_frame_size`.
         OptionError: the stream does not have `options.operating_point`.
         VideoError: the file cannot be read as a video, or is not AV1 (NotAv1Error).
+
+    Examples:
+        >>> from colmap_av1 import read_motion
+        >>> inter_units = [int(frame.is_inter.sum()) for frame in read_motion("video.mp4")]
+        >>> len(inter_units), inter_units[0]  # the first frame is a key frame
+        (60, 0)
     """
     options = options if options is not None else ReadOptions()
     index = _read_index(video, options)

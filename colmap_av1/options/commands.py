@@ -41,7 +41,14 @@ class TrackingOptions:
 
 @dataclass(frozen=True)
 class MatchOptions(Options):
-    """Options of `match`."""
+    """Options of `match`.
+
+    Examples:
+        >>> from colmap_av1 import ImageOptions, MatchOptions
+        >>> options = MatchOptions(images=ImageOptions(num_images=40), on_existing="append")
+        >>> options.images.num_images, options.pairs.min_matches
+        (40, 15)
+    """
 
     title: ClassVar[str] = "database and stream"
 
@@ -98,7 +105,16 @@ class MatchOptions(Options):
 
 @dataclass(frozen=True)
 class ReconstructOptions(Options):
-    """Options of `reconstruct`, including those of `match` except the selection of tracks."""
+    """Options of `reconstruct`, including those of `match` except the selection of tracks.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> from colmap_av1 import ImageOptions, MatchOptions, ReconstructOptions
+        >>> options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=6)))
+        >>> masking = replace(options, moving="mask")
+        >>> masking.match.images.every, masking.moving
+        (6, 'mask')
+    """
 
     title: ClassVar[str] = "reconstruction"
 

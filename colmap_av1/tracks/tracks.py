@@ -40,6 +40,13 @@ class Tracks:
             either axis, in pixels, relative to the track's first observation.
         confirmed: bool [num_observations] whether decoded pixels confirmed the position;
             False without refinement.
+
+    Examples:
+        >>> from colmap_av1 import build_tracks, read_motion
+        >>> tracks = build_tracks(read_motion("video.mp4")).keep_long(20)
+        >>> first = slice(tracks.offsets[0], tracks.offsets[1])
+        >>> tracks.frame[first][:4].tolist(), tracks.xy[first][:4].shape
+        ([0, 1, 2, 3], (4, 2))
     """
 
     num_frames: int
@@ -357,6 +364,14 @@ def build_tracks(
         VideoError: no frame is shown.
         ValueError: the frames are not in bitstream order, or their arrays contradict
             each other.
+
+    Examples:
+        >>> from colmap_av1 import TrackOptions, build_tracks, read_motion
+        >>> tracks = build_tracks(read_motion("video.mp4"), TrackOptions(min_length=10))
+        >>> tracks.num_frames, tracks.width, tracks.height
+        (60, 640, 360)
+        >>> print(tracks.lengths.min(), tracks.lengths.max())
+        10 60
     """
     options = options if options is not None else TrackOptions()
     core_options = _core_options(options)

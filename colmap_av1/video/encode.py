@@ -107,6 +107,12 @@ def encode(
         BitstreamError: the video is damaged and `strict` is set.
         EncodeError: no encoder works, or the output cannot be written.
         OptionError: an option has an invalid value, or the output exists.
+
+    Examples:
+        >>> from colmap_av1 import EncodeOptions, encode
+        >>> report = encode("phone.mp4", "phone_av1.mp4", options=EncodeOptions(downscale=2))
+        >>> report.num_frames
+        60
     """
     options = options if options is not None else EncodeOptions()
     progress = progress if progress is not None else no_progress
