@@ -47,7 +47,9 @@ def run(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ru
         text = inspect.getdoc(getattr(colmap_av1, name)) or ""
         example = doctest.DocTestParser().get_doctest(text, {}, name, None, 0)
         failures: list[str] = []
-        doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=failures.append)
+        # Not verbose, or pytest's -v would be taken for doctest's.
+        runner = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS)
+        runner.run(example, out=failures.append)
         return len(example.examples), "".join(failures)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -44,7 +44,7 @@ _FRAME_HEAD, _DATA_ID = 8 + _POSE, 16
 # Number of points written at a time, to limit memory.
 _CHUNK = 20_000
 # Smallest number of observations of a point.
-_LEAST_VIEWS = 2
+_FEWEST_OBSERVATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def keep_observations(
     """
     so_far = np.concatenate([[0], np.cumsum(kept)])
     lengths = np.diff(so_far[points.offsets])
-    enough = lengths >= _LEAST_VIEWS
+    enough = lengths >= _FEWEST_OBSERVATIONS
     seen = kept & np.repeat(enough, np.diff(points.offsets))
     left = ModelPoints(
         points.xyz[enough],

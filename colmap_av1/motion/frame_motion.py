@@ -74,7 +74,8 @@ class FrameMotion:
 
     Examples:
         >>> from colmap_av1 import read_motion
-        >>> key_frame, frame, *_ = read_motion("video.mp4")
+        >>> frames = read_motion("video.mp4")
+        >>> key_frame, frame = next(frames), next(frames)
         >>> frame.width, frame.height, frame.mv.shape
         (640, 360, (90, 160, 2, 2))
         >>> reference = frame.ref_frame[45, 80, 0]  # at the centre of the picture

@@ -337,8 +337,9 @@ def adjustment_stage(
 ) -> Kept[AdjustedResult]:
     """Bundle-adjust the poses with a robust loss, on long tracks that cover the images evenly.
 
-    All links are used: without them places that are seen again would drift apart. Corners of the
-    pictures correct poses that motion misleads, as at a jerk of the camera.
+    All links get points: without them places that are seen again would drift apart. Corners of the
+    pictures correct poses that motion misleads, as at a jerk of the camera. `adjust_posed` selects
+    observations of points that have many.
 
     Args:
         run: the run.
@@ -348,8 +349,8 @@ def adjustment_stage(
         posed: the stage with the initial poses.
         moved: digest of the stage that found dynamic objects, if `tracks` and `links` exclude them.
         follow: refines the selected tracks in the registered images.
-        corners: finds corners in the pictures of the registered images, all of which are used, and
-            corrects poses that contradict them.
+        corners: finds corners in the pictures of the registered images, and corrects poses that
+            contradict them.
         number: number of the mapping that the poses come from.
     """
     options = run.options
@@ -381,13 +382,15 @@ def adjustment_stage(
             write_model(
                 folder, adjusted.model.cameras, adjusted.model.images, adjusted.model.points
             )
-            seen = without_unseen_images(folder)
-        seams = model_seams(seen)
-        result = posed_model(seen, with_points=True)
+            registered = without_unseen_images(folder)
+        seams = model_seams(registered)
+        result = posed_model(registered, with_points=True)
         # The ids of points start at 1, in the order of the adjusted model.
-        is_motion = adjusted.points[np.array(list(seen.points3D)) - 1] < len(points[0].xyz)
+        ids = np.array(list(registered.points3D), np.int64)
+        is_motion = adjusted.kept_points[ids - 1] < len(points[0].xyz)
         with run.clock.measure("adjustment"):
-            result = with_own_cameras(run, result)
+            own = with_own_cameras(run, result)
+        result, is_motion = own.model, is_motion[own.kept_points]
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",

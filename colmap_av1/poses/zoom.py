@@ -16,7 +16,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, robust_costs
-from colmap_av1.poses.adjusting import LOSS_SCALES, adjust_posed, refines_intrinsics
+from colmap_av1.poses.adjusting import LOSS_SCALES, Adjusted, adjust_posed, refines_intrinsics
 from colmap_av1.poses.run import Run
 
 # Number of images that share a trial camera; fewer determine its focal length less well.
@@ -33,7 +33,7 @@ _MAX_STEPS = 60
 _LOG = "zoom.log"
 
 
-def with_own_cameras(run: Run, model: PosedModel) -> PosedModel:
+def with_own_cameras(run: Run, model: PosedModel) -> Adjusted:
     """Adjust a model with a camera for each image, if the options or a zoom require it.
 
     Args:
@@ -52,14 +52,14 @@ def with_own_cameras(run: Run, model: PosedModel) -> PosedModel:
         shared = _zooming_cameras(run, model)
     own = _with_copies(model, shared, 1)
     if own.cameras.keys() == model.cameras.keys() or not refines:
-        return own
+        return Adjusted(own, np.arange(len(own.points.xyz)))
     for number in own.cameras.keys() - model.cameras.keys():
         # The distortion of the shared camera was fitted to the zoom.
         camera = own.cameras[number]
         params = np.array(camera.params)
         params[list(camera.extra_params_idxs())] = 0.0
         camera.params = params.tolist()
-    return adjust_posed(run, own, log=_LOG, max_steps=_MAX_STEPS, tolerance=_TOLERANCE).model
+    return adjust_posed(run, own, log=_LOG, max_steps=_MAX_STEPS, tolerance=_TOLERANCE)
 
 
 def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:

@@ -91,7 +91,7 @@ def test_a_point_behind_a_camera_is_no_zoom(made: ReconstructReport, tmp_path: P
     behind = replace(model, points=replace(model.points, xyz=xyz))
     run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
     found = with_own_cameras(run, behind)
-    assert found.cameras.keys() == model.cameras.keys()
+    assert found.model.cameras.keys() == model.cameras.keys()
 
 
 def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> None:
