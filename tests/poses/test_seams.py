@@ -15,7 +15,7 @@ from colmap_av1.cli import main
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
 from colmap_av1.options import CameraOptions
-from colmap_av1.poses.seams import model_seams
+from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.reconstruct import ReconstructReport
 
 _FAILED_CHECK = 1
@@ -214,6 +214,21 @@ def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
     assert lost <= set(pairwise(turn))
     assert seams.warning is not None
     assert "scale" in seams.warning
+
+
+@pytest.mark.parametrize(
+    ("usual", "fewest", "is_lost"), [(730, 44, False), (730, 20, True), (468, 26, True)]
+)
+def test_many_points_carry_the_scale_however_many_are_usual(
+    usual: int, fewest: int, is_lost: bool
+) -> None:
+    """44 of 730 are those of a correct model of a walk, 26 of 468 of one that was bent."""
+    scaled = np.full(20, usual)
+    scaled[10] = fewest
+    pairs = tuple((f"{k}.png", f"{k + 1}.png") for k in range(20))
+    many = np.full(20, 2000)
+    seams = Seams(pairs, num_points=many, num_elsewhere=many, num_scaled=scaled, num_deep=many)
+    assert seams.unscaled == ([10] if is_lost else [])
 
 
 def test_a_place_seen_again_carries_no_scale_to_what_lies_between(tmp_path: Path) -> None:
