@@ -29,9 +29,10 @@ from colmap_av1.poses.run import Run
 # whose observations are all far off.
 LOSS_SCALES = (1.0, 0.25)
 # Mean number of observations per image in the adjustment. Of 640 observations per image of a video
-# of 300 images, 250 take a third of the time, and camera centres are off by 0.21 mm instead of
-# 0.16 mm on a path of 5 m.
-OBSERVATIONS = 250
+# of 300 images, 400 take two thirds of the time, and camera centres are off by 0.19 mm instead of
+# 0.16 mm on a path of 5 m. With 250, walks in which few points carry the scale across a turn lose
+# more of it.
+OBSERVATIONS = 400
 # Points with more observations keep at least this many.
 _FEWEST_KEPT = 8
 # Step of the phase in which consecutive points keep observations: the fractional part of the golden
