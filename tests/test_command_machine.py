@@ -35,7 +35,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are f
 
 SECONDS = float(os.environ.get("COLMAP_AV1_MACHINE_SECONDS", "0"))
 QUICK = settings(
-    max_examples=2,
+    max_examples=4,
     stateful_step_count=10,
     derandomize=True,
     deadline=None,

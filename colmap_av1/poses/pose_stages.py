@@ -371,22 +371,21 @@ def adjustment_stage(
                 followed, placed = corners(Tracks.concatenate(spread, linked), placed)
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
-        with run.clock.measure("adjustment"), tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
+        with run.clock.measure("adjustment"):
             points = [_black_points(run, placed, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
             model = PosedModel(placed.cameras, placed.images, joined_points(points))
             adjusted = adjust_posed(run, model)
             run.progress("adjustment", 1, 1)
-            write_model(
-                folder, adjusted.model.cameras, adjusted.model.images, adjusted.model.points
-            )
-            registered = without_unseen_images(folder)
+            model = adjusted.model
+            with tempfile.TemporaryDirectory() as name:
+                write_model(Path(name), model.cameras, model.images, model.points)
+                registered = without_unseen_images(Path(name))
         seams = model_seams(registered)
+        # `posed_model` sorts points by their ids, which start at 1 in the order of `model`.
         result = posed_model(registered, with_points=True)
-        # The ids of points start at 1, in the order of the adjusted model.
-        ids = np.array(list(registered.points3D), np.int64)
+        ids = np.array(sorted(registered.points3D), np.int64)
         is_motion = adjusted.kept_points[ids - 1] < len(points[0].xyz)
         with run.clock.measure("adjustment"):
             own = with_own_cameras(run, result)

@@ -198,7 +198,7 @@ def test_images_without_a_pose_keep_their_matches(
     assert len(read_cameras(report.database)) == 1
     assert report.estimate is not None
     left = report.num_images - report.estimate.num_registered
-    assert left >= 10
+    assert left >= 11  # of 13
     assert any(f"{left} of {report.num_images} images" in warning for warning in report.warnings)
     assert min(num_keypoints(report.database).values()) > 100
     models = tmp_path / "models"
